@@ -1,0 +1,48 @@
+"""Camera models, calibration and hand-eye: the machinery behind the course's five notebooks.
+
+Rooms are loaded when they are first used, so that `import coursekit as ck` costs nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from coursekit import cameras, geometry, lessons, plots, results, simulation, specifications
+    from coursekit.cameras import open_camera
+    from coursekit.lessons import check, checkpoint
+    from coursekit.plots import drag
+
+__all__ = [
+    "cameras",
+    "check",
+    "checkpoint",
+    "drag",
+    "geometry",
+    "lessons",
+    "open_camera",
+    "plots",
+    "results",
+    "simulation",
+    "specifications",
+]
+
+_FUNCTIONS = {
+    "open_camera": "coursekit.cameras",
+    "check": "coursekit.lessons",
+    "checkpoint": "coursekit.lessons",
+    "drag": "coursekit.plots",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _FUNCTIONS:
+        return getattr(importlib.import_module(_FUNCTIONS[name]), name)
+    if name in __all__:
+        return importlib.import_module(f"coursekit.{name}")
+    raise AttributeError(f"module 'coursekit' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__

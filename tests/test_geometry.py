@@ -1,0 +1,361 @@
+"""geometry against OpenCV, librealsense, SciPy and numerical derivatives."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from coursekit import geometry
+from coursekit.geometry import Intrinsics
+
+K = np.array([[612.5, 0, 331.4], [0, 598.0, 236.8], [0, 0, 1]])
+DIST = np.array([-0.27, 0.11, 0.0018, -0.0012, 0.05])
+LESSON = Intrinsics(848, 480, 447.0, 447.0, 424.0, 240.0)
+
+matrices = st.builds(
+    lambda f, a, cx, cy: np.array([[f, 0, cx], [0, f * a, cy], [0, 0, 1]]),
+    st.floats(200, 2000),
+    st.floats(0.8, 1.25),
+    st.floats(200, 800),
+    st.floats(150, 600),
+)
+coefficients = st.tuples(
+    st.floats(-0.4, 0.4),
+    st.floats(-0.3, 0.3),
+    st.floats(-0.005, 0.005),
+    st.floats(-0.005, 0.005),
+    st.floats(-0.2, 0.2),
+).map(np.array)
+
+
+def points_in_view(seed: int, n: int = 40) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    z = rng.uniform(0.1, 5, n)
+    return np.column_stack([rng.uniform(-0.6, 0.6, (n, 2)) * z[:, None], z])
+
+
+# --- against OpenCV ----------------------------------------------------------------------------
+
+
+@settings(max_examples=2000, deadline=None, derandomize=True)
+@given(matrices, coefficients, st.integers(0, 10**6))
+def test_project_is_opencvs(K: np.ndarray, dist: np.ndarray, seed: int) -> None:
+    points = points_in_view(seed)
+    wanted, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, dist)
+    assert np.abs(geometry.project(points, K, dist) - wanted[:, 0]).max() < 1e-9
+    plain, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, None)
+    assert np.abs(geometry.project(points, K) - plain[:, 0]).max() < 1e-9
+
+
+@settings(max_examples=1000, deadline=None, derandomize=True)
+@given(matrices, coefficients, st.integers(0, 10**6))
+def test_deproject_inverts_and_is_opencvs(K: np.ndarray, dist: np.ndarray, seed: int) -> None:
+    points = points_in_view(seed)
+    radius = np.hypot(points[:, 0], points[:, 1]) / points[:, 2]
+    points = points[radius < 0.95 * geometry._fold_radius(dist)]
+    assume(len(points) > 0)
+    pixels = geometry.project(points, K, dist)
+    back = geometry.deproject(pixels, points[:, 2], K, dist)
+    found = np.isfinite(back).all(axis=1)
+    # The tangential terms move the fold a little; inside the radial one nearly all must come back.
+    assert found.mean() > 0.95
+    assert np.abs(geometry.project(back[found], K, dist) - pixels[found]).max() < 1e-7
+    assert np.abs(back[found] - points[found]).max() < 1e-6
+
+    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 2000, 1e-15)
+    cvs = cv2.undistortPointsIter(pixels[found, None], K, dist, np.eye(3), K, criteria)[:, 0]
+    ideal = geometry.project(back[found], K)
+    cv_converged = (
+        np.abs(_redistort(cvs, K, dist) - pixels[found]).max(axis=1) < 1e-8
+    )  # its fixed-point iteration does not always arrive
+    assert np.abs(cvs - ideal)[cv_converged].max(initial=0) < 1e-6
+
+
+def _redistort(ideal_pixels: np.ndarray, K: np.ndarray, dist: np.ndarray) -> np.ndarray:
+    rays = cv2.convertPointsToHomogeneous((ideal_pixels - K[:2, 2]) / [K[0, 0], K[1, 1]])
+    return cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, dist)[0][:, 0]
+
+
+def test_undistort_says_where_it_cannot() -> None:
+    dist = [-0.27, 0, 0, 0, 0]  # r (1 - 0.27 r2) turns back at r = 1.111, where it is 0.741
+    xy, converged = geometry.undistort([[0.70, 0], [0.75, 0], [np.nan, 0]], dist)
+    assert converged.tolist() == [True, False, False]
+    assert np.allclose(geometry.distort(xy[0], dist), [0.70, 0], atol=1e-12)
+    assert xy[0, 0] < 1.111
+    points = geometry.deproject([[0.70, 0], [0.75, 0]], 1.0, np.eye(3), dist)
+    assert np.isfinite(points[0]).all()
+    assert np.isnan(points[1]).all()
+
+
+def test_distortion_jacobian_is_the_numerical_one() -> None:
+    xy, h = np.array([0.31, -0.22]), 1e-6
+    a, b, d = geometry._distortion_jacobian(xy, DIST)
+    columns = [
+        (geometry.distort(xy + e, DIST) - geometry.distort(xy - e, DIST)) / (2 * h)
+        for e in h * np.eye(2)
+    ]
+    assert np.allclose([[a, b], [b, d]], np.transpose(columns), atol=1e-9)
+
+
+# --- any leading shape, and the documented results of bad values -------------------------------
+
+
+@pytest.mark.parametrize("shape", [(), (0,), (1,), (5,), (2, 3), (0, 4), (2, 1, 3)])
+def test_any_leading_shape(shape: tuple[int, ...]) -> None:
+    points = np.random.default_rng(1).uniform([-1, -1, 1], [1, 1, 3], (*shape, 3))
+    pixels = geometry.project(points, K, DIST)
+    assert pixels.shape == (*shape, 2)
+    assert np.allclose(pixels.reshape(-1, 2), geometry.project(points.reshape(-1, 3), K, DIST))
+    back = geometry.deproject(pixels, points[..., 2], K, DIST)
+    assert back.shape == points.shape
+    assert np.allclose(back, points, atol=1e-9)
+
+
+def test_points_behind_or_at_the_camera_have_no_pixel() -> None:
+    points = [[0, 0, 1], [0, 0, 0], [0.1, 0, -1], [np.nan, 0, 1], [0, 0, np.nan], [np.inf, 0, 1]]
+    ok = np.isfinite(geometry.project(points, K)).all(axis=1)
+    assert ok.tolist() == [True, False, False, False, False, False]
+
+
+def test_invalid_depth_has_no_point() -> None:
+    depth = [1.0, 0.0, -1.0, np.nan, np.inf]
+    points = geometry.deproject(np.zeros((5, 2)), depth, K)
+    assert np.isnan(points).all(axis=1).tolist() == [False, True, True, True, True]
+    assert geometry.deproject([10, 20], 0.5, K).shape == (3,)
+
+
+BAD_ARRAYS = {
+    "complex": np.ones((4, 4), complex),
+    "ragged": [[1, 2], [3]],
+    "text": "abc",
+    "none": None,
+    "wrong shape": np.ones((4, 7)),
+    "dict": {},
+}
+
+
+@pytest.mark.parametrize("bad", BAD_ARRAYS.values(), ids=BAD_ARRAYS.keys())
+@pytest.mark.parametrize(
+    ("name", "call"),
+    [
+        ("points", lambda x: geometry.project(x, K)),
+        ("K", lambda x: geometry.project([0, 0, 1], x)),
+        ("dist", lambda x: geometry.project([0, 0, 1], K, x if x is not None else "x")),
+        ("pixels", lambda x: geometry.deproject(x, 1.0, K)),
+        ("depth_m", lambda x: geometry.deproject(np.zeros((3, 2)), x, K)),
+        ("xy", lambda x: geometry.distort(x, DIST)),
+        ("xy", lambda x: geometry.undistort(x, DIST)),
+        ("depth", lambda x: geometry.deproject_image(x, LESSON)),
+        ("depth_m", lambda x: geometry.align_depth_to_color(x, LESSON, LESSON, np.eye(4))),
+        ("T", geometry.invert_transform),
+        ("T", lambda x: geometry.transform_points(x, [0, 0, 1])),
+        ("points", lambda x: geometry.transform_points(np.eye(4), x)),
+        ("rotation", lambda x: geometry.make_transform(x, [0, 0, 0])),
+        ("translation", lambda x: geometry.make_transform(np.eye(3), x)),
+        ("coeffs", lambda x: Intrinsics(2, 2, 1, 1, 0, 0, coeffs=x)),
+        ("fx", lambda x: Intrinsics(2, 2, x, 1, 0, 0)),
+        ("width", lambda x: Intrinsics(x, 2, 1, 1, 0, 0)),
+        ("width", lambda x: geometry.pixel_grid(x, 4)),
+        ("fields", lambda x: Intrinsics.from_dict(x)),
+    ],
+)
+def test_bad_input_names_the_argument(name: str, call, bad) -> None:
+    with pytest.raises(ValueError, match=rf"^{name}\b"):
+        call(bad)
+
+
+@pytest.mark.parametrize("bad", ["{", "", "[1", None, 3])
+def test_bad_json(bad) -> None:
+    with pytest.raises(ValueError, match="^text: "):
+        Intrinsics.from_json(bad)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        np.zeros((3, 3)),
+        [[-1, 0, 0], [0, 1, 0], [0, 0, 1]],
+        [[1, 0.1, 0], [0, 1, 0], [0, 0, 1]],
+        [[1, 0, 0], [0, np.nan, 0], [0, 0, 1]],
+        [[1, 0, 0], [0, 1, 0], [0, 0, 2]],
+    ],
+)
+def test_a_matrix_that_is_no_K(bad) -> None:
+    with pytest.raises(ValueError, match=r"^K: "):
+        geometry.project([0, 0, 1], bad)
+    with pytest.raises(ValueError, match=r"^K: "):
+        geometry.deproject([0, 0], 1, bad)
+
+
+@pytest.mark.parametrize("bad", [[0.1], [0, 0, 0], np.zeros(6), [np.nan] * 5, np.inf])
+def test_wrong_number_of_coefficients(bad) -> None:
+    with pytest.raises(ValueError, match=r"^dist: "):
+        geometry.project([0, 0, 1], K, bad)
+
+
+def test_four_coefficients_mean_k3_is_zero() -> None:
+    a = geometry.project(points_in_view(3), K, DIST[:4])
+    assert np.array_equal(a, geometry.project(points_in_view(3), K, [*DIST[:4], 0]))
+
+
+def test_depths_that_do_not_fit_the_pixels() -> None:
+    with pytest.raises(ValueError, match=r"^depth_m: got shape \(4,\)"):
+        geometry.deproject(np.zeros((3, 2)), np.ones(4), K)
+
+
+# --- Intrinsics -----------------------------------------------------------------------------------
+
+
+def test_intrinsics_round_trip() -> None:
+    camera = Intrinsics(640, 480, 612.5, 598.0, 331.4, 236.8, "brown_conrady", tuple(DIST))
+    assert Intrinsics.from_json(camera.to_json()) == camera
+    assert json.loads(camera.to_json())["coeffs"] == DIST.tolist()
+    assert np.array_equal(camera.K, K)
+    assert np.array_equal(camera.dist, DIST)
+    assert LESSON.dist is None
+    assert camera.size == (640, 480)
+
+
+def test_field_of_view() -> None:
+    # 848 px at fx 447 in a symmetric camera is 87 degrees: the datasheet's figure (claim P1).
+    centred = Intrinsics(848, 480, 447.0, 447.0, 423.5, 239.5)
+    assert centred.hfov_deg == pytest.approx(2 * np.degrees(np.arctan(424 / 447)), abs=1e-9)
+    assert centred.hfov_deg == pytest.approx(87.0, abs=0.05)
+    assert centred.vfov_deg == pytest.approx(56.5, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("fields", "name"),
+    [
+        ({"width": 0}, "width"),
+        ({"height": 2.5}, "height"),
+        ({"width": True}, "width"),
+        ({"fx": 0.0}, "fx"),
+        ({"fy": -1.0}, "fy"),
+        ({"cx": np.nan}, "cx"),
+        ({"model": "fisheye"}, "model"),
+        ({"coeffs": (0, 0, 0)}, "coeffs"),
+        ({"coeffs": (0, 0, 0, 0, np.nan)}, "coeffs"),
+        ({"skew": 1}, "fields"),
+    ],
+)
+def test_bad_intrinsics(fields: dict, name: str) -> None:
+    with pytest.raises(ValueError, match=f"^{name}: "):
+        Intrinsics.from_dict(LESSON.to_dict() | fields)
+
+
+# --- whole images -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dist", [None, DIST])
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32, np.float64])
+def test_deproject_image_is_deproject(dtype: type, dist: np.ndarray | None) -> None:
+    camera = Intrinsics(64, 48, 61.25, 59.8, 33.1, 23.7, "brown_conrady",
+                        tuple(dist) if dist is not None else (0,) * 5)  # fmt: skip
+    counts = np.random.default_rng(5).integers(0, 3000, (48, 64))
+    counts[0, :3] = 0
+    depth = counts.astype(dtype) if dtype == np.uint16 else (counts * 0.0001).astype(dtype)
+    points = geometry.deproject_image(depth, camera, depth_scale_m=0.0001)
+    grid = geometry.pixel_grid(64, 48)
+    wanted = geometry.deproject(grid, counts * 0.0001, camera.K, camera.dist)
+    assert points.dtype == np.float32
+    assert np.array_equal(np.isnan(points), np.isnan(wanted))
+    assert np.nanmax(np.abs(points - wanted)) < 1e-6  # 1 µm
+    again = np.empty_like(points)
+    assert geometry.deproject_image(depth, camera, 0.0001, out=again) is again
+    assert np.array_equal(again, points, equal_nan=True)
+
+
+def test_deproject_image_invalid_floats_are_nan() -> None:
+    camera = Intrinsics(4, 1, 1.0, 1.0, 0.0, 0.0)
+    points = geometry.deproject_image(np.array([[1.0, -1.0, np.nan, np.inf]]), camera)
+    assert np.isnan(points[0]).all(axis=1).tolist() == [False, True, True, True]
+
+
+@pytest.mark.parametrize(
+    ("name", "call"),
+    [
+        ("depth", lambda: geometry.deproject_image(np.zeros((3, 3), np.uint16), LESSON)),
+        ("depth", lambda: geometry.deproject_image(np.zeros((480, 848), np.int32), LESSON)),
+        ("depth", lambda: geometry.deproject_image(np.zeros((480, 848), complex), LESSON)),
+        ("intrinsics", lambda: geometry.deproject_image(np.zeros((480, 848)), K)),
+        (
+            "depth_scale_m",
+            lambda: geometry.deproject_image(np.zeros((480, 848), np.uint16), LESSON, 0),
+        ),
+        (
+            "out",
+            lambda: geometry.deproject_image(np.zeros((480, 848)), LESSON, out=np.zeros((2, 2))),
+        ),
+        ("height", lambda: geometry.pixel_grid(3, -1)),
+    ],
+)
+def test_bad_images(name: str, call) -> None:
+    with pytest.raises(ValueError, match=f"^{name}: "):
+        call()
+
+
+def test_aligned_depth_is_in_the_colour_frame() -> None:
+    """A wall seen by a turned colour camera: the aligned depth must be the wall's Z over there."""
+    depth_camera = Intrinsics(160, 120, 100.0, 100.0, 79.0, 60.5)
+    color_camera = Intrinsics(120, 90, 90.0, 91.0, 60.2, 44.1)
+    T = geometry.make_transform(Rotation.from_euler("xyz", [2, -5, 1], degrees=True),
+                                [0.015, 0.001, 0.002])  # fmt: skip
+    aligned = geometry.align_depth_to_color(np.full((120, 160), 0.8), depth_camera, color_camera, T)
+    # Plane z = 0.8 in the depth frame, intersected with each colour ray, analytically.
+    R, t = T[:3, :3], T[:3, 3]
+    normal, offset = R[:, 2], 0.8 + R[:, 2] @ t
+    rays = geometry.deproject(geometry.pixel_grid(120, 90), np.ones((90, 120)), color_camera.K)
+    wanted = offset / (rays @ normal)
+    filled = aligned > 0
+    assert filled.mean() > 0.85
+    # A depth pixel covers up to about two colour pixels; Z changes by < 1.5 mm over them here.
+    assert np.abs(aligned - wanted)[filled].max() < 0.0015
+
+
+# --- rigid transforms --------------------------------------------------------------------------------
+
+
+def test_transforms() -> None:
+    rng = np.random.default_rng(0)
+    rotation = Rotation.from_rotvec([0.3, -0.2, 0.9])
+    T = geometry.make_transform(rotation, [0.1, 0.2, 0.3])
+    points = rng.standard_normal((4, 5, 3))
+    moved = geometry.transform_points(T, points)
+    assert np.allclose(moved.reshape(-1, 3), rotation.apply(points.reshape(-1, 3)) + T[:3, 3])
+    assert np.allclose(geometry.invert_transform(T), np.linalg.inv(T), atol=1e-15)
+    stack = np.stack([T, T @ T])
+    assert np.allclose(geometry.invert_transform(stack), np.linalg.inv(stack), atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        np.diag([1, 1, -1, 1.0]),
+        np.diag([1, 1, 2, 1.0]),
+        np.diag([1, 1, 1, 2.0]),
+        np.full((4, 4), np.nan),
+    ],
+)
+def test_a_matrix_that_is_no_transform(broken: np.ndarray) -> None:
+    with pytest.raises(ValueError, match=r"^T: "):
+        geometry.invert_transform(broken)
+
+
+# --- import time ------------------------------------------------------------------------------------
+
+
+def test_import_is_lazy() -> None:
+    import subprocess
+    import sys
+
+    heavy = "numpy cv2 numba matplotlib scipy pyrealsense2 ipywidgets IPython"
+    code = f"import coursekit, sys; print([m for m in '{heavy}'.split() if m in sys.modules])"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "[]"
