@@ -1,0 +1,183 @@
+"""Questions that the student answers before the notebook shows the answer.
+
+The question and its options stand in the notebook's Markdown, where they can be read without a
+kernel; a test keeps both texts equal. An answer is committed by clicking, or by a plain call:
+`ck.checkpoint("pinhole.zoom").answer("B")`.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from typing import Any
+
+from coursekit.lessons import progress
+from coursekit.lessons.verdict import Verdict
+
+
+@dataclass(frozen=True)
+class Option:
+    """One option of a choice: its text and why it is right or wrong."""
+
+    text: str
+    why: str
+    right: bool = False
+
+
+@dataclass(frozen=True)
+class Classic:
+    """A wrong number that a known slip leads to, and what that slip is."""
+
+    value: float
+    why: str
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A question; `answer` commits one answer and says why it is right or wrong."""
+
+    name: str
+    question: str
+
+    def answer(self, given: Any) -> Verdict:
+        """The verdict on an answer; the first one given is what `progress` keeps as first try."""
+        verdict = self.judge(given)
+        return verdict if verdict.kind == "not attempted" else progress.noted(verdict, str(given))
+
+    def judge(self, given: Any) -> Verdict:
+        """The verdict on an answer, without noting it."""
+        raise NotImplementedError
+
+    @property
+    def example(self) -> str:
+        """What a plain call would pass, as source."""
+        raise NotImplementedError
+
+    def input_widget(self) -> Any:
+        """The ipywidget whose `value` is the answer."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        return f'Checkpoint: commit your answer with ck.checkpoint("{self.name}").answer(...)'
+
+    def _repr_mimebundle_(self, **kwargs: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+        call = f'ck.checkpoint("{self.name}").answer({self.example})'
+        bundle: dict[str, Any] = {
+            "text/plain": repr(self),
+            "text/html": f"<em>Run this cell to answer here, or call <code>{call}</code>.</em>",
+        }
+        widget_data, metadata = _panel(self)._repr_mimebundle_(**kwargs)
+        return bundle | {k: v for k, v in widget_data.items() if k not in bundle}, metadata
+
+
+@dataclass(frozen=True, repr=False)
+class Choice(Checkpoint):
+    """A question with options A, B, C, ..., exactly one of them right."""
+
+    options: tuple[Option, ...]
+
+    def lettered(self) -> dict[str, Option]:
+        """The options by letter."""
+        return {chr(ord("A") + i): option for i, option in enumerate(self.options)}
+
+    def judge(self, given: Any) -> Verdict:
+        """The verdict on a letter; a right one also says why each other option is wrong."""
+        options = self.lettered()
+        letter = str(given).strip().upper().rstrip(".")
+        if letter not in options:
+            want = f"one of {', '.join(options)}"
+            return Verdict(self.name, "not attempted", f"Choose {want}; got {given!r}.")
+        chosen = options[letter]
+        if not chosen.right:
+            again = "Think again, and choose another."
+            headline = f"{letter}, {chosen.text}: not this one."
+            return Verdict(self.name, "wrong", headline, (chosen.why, again), named=letter)
+        others = [f"{k}, {o.text}: {o.why}" for k, o in options.items() if not o.right]
+        headline = f"{letter}, {chosen.text}: right."
+        return Verdict(self.name, "right", headline, (chosen.why, *others))
+
+    @property
+    def example(self) -> str:
+        return '"A"'
+
+    def input_widget(self) -> Any:
+        import ipywidgets
+
+        labels = [(f"{k}. {o.text}", k) for k, o in self.lettered().items()]
+        return ipywidgets.RadioButtons(
+            options=labels, value=None, layout=ipywidgets.Layout(width="max-content")
+        )
+
+
+@dataclass(frozen=True, repr=False)
+class Number(Checkpoint):
+    """A question whose answer is a number; classic wrong numbers are recognised."""
+
+    value: float
+    unit: str
+    why: str
+    classics: tuple[Classic, ...]
+    hint: str
+    tolerance: float = 0.02  # relative
+
+    def judge(self, given: Any) -> Verdict:
+        """The verdict on a number, or on text such as "2.4" or "2,4 mm"."""
+        number = _read_number(given, self.unit)
+        if number is None:
+            say = f"Type a number in {self.unit}, such as 2.4; got {given!r}."
+            return Verdict(self.name, "not attempted", say)
+        said = f"{number:g} {self.unit}"
+        if self._close(number, self.value):
+            others = [f"{c.value:g} {self.unit}: {c.why}" for c in self.classics]
+            return Verdict(self.name, "right", f"{said}: right.", (self.why, *others))
+        for classic in self.classics:
+            if self._close(number, classic.value):
+                lines = (classic.why, "Think again, and try another number.")
+                return Verdict(
+                    self.name, "wrong", f"{said}: not this.", lines, named=f"{classic.value:g}"
+                )
+        lines = (self.hint, "Think again, and try another number.")
+        return Verdict(self.name, "wrong", f"{said}: not this.", lines)
+
+    def _close(self, number: float, value: float) -> bool:
+        return math.isclose(number, value, rel_tol=self.tolerance, abs_tol=1e-12)
+
+    @property
+    def example(self) -> str:
+        return "1.0"
+
+    def input_widget(self) -> Any:
+        import ipywidgets
+
+        return ipywidgets.Text(placeholder=f"a number in {self.unit}")
+
+
+def _read_number(given: Any, unit: str) -> float | None:
+    """The number in the student's answer, or None; a decimal comma and the unit are accepted."""
+    text = str(given).strip().removesuffix(unit).strip().replace("\N{MINUS SIGN}", "-")
+    if re.fullmatch(r"[+-]?\d+,\d+", text):
+        text = text.replace(",", ".")
+    try:
+        number = float(text)
+    except ValueError:
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _panel(checkpoint: Checkpoint) -> Any:
+    """The widget: input, a button that commits, and the verdict below."""
+    import ipywidgets
+
+    field = checkpoint.input_widget()
+    button = ipywidgets.Button(description="Commit", tooltip="Commit this answer")
+    said = ipywidgets.HTML()
+
+    def commit(_: Any) -> None:
+        if field.value in (None, ""):
+            said.value = "<em>Choose or type an answer first.</em>"
+        else:
+            said.value = checkpoint.answer(field.value)._repr_html_()
+
+    button.on_click(commit)
+    return ipywidgets.VBox([field, button, said])

@@ -1,0 +1,299 @@
+"""Checks of a learner's function that name the mistake.
+
+The right answer is written as a few named *steps*. A misconception replaces one step by what a
+learner who holds it would write, so a wrong function can be compared with each wrong model on the
+same cases, and with each pair of them. Only an exact match is named: the nearest wrong model
+misleads as soon as there are two mistakes. To add a misconception, write the wrong step:
+
+    @PROJECT.mistake("read", "your p1 and p2 are swapped", "Which of the two multiplies r² + 2x²?")
+    def p1_p2_swapped(k1, k2, p1, p2, k3):
+        return k1, k2, p2, p1, k3
+"""
+
+from __future__ import annotations
+
+import itertools
+import linecache
+import traceback
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from coursekit.lessons import progress
+from coursekit.lessons.verdict import Verdict
+
+Step = Callable[..., Any]
+Model = Callable[..., Any]
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """One wrong step: what it says to the learner, and a question that leads on."""
+
+    name: str
+    step: str
+    says: str
+    ask: str
+    wrong: Step
+
+
+@dataclass
+class Exercise:
+    """A function the learner writes, and all that is known about getting it wrong.
+
+    build(steps) returns the model that uses these steps; `describe(args)` and `show(row)` put a
+    case and one row of a result into words. Cases go from small to large: the first one that
+    fails is shown; the first `per_row` arguments have one row a point. Results agree within
+    `tolerance` (in `unit`) or 1e-6 of their size.
+    """
+
+    name: str
+    build: Callable[[Mapping[str, Step]], Model]
+    steps: dict[str, Step]
+    cases: list[tuple[Any, ...]]
+    per_row: int
+    unit: str
+    tolerance: float
+    describe: Callable[[tuple[Any, ...]], str]
+    show: Callable[[np.ndarray], str]
+    mistakes: list[Mistake] = field(default_factory=list)
+
+    @property
+    def function(self) -> str:
+        """The learner's function's name."""
+        return self.name.rpartition(".")[2]
+
+    def mistake(
+        self, step: str, says: str, ask: str, name: str | None = None
+    ) -> Callable[[Step], Step]:
+        """Decorator that adds a misconception, named after the function unless `name` is given."""
+
+        def add(wrong: Step) -> Step:
+            self.mistakes.append(Mistake(name or wrong.__name__, step, says, ask, wrong))
+            return wrong
+
+        return add
+
+    def model(self, *mistakes: Mistake) -> Model:
+        """The right function with these mistakes built in."""
+        return self.build(self.steps | {m.step: m.wrong for m in mistakes})
+
+    def check(self, function: Callable[..., Any]) -> Verdict:
+        """The verdict on a learner's function; never raises, and notes the attempt."""
+        verdict = self.judge(function)
+        return progress.noted(verdict) if verdict.kind != "not attempted" else verdict
+
+    def judge(self, function: Callable[..., Any]) -> Verdict:
+        """The verdict on a learner's function, without noting it."""
+        if not callable(function):
+            return self._say("not attempted", f"got a {type(function).__name__}, not a function.")
+        runs = [_run(function, args) for args in self.cases]
+        expected = [_run(self.model(), args).value for args in self.cases]
+        unfinished = self._unfinished(runs)
+        if unfinished:
+            return unfinished
+        return self._compare(runs, expected)
+
+    def _unfinished(self, runs: list[Run]) -> Verdict | None:
+        """Not attempted, raised, or something that is not an array of the right shape."""
+        if all(r.value is None and r.error is None for r in runs):
+            return self._say("not attempted", "not attempted yet: it returns None.")
+        for run, args in zip(runs, self.cases, strict=True):
+            if isinstance(run.error, NotImplementedError):
+                return self._say("not attempted", "not attempted yet.")
+            if run.error is not None:
+                return self._say("raised", f"your function raised {run.said}", self._given(args))
+            if run.value is None:
+                return self._say(
+                    "wrong", "it returns None here; is a `return` missing?", self._given(args)
+                )
+            if _as_numbers(run.value) is None:
+                kind = type(run.value).__name__
+                return self._say(
+                    "wrong",
+                    f"it returns a {kind} that is not an array of numbers.",
+                    self._given(args),
+                )
+        return None
+
+    def _compare(self, runs: list[Run], expected: list[np.ndarray]) -> Verdict:
+        values = [v for r in runs if (v := _as_numbers(r.value)) is not None]
+        changed = any(r.changed_input for r in runs)
+        transposed = all(
+            v.shape == e.T.shape and v.shape != e.shape
+            for v, e in zip(values, expected, strict=True)
+            if e.shape[0] != e.shape[1]
+        )
+        if transposed:
+            values = [
+                v.T if v.shape == e.T.shape else v for v, e in zip(values, expected, strict=True)
+            ]
+        for value, want, args in zip(values, expected, self.cases, strict=True):
+            if value.shape != want.shape:
+                text = f"wrong shape: it returns {value.shape}, and {want.shape} is wanted."
+                return self._say("wrong", text, self._given(args))
+        agree = [self._agrees(v, e) for v, e in zip(values, expected, strict=True)]
+        formal = []
+        if changed:
+            formal.append(IN_PLACE)
+        if transposed:
+            formal.append(TRANSPOSED)
+        if all(agree):
+            return self._formal(formal) if formal else self._right()
+        return self._wrong(values, expected, agree, formal)
+
+    def _right(self) -> Verdict:
+        text = f"right. All {len(self.cases)} cases agree to {self.tolerance:g} {self.unit}."
+        return self._say("right", text)
+
+    def _formal(self, formal: list[Mistake]) -> Verdict:
+        if len(formal) > 1:
+            return self._several(formal[0], ())
+        return self._say(
+            "wrong",
+            f"{formal[0].says}. The numbers are right.",
+            formal[0].ask,
+            named=formal[0].name,
+        )
+
+    def _wrong(
+        self,
+        values: list[np.ndarray],
+        expected: list[np.ndarray],
+        agree: list[bool],
+        formal: list[Mistake],
+    ) -> Verdict:
+        count = f"{sum(agree)} of {len(agree)} cases agree."
+        first = agree.index(False)
+        evidence = self._evidence(first, values[first], expected[first])
+        if formal:
+            return self._several(formal[0], (count, evidence))
+        for mistakes in self._combinations():
+            if self._explains(mistakes, values):
+                if len(mistakes) > 1:
+                    return self._several(mistakes[0], (count, evidence))
+                (mistake,) = mistakes
+                return self._say(
+                    "wrong", f"{mistake.says}. {count}", evidence, mistake.ask, named=mistake.name
+                )
+        return self._say(
+            "wrong",
+            f"not right yet. {count}",
+            evidence,
+            "No single mistake that this check knows gives these numbers. Work this "
+            "case by hand, one step at a time, and compare.",
+        )
+
+    def _several(self, first: Mistake, lines: tuple[str, ...]) -> Verdict:
+        return self._say(
+            "wrong",
+            f"more than one mistake. Look first at this: {first.says}.",
+            *lines,
+            first.ask,
+            named=f"several, first {first.name}",
+        )
+
+    def _combinations(self) -> Iterator[tuple[Mistake, ...]]:
+        """Each mistake alone, then each pair of different steps, earlier step first."""
+        order = list(self.steps)
+        yield from ((m,) for m in self.mistakes)
+        for a, b in itertools.combinations(self.mistakes, 2):
+            if a.step != b.step:
+                yield (a, b) if order.index(a.step) < order.index(b.step) else (b, a)
+
+    def _explains(self, mistakes: tuple[Mistake, ...], values: list[np.ndarray]) -> bool:
+        model = self.model(*mistakes)
+        return all(
+            self._agrees(value, _as_numbers(_run(model, args).value))
+            for value, args in zip(values, self.cases, strict=True)
+        )
+
+    def _agrees(self, value: np.ndarray, want: np.ndarray | None) -> bool:
+        return want is not None and np.allclose(
+            value, want, rtol=1e-6, atol=self.tolerance, equal_nan=True
+        )
+
+    def _evidence(self, index: int, value: np.ndarray, want: np.ndarray) -> str:
+        """The row of the first failing case that is furthest off, with its input."""
+        with np.errstate(all="ignore"):
+            off = np.nan_to_num(np.abs(value - want).max(axis=1), nan=np.inf)
+        row = int(off.argmax())
+        args = self.cases[index]
+        single = tuple(a[row : row + 1] for a in args[: self.per_row]) + args[self.per_row :]
+        return (
+            f"{self._given(single)} expected {self.show(want[row])}, "
+            f"yours {self.show(value[row])} {self.unit}."
+        )
+
+    def _given(self, args: tuple[Any, ...]) -> str:
+        return self.describe(args) + ":"
+
+    def _say(self, kind: Any, text: str, *lines: str, named: str | None = None) -> Verdict:
+        return Verdict(self.name, kind, f"{self.function}: {text}", lines, named)
+
+
+IN_PLACE = Mistake(
+    "in_place",
+    "",
+    "your function changes the array it is given",
+    "Whoever calls it loses their points. Which line writes into an argument?",
+    lambda: None,
+)
+TRANSPOSED = Mistake(
+    "transposed",
+    "",
+    "your result is transposed: one column a point, and one row a point is wanted",
+    "What does `np.stack` do with `axis=1`?",
+    lambda: None,
+)
+
+
+@dataclass(frozen=True)
+class Run:
+    """One call of a function on copies of its arguments."""
+
+    value: Any
+    error: BaseException | None = None
+    said: str = ""
+    changed_input: bool = False
+
+
+def _run(function: Callable[..., Any], args: tuple[Any, ...]) -> Run:
+    own = tuple(np.array(a) if isinstance(a, np.ndarray) else a for a in args)
+    try:
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            value = function(*own)
+    except (Exception, SystemExit) as error:  # whatever a learner's code does, the check goes on
+        return Run(None, error, _what_was_raised(error, function))
+    changed = any(
+        isinstance(a, np.ndarray) and not np.array_equal(a, b)
+        for a, b in zip(args, own, strict=True)
+    )
+    return Run(value, changed_input=changed)
+
+
+def _what_was_raised(error: BaseException, function: Callable[..., Any]) -> str:
+    """The exception in words, with the learner's own line that it came from."""
+    said = f"`{type(error).__name__}: {error}`"
+    code = getattr(function, "__code__", None)
+    own = [
+        f
+        for f in traceback.extract_tb(error.__traceback__)
+        if code is not None and f.filename == code.co_filename
+    ]
+    if not own:
+        return said
+    source = linecache.getline(own[-1].filename, own[-1].lineno or 0).strip()
+    return f"{said} at `{source}`" if source else said
+
+
+def _as_numbers(value: Any) -> np.ndarray | None:
+    try:
+        array = np.asarray(value)
+        return array.astype(float) if array.dtype.kind in "fiub" else None
+    except (TypeError, ValueError):
+        return None

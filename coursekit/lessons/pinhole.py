@@ -1,0 +1,655 @@
+"""Notebook 01: its checkpoints, its two exercises and the mistakes that people make in them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from coursekit.lessons.checkpoints import Choice, Classic, Number, Option
+from coursekit.lessons.exercises import Exercise, Model, Step
+
+Array = np.ndarray
+
+# --- project -------------------------------------------------------------------------------------
+
+GENERIC_K = np.array([[612.5, 0.0, 331.4], [0.0, 598.0, 236.8], [0.0, 0.0, 1.0]])
+LESSON_K = np.array([[447.0, 0.0, 424.0], [0.0, 447.0, 240.0], [0.0, 0.0, 1.0]])
+SINGLE = np.array([[0.30, -0.20, 0.90]])
+SEVERAL = np.array([[0.25, 0.40, 0.80], [-0.31, 0.12, 0.55], [0.07, -0.26, 0.62]])
+MIXED = np.array([-0.27, 0.11, 0.0018, -0.0012, 0.05])
+
+
+# The steps of projection. The third of x, y, w is 1 unless somebody forgets to divide by Z.
+
+
+def _normalise(points: Array) -> Any:
+    return points[:, 0] / points[:, 2], points[:, 1] / points[:, 2], 1.0
+
+
+def _read(k1: float, k2: float, p1: float, p2: float, k3: float) -> Any:
+    return k1, k2, p1, p2, k3
+
+
+def _bend(x: Array, y: Array, k1: float, k2: float, p1: float, p2: float, k3: float) -> Any:
+    r2 = x * x + y * y
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+    )
+
+
+def _to_pixels(x: Array, y: Array, w: Any, K: Array) -> Any:
+    return K[0, 0] * x + K[0, 2] * w, K[1, 1] * y + K[1, 2] * w
+
+
+def _image(x: Array, y: Array, bend: Step, to_pixels: Step) -> Any:
+    return to_pixels(*bend(x, y))
+
+
+def _columns(u: Array, v: Array) -> Array:
+    return np.stack([u, v], axis=1)
+
+
+def _build_project(steps: Mapping[str, Step]) -> Model:
+    def project(points: Array, K: Array, dist: Array | None = None) -> Any:
+        x, y, w = steps["normalise"](points)
+
+        def bend(x: Array, y: Array) -> Any:
+            return (x, y) if dist is None else steps["bend"](x, y, *steps["read"](*dist))
+
+        def to_pixels(x: Array, y: Array) -> Any:
+            return steps["to_pixels"](x, y, w, K)
+
+        return steps["columns"](*steps["image"](x, y, bend, to_pixels))
+
+    return project
+
+
+def _tuple(values: Any, places: int) -> str:
+    return "(" + ", ".join(f"{v:.{places}f}" for v in values) + ")"
+
+
+def _short(values: Any) -> str:
+    return "(" + ", ".join(f"{v:g}" for v in values) + ")"
+
+
+def _describe_camera(K: Array, dist: Array | None = None) -> str:
+    text = f"K = {_short((K[0, 0], K[1, 1], K[0, 2], K[1, 2]))} px"
+    return text if dist is None else f"{text}, coefficients {_short(dist)}"
+
+
+def _describe_project(args: tuple[Any, ...]) -> str:
+    points, *camera = args
+    named = "point" if len(points) == 1 else "points"
+    return f"{_describe_camera(*camera)}, {named} {', '.join(_tuple(p, 2) for p in points)} m"
+
+
+PROJECT = Exercise(
+    name="pinhole.project",
+    build=_build_project,
+    steps={
+        "normalise": _normalise,
+        "read": _read,
+        "bend": _bend,
+        "to_pixels": _to_pixels,
+        "image": _image,
+        "columns": _columns,
+    },
+    cases=[
+        (np.array([[0.10, -0.05, 0.45]]), LESSON_K),
+        (SINGLE, LESSON_K),
+        (SINGLE, GENERIC_K),
+        (SEVERAL, GENERIC_K),
+        (SINGLE, LESSON_K, np.array([0.1, 0.0, 0.0, 0.0, 0.0])),
+        (SINGLE, LESSON_K, np.array([0.0, 0.2, 0.0, 0.0, 0.0])),
+        (SINGLE, LESSON_K, np.array([0.0, 0.0, 0.0010, 0.0005, 0.0])),
+        (SINGLE, LESSON_K, np.array([0.0, 0.0, 0.0, 0.0, 0.4])),
+        (SEVERAL, GENERIC_K, MIXED),
+        (SEVERAL[::-1] * [-1, 1, 1], GENERIC_K, MIXED * [1, -2, 3, 2, -1]),
+    ],
+    per_row=1,
+    unit="px",
+    tolerance=1e-3,
+    describe=_describe_project,
+    show=lambda row: _tuple(row, 3),
+)
+
+
+_DIVIDE = (
+    "nothing is divided by Z",
+    "Two points on one ray, one twice as far as the other: do yours land on the same pixel?",
+)
+
+
+@PROJECT.mistake("normalise", *_DIVIDE)
+def no_division(points: Array) -> Any:
+    return points[:, 0], points[:, 1], 1.0
+
+
+@PROJECT.mistake("normalise", *_DIVIDE, name="no_division")
+def homogeneous_without_division(points: Array) -> Any:
+    return points[:, 0], points[:, 1], points[:, 2]
+
+
+_UP = ("your y axis points up", "In which row is a point below the optical axis?")
+
+
+@PROJECT.mistake("normalise", *_UP, name="y_up")
+def y_up_before_distortion(points: Array) -> Any:
+    x, y, w = _normalise(points)
+    return x, -y, w
+
+
+@PROJECT.mistake("to_pixels", *_UP, name="y_up")
+def y_up_after_distortion(x: Array, y: Array, w: Any, K: Array) -> Any:
+    return _to_pixels(x, -y, w, K)
+
+
+@PROJECT.mistake(
+    "to_pixels",
+    "your fx and fy are swapped",
+    "Which entry of K belongs to the columns of the image?",
+)
+def fx_fy_swapped(x: Array, y: Array, w: Any, K: Array) -> Any:
+    return K[1, 1] * x + K[0, 2] * w, K[0, 0] * y + K[1, 2] * w
+
+
+@PROJECT.mistake(
+    "to_pixels",
+    "your cx and cy are swapped",
+    "Which of the two is near half the *width* of the image?",
+)
+def cx_cy_swapped(x: Array, y: Array, w: Any, K: Array) -> Any:
+    return K[0, 0] * x + K[1, 2] * w, K[1, 1] * y + K[0, 2] * w
+
+
+_PRINCIPAL = (
+    "the principal point is forgotten",
+    "Where does a point on the optical axis land, and where does yours put it?",
+)
+
+
+@PROJECT.mistake("to_pixels", *_PRINCIPAL)
+def principal_point_forgotten(x: Array, y: Array, w: Any, K: Array) -> Any:
+    return K[0, 0] * x, K[1, 1] * y
+
+
+@PROJECT.mistake(
+    "to_pixels",
+    "the principal point is subtracted",
+    "A point on the optical axis has x = y = 0. On which pixel must it land?",
+)
+def principal_point_subtracted(x: Array, y: Array, w: Any, K: Array) -> Any:
+    return K[0, 0] * x - K[0, 2] * w, K[1, 1] * y - K[1, 2] * w
+
+
+@PROJECT.mistake("read", "your p1 and p2 are swapped", "Which of the two multiplies r² + 2x²?")
+def p1_p2_swapped(k1: float, k2: float, p1: float, p2: float, k3: float) -> Any:
+    return k1, k2, p2, p1, k3
+
+
+@PROJECT.mistake(
+    "read",
+    "the coefficients are read as (k1, k2, k3, p1, p2)",
+    "OpenCV added k3 when the other four were already there. At which end?",
+)
+def k3_before_p1(k1: float, k2: float, p1: float, p2: float, k3: float) -> Any:
+    return k1, k2, p2, k3, p1
+
+
+@PROJECT.mistake(
+    "read",
+    "the r⁶ term is missing",
+    "Five coefficients come in. Does each of them do something?",
+)
+def r6_missing(k1: float, k2: float, p1: float, p2: float, k3: float) -> Any:
+    return k1, k2, p1, p2, 0.0
+
+
+@PROJECT.mistake(
+    "read",
+    "the tangential terms are missing",
+    "What do p1 and p2 do in your function?",
+)
+def tangential_missing(k1: float, k2: float, p1: float, p2: float, k3: float) -> Any:
+    return k1, k2, 0.0, 0.0, k3
+
+
+_FACTOR = (
+    "a factor 2 is missing in the tangential terms",
+    "There are four twos in them: 2 p1 xy, 2x², 2y² and 2 p2 xy. Count yours.",
+)
+
+
+def _tangential(a: float, b: float) -> Step:
+    """`bend` with the factors a (of p xy) and b (of x², y²) in place of the two twos."""
+
+    def bend(x: Array, y: Array, k1: float, k2: float, p1: float, p2: float, k3: float) -> Any:
+        r2 = x * x + y * y
+        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+        return (
+            x * radial + a * p1 * x * y + p2 * (r2 + b * x * x),
+            y * radial + p1 * (r2 + b * y * y) + a * p2 * x * y,
+        )
+
+    return bend
+
+
+PROJECT.mistake("bend", *_FACTOR, name="factor_2_missing")(_tangential(1, 2))
+PROJECT.mistake("bend", *_FACTOR, name="factor_2_missing")(_tangential(2, 1))
+PROJECT.mistake("bend", *_FACTOR, name="factor_2_missing")(_tangential(1, 1))
+
+
+@PROJECT.mistake(
+    "bend",
+    "x is overwritten before y is computed from it",
+    "Your line for y uses x. Is it still the x you started with?",
+)
+def x_overwritten(x: Array, y: Array, k1: float, k2: float, p1: float, p2: float, k3: float) -> Any:
+    r2 = x * x + y * y
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return x, y
+
+
+@PROJECT.mistake(
+    "bend",
+    "the tangential terms use x and y after the radial factor",
+    "Both kinds of distortion start from the same ideal x and y. Do yours?",
+)
+def tangential_after_radial(
+    x: Array, y: Array, k1: float, k2: float, p1: float, p2: float, k3: float
+) -> Any:
+    r2 = x * x + y * y
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    x, y = x * radial, y * radial
+    return (
+        x + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+    )
+
+
+@PROJECT.mistake(
+    "bend",
+    "the radial polynomial runs in r instead of r²",
+    "With k1 alone, the displacement grows as the third power of the radius. How does yours?",
+)
+def r_for_r2(x: Array, y: Array, k1: float, k2: float, p1: float, p2: float, k3: float) -> Any:
+    r2 = x * x + y * y
+    r = np.sqrt(r2)
+    radial = 1 + k1 * r + k2 * r**2 + k3 * r**3
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+    )
+
+
+@PROJECT.mistake("image", "the distortion is ignored", "What does your function do with `dist`?")
+def distortion_ignored(x: Array, y: Array, bend: Step, to_pixels: Step) -> Any:
+    return to_pixels(x, y)
+
+
+_IN_PIXELS = (
+    "the distortion is applied in pixels",
+    "The polynomial wants x = X/Z, which is about 0.3 near the edge. How large is your r²?",
+)
+
+
+@PROJECT.mistake("image", *_IN_PIXELS, name="distortion_in_pixels")
+def distortion_of_uv(x: Array, y: Array, bend: Step, to_pixels: Step) -> Any:
+    return bend(*to_pixels(x, y))
+
+
+@PROJECT.mistake("image", *_IN_PIXELS, name="distortion_in_pixels")
+def distortion_of_centred_uv(x: Array, y: Array, bend: Step, to_pixels: Step) -> Any:
+    cx, cy = to_pixels(0.0, 0.0)
+    u, v = to_pixels(x, y)
+    u, v = bend(u - cx, v - cy)
+    return u + cx, v + cy
+
+
+@PROJECT.mistake(
+    "columns",
+    "x and y are swapped in the output",
+    "A pixel is (u, v), column first; a NumPy index is [row, column]. Which did you return?",
+)
+def output_swapped(u: Array, v: Array) -> Array:
+    return np.stack([v, u], axis=1)
+
+
+_ROUNDED = (
+    "the pixels are rounded to whole numbers",
+    "A calibrated corner is known to a tenth of a pixel. What is left of that?",
+)
+
+
+@PROJECT.mistake("columns", *_ROUNDED)
+def rounded(u: Array, v: Array) -> Array:
+    return np.rint(np.stack([u, v], axis=1))
+
+
+@PROJECT.mistake("columns", *_ROUNDED, name="rounded")
+def truncated(u: Array, v: Array) -> Array:
+    return np.trunc(np.stack([u, v], axis=1))
+
+
+# --- deproject -----------------------------------------------------------------------------------
+
+
+def _to_normalised(pixels: Array, K: Array) -> Any:
+    return (pixels[:, 0] - K[0, 2]) / K[0, 0], (pixels[:, 1] - K[1, 2]) / K[1, 1]
+
+
+def _unbend(x: Array, y: Array, dist: Array) -> Any:
+    xd, yd = x, y
+    for _ in range(100):
+        bent_x, bent_y = _bend(x, y, *dist)
+        x, y = x + xd - bent_x, y + yd - bent_y
+    return x, y
+
+
+def _scale(x: Array, y: Array, depth: Array) -> Any:
+    return x * depth, y * depth, depth
+
+
+def _points(X: Array, Y: Array, Z: Array) -> Array:
+    return np.stack([X, Y, Z], axis=1)
+
+
+def _build_deproject(steps: Mapping[str, Step]) -> Model:
+    def deproject(pixels: Array, depth: Array, K: Array, dist: Array | None = None) -> Any:
+        x, y = steps["to_normalised"](pixels, K)
+        if dist is not None:
+            x, y = steps["unbend"](x, y, dist)
+        return steps["points"](*steps["scale"](x, y, depth))
+
+    return deproject
+
+
+def _describe_deproject(args: tuple[Any, ...]) -> str:
+    pixels, depth, *camera = args
+    what = ", ".join(f"{_tuple(p, 1)} px at {z:.2f} m" for p, z in zip(pixels, depth, strict=True))
+    named = "pixel" if len(pixels) == 1 else "pixels"
+    return f"{_describe_camera(*camera)}, {named} {what}"
+
+
+_PIXEL = np.array([[600.0, 140.0]])
+_PIXELS = np.array([[600.0, 140.0], [52.5, 310.2], [400.1, 20.8]])
+_DEPTHS = np.array([0.90, 0.55, 0.62])
+
+DEPROJECT = Exercise(
+    name="pinhole.deproject",
+    build=_build_deproject,
+    steps={
+        "to_normalised": _to_normalised,
+        "unbend": _unbend,
+        "scale": _scale,
+        "points": _points,
+    },
+    cases=[
+        (_PIXEL, _DEPTHS[:1], LESSON_K),
+        (_PIXEL, _DEPTHS[:1], GENERIC_K),
+        (_PIXELS, _DEPTHS, GENERIC_K),
+        (_PIXEL, _DEPTHS[:1], LESSON_K, np.array([0.1, 0.0, 0.0, 0.0, 0.0])),
+        (_PIXEL, _DEPTHS[:1], LESSON_K, np.array([0.0, 0.0, 0.0010, 0.0005, 0.0])),
+        (_PIXELS, _DEPTHS, GENERIC_K, MIXED),
+    ],
+    per_row=2,
+    unit="m",
+    tolerance=1e-5,
+    describe=_describe_deproject,
+    show=lambda row: _tuple(row, 4),
+)
+
+
+@DEPROJECT.mistake(
+    "scale",
+    "the depth is taken along the ray instead of along Z",
+    "A wall faces the camera. Does your function give all its pixels the same Z?",
+)
+def depth_along_ray(x: Array, y: Array, depth: Array) -> Any:
+    length = np.sqrt(x * x + y * y + 1)
+    return x * depth / length, y * depth / length, depth / length
+
+
+@DEPROJECT.mistake(
+    "to_normalised",
+    "K is applied where its inverse is needed",
+    "K takes rays to pixels. Which way does this function go?",
+)
+def inverse_missing(pixels: Array, K: Array) -> Any:
+    return K[0, 0] * pixels[:, 0] + K[0, 2], K[1, 1] * pixels[:, 1] + K[1, 2]
+
+
+@DEPROJECT.mistake("to_normalised", *_PRINCIPAL, name="principal_point_forgotten")
+def principal_point_not_subtracted(pixels: Array, K: Array) -> Any:
+    return pixels[:, 0] / K[0, 0], pixels[:, 1] / K[1, 1]
+
+
+@DEPROJECT.mistake(
+    "to_normalised",
+    "your fx and fy are swapped",
+    "Which entry of K belongs to the columns of the image?",
+    name="fx_fy_swapped",
+)
+def fx_fy_swapped_back(pixels: Array, K: Array) -> Any:
+    return (pixels[:, 0] - K[0, 2]) / K[1, 1], (pixels[:, 1] - K[1, 2]) / K[0, 0]
+
+
+@DEPROJECT.mistake(
+    "to_normalised",
+    "x and y are swapped in the input",
+    "A pixel is (u, v), column first. Which of your lines uses u?",
+)
+def input_swapped(pixels: Array, K: Array) -> Any:
+    return _to_normalised(pixels[:, ::-1], K)
+
+
+@DEPROJECT.mistake("to_normalised", *_UP, name="y_up")
+def y_up_back(pixels: Array, K: Array) -> Any:
+    x, y = _to_normalised(pixels, K)
+    return x, -y
+
+
+_MILLIMETRES = (
+    "your points are not in metres",
+    "The depth comes in metres and the points leave in metres. What do you multiply it by?",
+)
+
+
+@DEPROJECT.mistake("scale", *_MILLIMETRES, name="millimetres")
+def times_thousand(x: Array, y: Array, depth: Array) -> Any:
+    return 1000 * x * depth, 1000 * y * depth, 1000 * depth
+
+
+@DEPROJECT.mistake("scale", *_MILLIMETRES, name="millimetres")
+def through_thousand(x: Array, y: Array, depth: Array) -> Any:
+    return x * depth / 1000, y * depth / 1000, depth / 1000
+
+
+@DEPROJECT.mistake(
+    "scale",
+    "x and y are not multiplied by the depth",
+    "Two pixels of one ray at 0.5 m and at 1 m: is X the same for both?",
+)
+def not_scaled(x: Array, y: Array, depth: Array) -> Any:
+    return x, y, depth
+
+
+@DEPROJECT.mistake("unbend", "the distortion is ignored", "What does your function do with `dist`?")
+def coefficients_ignored(x: Array, y: Array, dist: Array) -> Any:
+    return x, y
+
+
+@DEPROJECT.mistake(
+    "unbend",
+    "the distortion is applied once more instead of being inverted",
+    "Project your answer. Do you come back to the pixel that you started from?",
+)
+def distorted_again(x: Array, y: Array, dist: Array) -> Any:
+    return _bend(x, y, *dist)
+
+
+_ONE_STEP = (
+    "the inversion stops after one step (flipping the signs of the coefficients is one, too)",
+    "Project your answer: close, but not back. What would a second step do?",
+)
+
+
+@DEPROJECT.mistake("unbend", *_ONE_STEP, name="one_step")
+def one_step(x: Array, y: Array, dist: Array) -> Any:
+    bent_x, bent_y = _bend(x, y, *dist)
+    return 2 * x - bent_x, 2 * y - bent_y
+
+
+@DEPROJECT.mistake("unbend", *_ONE_STEP, name="one_step")
+def one_division(x: Array, y: Array, dist: Array) -> Any:
+    k1, k2, p1, p2, k3 = dist
+    r2 = x * x + y * y
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    return (
+        (x - 2 * p1 * x * y - p2 * (r2 + 2 * x * x)) / radial,
+        (y - p1 * (r2 + 2 * y * y) - 2 * p2 * x * y) / radial,
+    )
+
+
+EXERCISES = [PROJECT, DEPROJECT]
+
+# --- checkpoints ---------------------------------------------------------------------------------
+
+CHECKPOINTS = [
+    Choice(
+        name="pinhole.twice_as_far",
+        question="A point is 30 px right of the principal point. It moves straight away from the "
+        "camera, along Z, to twice its depth. Where is its image now?",
+        options=(
+            Option(
+                "30 px right of it",
+                "That would mean that size does not depend on distance. A point that stays 30 px "
+                "out moves along its *ray*, not along Z.",
+            ),
+            Option(
+                "15 px right of it",
+                "u - cx = fx X / Z: X stays, Z doubles, the offset halves. That is why distant "
+                "things look small and why one pixel covers more of them.",
+                right=True,
+            ),
+            Option(
+                "7.5 px right of it",
+                "A quarter is how *area* shrinks, or brightness. A length is divided by Z once.",
+            ),
+            Option(
+                "60 px right of it",
+                "Farther away is smaller in the image: Z stands in the denominator of x = f X / Z.",
+            ),
+        ),
+    ),
+    Number(
+        name="pinhole.pitch",
+        question="A lens with f = 10 mm in front of a sensor with 10 µm pixels has fx = 1000 px. "
+        "The sensor is replaced by one with 5 µm pixels. What is fx now, in px?",
+        value=2000.0,
+        unit="px",
+        why="fx = f / pitch = 0.010 m / 0.000005 m. The lens has not changed, and neither has the "
+        "field of view of each millimetre of sensor; the ruler that measures f has.",
+        hint="fx is the focal length measured in pixels: f divided by the pixel pitch.",
+        classics=(
+            Classic(1000.0, "The lens is the same, but fx counts *pixels*, and those are smaller."),
+            Classic(500.0, "Smaller pixels mean more of them along the same focal length."),
+            Classic(50.0, "That is 10 × 5. f is divided by the pitch, not multiplied by it."),
+            Classic(2.0, "Check the units: 10 mm are 10 000 µm."),
+        ),
+    ),
+    Choice(
+        name="pinhole.half_size",
+        question="You scale the 1280x720 image down to 640x360. What happens to K?",
+        options=(
+            Option(
+                "nothing, the lens is the same",
+                "The lens is, the pixels are not: each is twice as large, so f measured in pixels "
+                "is half. K belongs to an *image size*, not to a camera alone.",
+            ),
+            Option(
+                "fx and fy halve, cx and cy stay",
+                "Then the optical axis would meet the small image near its right lower corner.",
+            ),
+            Option(
+                "all four halve (cx and cy up to a quarter pixel)",
+                "Everything measured in pixels shrinks with the pixels. The quarter pixel is the "
+                "convention: (0, 0) is the *centre* of a pixel, so cx becomes "
+                "(cx + 0.5) / 2 - 0.5.",
+                right=True,
+            ),
+            Option(
+                "cx and cy halve, fx and fy stay",
+                "Then the field of view would halve too. Cropping does something like that (it "
+                "keeps fx and moves cx); scaling does not.",
+            ),
+        ),
+    ),
+    Number(
+        name="pinhole.same_size",
+        question="The face of the 60 mm block, 0.45 m away, is as wide in the image as the face "
+        "of the 25 mm cube. How far away is the cube, in m?",
+        value=0.1875,
+        unit="m",
+        why="Equal width in the image means equal X / Z: 25 / Z = 60 / 0.45. From one colour image "
+        "alone you could not have told the two apart.",
+        hint="Equal size in the image means equal ratio of size to distance.",
+        classics=(
+            Classic(1.08, "Upside down: the smaller thing has to be *nearer* to look as large."),
+            Classic(0.45, "At the same distance the smaller cube looks smaller."),
+            Classic(0.415, "Sizes are divided by distance, not subtracted from it."),
+            Classic(0.0781, "A length goes with 1/Z, not with 1/Z²."),
+        ),
+    ),
+    Choice(
+        name="pinhole.exact_centre",
+        question="A calibration of a 640x480 camera returns the principal point (319.5, 239.5), "
+        "exact to the last digit. What do you conclude?",
+        options=(
+            Option(
+                "an excellent lens",
+                "Lenses are glued to within tens of micrometres, and pixels measure a few. The "
+                "cameras in this course are 0.1 to 22 px off centre.",
+            ),
+            Option(
+                "nothing was estimated: that is the image centre, held fixed",
+                "(640 - 1) / 2 = 319.5 is the centre when (0, 0) is the centre of the first pixel. "
+                "A number that was *measured* has digits that nobody would choose.",
+                right=True,
+            ),
+            Option(
+                "the image was rectified",
+                "Rectified streams have a principal point of their own, and it is as crooked as "
+                "any: this camera's depth stream is an example.",
+            ),
+            Option(
+                "the calibration is half a pixel off: the centre is (320, 240)",
+                "That is the other convention, in which (0, 0) is the *corner* of the first "
+                "pixel. OpenCV and RealSense put it at the centre.",
+            ),
+        ),
+    ),
+    Number(
+        name="pinhole.range",
+        question="K = (447, 447, 424, 240). The pixel (0, 240), at the left edge, has depth "
+        "0.45 m. How far is that point from the camera's centre, in m?",
+        value=0.45 * math.hypot(1.0, 424 / 447),
+        unit="m",
+        why="Depth is Z, along the optical axis. The point is also X = (0 - 424) / 447 × 0.45 = "
+        "-0.427 m to the left, so its distance along the ray is √(0.45² + 0.427²).",
+        hint="Deproject the pixel first: X = (u - cx) Z / fx. Then take the length of (X, Y, Z).",
+        classics=(
+            Classic(0.45, "That is the depth, Z. The point lies far to the left as well."),
+            Classic(0.427, "That is the size of X alone; the point is also 0.45 m in front."),
+            Classic(0.3265, "That takes 0.45 m as the length of the ray and returns its Z."),
+            Classic(0.877, "Lengths at a right angle add as squares, not as numbers."),
+        ),
+    ),
+]

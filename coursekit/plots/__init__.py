@@ -1,0 +1,9 @@
+"""Figures of the notebooks, one module a notebook; each function returns a figure, none shows it."""
+
+from __future__ import annotations
+
+from coursekit.plots import pinhole
+from coursekit.plots.interactive import drag
+from coursekit.plots.style import COLORS, LessonFigure, figure
+
+__all__ = ["COLORS", "LessonFigure", "drag", "figure", "pinhole"]

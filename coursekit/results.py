@@ -1,0 +1,142 @@
+"""The hand-over between notebooks: one JSON file a notebook in `results/`.
+
+Every number carries its unit, its standard deviation, whether it is a bias or noise, and where it
+came from, so that the error budget can say whose numbers it uses.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+if TYPE_CHECKING:
+    from coursekit.cameras import Camera
+
+ROOT = Path(__file__).resolve().parent.parent
+FORMAT = 1
+Source = Literal["live", "recorded", "simulated", "reference"]
+Kind = Literal["bias", "noise"]
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A number with its unit.
+
+    sigma: one standard deviation in the same unit, None where nobody has measured it (then `note`
+    says so). kind: "bias" for what repeats, "noise" for what averages down, None for neither.
+    """
+
+    value: float
+    unit: str
+    sigma: float | None = None
+    kind: Kind | None = None
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        for name in ("value", "sigma"):
+            number = getattr(self, name)
+            if number is None and name == "sigma":
+                continue
+            if not isinstance(number, (int, float)) or not math.isfinite(number):
+                raise ValueError(f"{name}: got {number!r}, want a finite number")
+        if self.sigma is not None and self.sigma < 0:
+            raise ValueError(f"sigma: got {self.sigma}, want a standard deviation >= 0")
+        if self.kind not in (None, *get_args(Kind)):
+            raise ValueError(f"kind: got {self.kind!r}, want 'bias', 'noise' or None")
+        if not self.unit:
+            raise ValueError("unit: got nothing, want for example 'px', 'mm' or '1'")
+
+
+@dataclass(frozen=True)
+class Result:
+    """What one notebook found: quantities by name, and the camera and day they come from."""
+
+    lesson: str
+    source: Source
+    camera: str
+    date: str
+    versions: dict[str, str]
+    quantities: dict[str, Quantity]
+
+
+def folder() -> Path:
+    """Where the hand-over files are: COURSEKIT_RESULTS, else `results/` beside the package."""
+    return Path(os.environ.get("COURSEKIT_RESULTS") or ROOT / "results")
+
+
+def save(lesson: str, camera: Camera, quantities: Mapping[str, Quantity]) -> Path:
+    """Write `results/<lesson>.json` in one step (a reader sees the old file or the new one)."""
+    for name, quantity in quantities.items():
+        if not isinstance(quantity, Quantity):
+            raise ValueError(f"quantities: {name} is a {type(quantity).__name__}, want Quantity")
+    result = Result(lesson, camera.source, camera.name, now(), _versions(), dict(quantities))
+    path = _path(lesson)
+    write_json(path, {"format": FORMAT} | asdict(result))
+    return path
+
+
+def load(lesson: str) -> Result:
+    """Read `results/<lesson>.json`; FileNotFoundError when it is not there, ValueError when damaged."""
+    path = _path(lesson)
+    content = read_json(path)
+    try:
+        if content.pop("format") != FORMAT:
+            raise ValueError("written by another version of the course")
+        quantities = {k: Quantity(**v) for k, v in content.pop("quantities").items()}
+        result = Result(**content, quantities=quantities)
+        if result.source not in get_args(Source):
+            raise ValueError(f"source is {result.source!r}")
+        return result
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path.name}: {error}. Run notebook {lesson} again.") from error
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON to a file beside `path`, then rename it: never half a file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        part.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def read_json(path: Path) -> Any:
+    """The object in a JSON file; ValueError naming the file when it is damaged."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:  # also not UTF-8
+        raise ValueError(f"{path.name}: not a JSON file ({error})") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{path.name}: got a {type(content).__name__}, want an object")
+    return content
+
+
+def now() -> str:
+    """The time, UTC, as ISO 8601 to the second."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def _path(lesson: str) -> Path:
+    if not lesson or not lesson.replace("_", "").isalnum():
+        raise ValueError(f"lesson: got {lesson!r}, want a name like '01_pinhole'")
+    return folder() / f"{lesson}.json"
+
+
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for name in ("coursekit", "numpy", "opencv-python-headless", "pyrealsense2"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
