@@ -1,0 +1,504 @@
+"""course.py without a network: its decisions, and what it says when something is in the way."""
+
+import ast
+import importlib.util
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+REQUIREMENTS = ("requirements.txt", "requirements-test.txt", "requirements-camera.txt")
+posix = pytest.mark.skipif(os.name == "nt", reason="the stand-ins are shell scripts and links")
+
+# Stands in for pip inside the environment: writes down each call, and fails or waits on demand.
+PIP = """
+import os, pathlib, sys, time
+with open("calls.txt", "a") as calls:
+    print(" ".join(sys.argv[1:]), file=calls)
+if os.environ.get("FAIL", "-") in sys.argv:
+    print(os.environ["SAY"])
+    sys.exit(1)
+if os.environ.get("WAIT", "-") in sys.argv:
+    pathlib.Path("pid").write_text(f"{os.getpid()}.")
+    time.sleep(30)
+"""
+
+
+@pytest.fixture
+def project(tmp_path: Path, course: ModuleType) -> Path:
+    """A project folder with the true course.py and small stand-ins for all it installs and runs."""
+    root = tmp_path / "my project"
+    for folder in ("coursekit/simulation", "tools"):
+        (root / folder).mkdir(parents=True)
+    (root / "course.py").write_bytes((ROOT / "course.py").read_bytes())
+    for name in {name for step in course.STEPS for name in step.inputs}:
+        (root / name).write_text(f"# {name}\n")
+    (root / "tools/bench.py").write_text("print('bench ran')\n")
+    (root / "stand-ins/ensurepip").mkdir(parents=True)
+    (root / "stand-ins/ensurepip/__init__.py").touch()
+    (root / "stand-ins/ensurepip/__main__.py").write_text(
+        "import pathlib, sysconfig\n"
+        "folder = pathlib.Path(sysconfig.get_path('purelib'))\n"
+        "(folder / 'pip').mkdir(parents=True)\n"
+        f"(folder / 'pip/__main__.py').write_text({PIP!r})\n"
+        "(folder / 'coursekit').mkdir()\n"
+        "(folder / 'coursekit/__init__.py').touch()\n"
+        "(folder / 'coursekit/warm_up.py').touch()\n"
+    )
+    return root
+
+
+def start(root: Path, *arguments: str, **environment: str) -> subprocess.Popen:
+    """Run the project's course.py with the stand-ins and little of this computer's environment."""
+    program = (
+        "import sys, runpy; sys.argv = sys.argv[1:]\n"
+        "module = runpy.run_path(sys.argv[0], run_name='course')\n"
+        "names = module['set_up'].__globals__\n"
+        "true = names['environment']\n"
+        "names['environment'] = lambda: {**true(), 'PYTHONPATH': 'stand-ins'}\n"
+        "sys.exit(module['main'](sys.argv[1:]))"
+    )
+    return subprocess.Popen(
+        [sys.executable, "-c", program, "course.py", *(arguments or ("bench",))],
+        cwd=root,
+        env={"PATH": str(root), "HOME": str(root), "SYSTEMROOT": "C:\\Windows", **environment},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def run(root: Path, *arguments: str, **environment: str) -> tuple[int, str]:
+    child = start(root, *arguments, **environment)
+    output, _ = child.communicate(timeout=60)
+    assert "Traceback" not in output
+    return child.returncode, output
+
+
+def calls(root: Path) -> list[str]:
+    """What pip was asked to install since the last look."""
+    file = root / "calls.txt"
+    lines = file.read_text().splitlines() if file.exists() else []
+    file.unlink(missing_ok=True)
+    return [line.split()[-1] for line in lines]
+
+
+def pip_waiting(root: Path) -> int:
+    """The process number of the stand-in for pip, once it waits."""
+    for _ in range(1000):
+        if (root / "pid").exists() and (root / "pid").read_text().endswith("."):
+            return int((root / "pid").read_text()[:-1])
+        time.sleep(0.02)
+    raise TimeoutError("the stand-in for pip did not start")
+
+
+@pytest.fixture
+def course(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    spec = importlib.util.spec_from_file_location("course", ROOT / "course.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "course", module)
+    spec.loader.exec_module(module)
+    return module
+
+
+# ---- the state of the environment ---------------------------------------------------------------
+
+ALL = ["requirements.txt", "requirements-camera.txt", "."]
+
+
+def test_first_run_installs_and_second_run_does_nothing(project: Path) -> None:
+    code, output = run(project)
+    assert (code, calls(project)) == (0, ALL), output
+    assert "Setting up the course" in output
+    log = (project / "build/setup.log").read_text()
+    assert log.count("--require-hashes --only-binary :all: -r requirements") == 2
+    overrides = project / ".venv/share/jupyter/lab/settings/overrides.json"
+    notification = json.loads(overrides.read_text())["@jupyterlab/apputils-extension:notification"]
+    assert notification == {"fetchNews": "false", "checkForUpdates": False}
+
+    before = (project / "build/setup.log").stat().st_mtime_ns
+    assert run(project) == (0, "bench ran\n")
+    assert calls(project) == []
+    assert (project / "build/setup.log").stat().st_mtime_ns == before
+
+
+def test_only_what_changed_is_installed_again_in_place(project: Path) -> None:
+    run(project)
+    calls(project)
+    (project / ".venv/kept").touch()
+    for changed, wanted in (
+        ("requirements.txt", ["requirements.txt"]),
+        ("requirements-camera.txt", ["requirements-camera.txt"]),
+        ("pyproject.toml", ["."]),
+        ("requirements-test.txt", []),  # only "test" needs it
+    ):
+        (project / changed).write_text("# changed\n")
+        code, output = run(project)
+        assert (code, calls(project)) == (0, wanted), output
+    assert (project / ".venv/kept").exists()
+    (project / "coursekit/kernels.py").write_text("# changed\n")
+    code, output = run(project)
+    assert (code, calls(project), "Fast parts: done" in output) == (0, [], True)
+
+
+def test_test_adds_its_tools_runs_every_check_and_names_those_that_failed(project: Path) -> None:
+    (project / "tools/build_notebooks.py").write_text("print('checked the notebooks')\n")
+    for name, status in (("ruff", 0), ("mypy", 3), ("pytest", 0)):
+        lines = f"import sys; print('{name}', *sys.argv[1:]); sys.exit({status})"
+        (project / f"{name}.py").write_text(lines)
+    code, output = run(project, "test", "-k", "some")
+    assert "requirements-test.txt" in calls(project)
+    assert code == 1
+    assert output[output.index("--") :].splitlines() == [
+        "-- ruff check",
+        "ruff check",
+        "-- ruff format",
+        "ruff format --check",
+        "-- mypy",
+        "mypy",
+        "-- stored outputs of the notebooks",
+        "checked the notebooks",
+        "-- pytest",
+        "pytest -k some",
+        "Failed: mypy",
+    ]
+    (project / "mypy.py").write_text("")
+    code, output = run(project, "test")
+    assert (code, output.splitlines()[-1]) == (0, "pytest")
+
+
+@posix
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM])
+def test_interrupted_set_up_is_made_anew(project: Path, end: signal.Signals) -> None:
+    child = start(project, WAIT="requirements.txt")
+    pip = pip_waiting(project)
+    (project / ".venv/half-done").touch()
+    os.kill(child.pid, end)
+    os.kill(pip, end)
+    output, _ = child.communicate(timeout=20)
+    assert "Traceback" not in output
+    assert child.returncode != 0
+    assert calls(project) == ["requirements.txt"]
+
+    code, output = run(project)
+    assert (code, calls(project)) == (0, ALL), output
+    assert "Replacing .venv" in output
+    assert not (project / ".venv/half-done").exists()
+
+
+@posix
+def test_second_set_up_waits_even_for_the_orphan_of_a_killed_one(project: Path) -> None:
+    first = start(project, WAIT="requirements.txt")
+    pip = pip_waiting(project)
+    first.kill()
+    second = start(project)
+    assert second.stdout is not None
+    assert second.stdout.readline() == (
+        "Another set-up of this folder is under way: waiting for it to end.\n"
+    )
+    assert calls(project) == ["requirements.txt"]
+    os.kill(pip, signal.SIGKILL)
+    second.communicate(timeout=60)
+    assert (second.returncode, calls(project)) == (0, ALL)
+    first.communicate()
+
+
+@posix
+def test_moved_folder_and_vanished_python_are_repaired(project: Path) -> None:
+    run(project)
+    calls(project)
+    moved = project.with_name("moved")
+    project.rename(moved)
+    code, output = run(moved)
+    assert (code, calls(moved)) == (0, ALL), output
+    python = moved / ".venv/bin/python"
+    python.unlink()
+    python.symlink_to(moved / "no-longer-there")
+    code, output = run(moved)
+    assert (code, calls(moved)) == (0, ALL), output
+
+
+def test_environment_of_somebody_else_is_left_alone(project: Path) -> None:
+    theirs = project / ".venv/pyvenv.cfg"
+    theirs.parent.mkdir()
+    theirs.write_text("home = elsewhere")
+    code, output = run(project)
+    assert code == 1
+    assert "was not made by course.py, so it stays as it is" in output
+    assert "Rename it" in output
+    assert list(theirs.parent.iterdir()) == [theirs]
+    assert theirs.read_text() == "home = elsewhere"
+
+
+@posix
+def test_link_in_place_of_the_environment_is_left_alone(project: Path, tmp_path: Path) -> None:
+    (tmp_path / "precious").mkdir()
+    (project / ".venv").symlink_to(tmp_path / "precious")
+    code, output = run(project)
+    assert (code, "was not made by course.py" in output) == (1, True)
+    assert list((tmp_path / "precious").iterdir()) == []
+
+
+# ---- what is said when something is in the way --------------------------------------------------
+
+
+def test_camera_failure_is_no_obstacle_and_is_retried(project: Path) -> None:
+    code, output = run(project, FAIL="requirements-camera.txt", SAY="os error 28")
+    assert (code, calls(project)) == (0, ALL)
+    assert "the disk is full" in output
+    assert "The simulated camera works all the same" in output
+    assert output.endswith("bench ran\n")
+    run(project)
+    assert calls(project) == ["requirements-camera.txt"]
+    run(project)
+    assert calls(project) == []
+
+
+def test_failed_set_up_says_why_and_names_the_log(project: Path) -> None:
+    failure = "client error: dns error, no such host"
+    code, output = run(project, FAIL="requirements.txt", SAY=failure)
+    assert (code, calls(project)) == (1, ["requirements.txt"])
+    assert "the network did not answer" in output
+    assert "bench ran" not in output
+    log = Path(output.splitlines()[-1].removeprefix("The full output is in "))
+    assert failure in log.read_text()
+    code, output = run(project)
+    assert (code, calls(project), "Replacing" in output) == (0, ALL, False)
+
+
+# What the programs said here when each cause was provoked (addresses and folders shortened).
+SAID = {
+    "pip, hash": (
+        "the course was tested with",
+        "ERROR: THESE PACKAGES DO NOT MATCH THE HASHES FROM THE REQUIREMENTS FILE. If you have "
+        "updated the package versions, please update the hashes.\n"
+        "        Expected sha256 0000\n             Got        c66a",
+    ),
+    "uv, hash": (
+        "the course was tested with",
+        "error: Failed to download `anyio==4.16.0`\n  cause: Hash mismatch for `anyio==4.16.0`",
+    ),
+    "pip, proxy": (
+        "the network",
+        "WARNING: Retrying (Retry(total=0, connect=None)) after connection broken by "
+        "'ProxyError('Cannot connect to proxy.', NewConnectionError('Failed to establish a new "
+        "connection: [Errno 111] Connection refused'))': /anyio/\n"
+        "ERROR: Could not find a version that satisfies the requirement anyio==4.16.0\n"
+        "ERROR: No matching distribution found for anyio==4.16.0",
+    ),
+    "pip, no name server": (
+        "the network",
+        "WARNING: Retrying (Retry(total=0)) after connection broken by 'NewConnectionError('Failed "
+        "to establish a new connection: [Errno -2] Name or service not known')': /anyio/\n"
+        "ERROR: No matching distribution found for anyio==4.16.0",
+    ),
+    "uv, proxy": (
+        "the network",
+        "error: Request failed after 3 retries in 10.3s\n  cause: Failed to fetch: anyio\n"
+        "  cause: client error (Connect)\n  cause: tcp connect error\n"
+        "  cause: Connection refused (os error 111)",
+    ),
+    "uv, no name server": (
+        "the network",
+        "error: Request failed after 3 retries in 8.9s\n  cause: client error (Connect)\n"
+        "  cause: dns error\n  cause: failed to lookup address information",
+    ),
+    "uv, offline": (
+        "the network",
+        "error: No solution found when resolving dependencies\n\nhint: Packages were unavailable "
+        "because the network was disabled.",
+    ),
+    "pip, certificate": (
+        "certificate is not trusted",
+        "There was a problem confirming the ssl certificate: Max retries exceeded (Caused by "
+        "SSLError('[SSL: CERTIFICATE_VERIFY_FAILED] certificate verify failed'))\n"
+        "ERROR: No matching distribution found for anyio==4.16.0",
+    ),
+    "uv, certificate": (
+        "certificate is not trusted",
+        "  cause: error sending request for url\n  cause: client error (Connect)\n"
+        "  cause: invalid peer certificate: UnknownIssuer",
+    ),
+    "pip, disk": (
+        "the disk is full",
+        "Installing collected packages: numpy\nERROR: Could not install packages due to an "
+        "OSError: [Errno 28] No space left on device",
+    ),
+    "uv, disk": (
+        "the disk is full",
+        "error: Failed to install: numpy.whl\n  cause: failed to copy file: No space left on "
+        "device (os error 28)",
+    ),
+    "pip, a retry that went well, then the disk": (
+        "the disk is full",
+        "WARNING: Retrying (Retry(total=4)) after connection broken by 'NewConnectionError('Failed "
+        "to establish a new connection')'\nERROR: OSError: [Errno 28] No space left on device",
+    ),
+    "uv, platform": (
+        "does not exist for this computer",
+        "error: No solution found when resolving dependencies\n  cause: Because "
+        "llvmlite==0.50.0 has no usable wheels, your requirements are unsatisfiable.",
+    ),
+    "system, read-only": (
+        "cannot be written",
+        "[Errno 30] Read-only file system: '.venv'",
+    ),
+    "Windows, in use": (
+        "cannot be written, or is in use",
+        "[WinError 5] Zugriff verweigert: 'python.exe'",
+    ),
+    "something else": (
+        "saying last: boom",
+        "first\nboom\n",
+    ),
+}
+
+
+@pytest.mark.parametrize(("wanted", "said"), SAID.values(), ids=SAID.keys())
+def test_cause_is_recognised(course: ModuleType, wanted: str, said: str) -> None:
+    assert wanted in course.explain(said)
+
+
+def stand_in(folder: Path, name: str, status: int) -> None:
+    file = folder / name
+    file.write_text(f"#!/bin/sh\nexit {status}\n")
+    file.chmod(0o755)
+
+
+@posix
+def test_old_python_is_told_a_command_that_works(
+    course: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    typed = ["course.py", "lab", "--port=9000"]
+    alone = course.too_old((3, 9, 18), typed)
+    assert alone.startswith("This is Python 3.9, and the course needs 3.11 or newer. Install")
+    stand_in(tmp_path, "uv", 0)
+    with_uv = course.too_old((3, 9, 18), typed)
+    assert "\n    uv run --no-project --python 3.12 course.py lab --port=9000\n" in with_uv
+    stand_in(tmp_path, "python3.12", 127)  # like a shim of pyenv with nothing behind it
+    stand_in(tmp_path, "python3.13", 0)
+    newer = course.too_old((3, 10, 1), typed)
+    assert newer.startswith("This is Python 3.10,")
+    assert "\n    python3.13 course.py lab --port=9000\n" in newer
+
+
+def test_old_python_gets_that_far_and_no_further() -> None:
+    source = (ROOT / "course.py").read_text(encoding="utf-8")
+    ast.parse(source, feature_version=(3, 6))
+    program = "import sys; sys.version_info = (3, 9, 18); exec(sys.stdin.read())"
+    old = subprocess.run(
+        [sys.executable, "-c", program], input=source, capture_output=True, text=True, check=False
+    )
+    assert old.returncode == 1
+    assert old.stderr.startswith("This is Python 3.9, and the course needs 3.11 or newer.")
+
+
+def test_missing_ensurepip_names_the_package(
+    course: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    course.require_ensurepip()
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: name != "ensurepip" or None)
+    with pytest.raises(SystemExit, match=r"sudo apt install python3\.\d+-venv") as stopped:
+        course.require_ensurepip()
+    assert "install uv" in str(stopped.value)
+
+
+def test_too_little_space_is_said_before_anything_is_installed(
+    course: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(course, "VENV", tmp_path / ".venv")
+    monkeypatch.setattr(course, "MARKER", tmp_path / ".venv/marker")
+    monkeypatch.setattr(course, "SPACE_BYTES", 10**18)
+    monkeypatch.setattr(course, "must", lambda *_: pytest.fail("installed something"))
+    with pytest.raises(SystemExit, match=r"has \d+\.\d GB free, and the course needs about"):
+        course.create()
+
+
+def test_system_errors_are_sentences(
+    course: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(error: BaseException) -> Callable[[list[str]], int]:
+        def command(_: list[str]) -> int:
+            raise error
+
+        return command
+
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    monkeypatch.setattr(course, "bench", fail(PermissionError(13, "Permission denied", "build")))
+    assert course.main(["bench"]) == 1
+    assert "Permission denied: 'build': a file cannot be written" in capsys.readouterr().err
+    monkeypatch.setattr(course, "bench", fail(KeyboardInterrupt()))
+    assert course.main(["bench"]) == 130
+    assert "Interrupted" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("arguments", "status"), [([], 2), (["--help"], 0), (["labb"], 2)])
+def test_usage(
+    course: ModuleType, arguments: list[str], status: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert course.main(arguments) == status
+    assert "python3 course.py lab" in capsys.readouterr().out
+
+
+def test_environment_leads_nowhere_else(
+    course: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("PYTHONPATH", "PYTHONHOME", "CONDA_PREFIX", "PIP_TARGET", "VIRTUAL_ENV"):
+        monkeypatch.setenv(name, "elsewhere")
+    monkeypatch.setenv("PIP_USER", "1")
+    monkeypatch.setenv("HTTPS_PROXY", "proxy:3128")
+    monkeypatch.setenv("PIP_INDEX_URL", "mirror")
+    environment = course.environment()
+    assert "elsewhere" not in environment.values()
+    assert environment["VIRTUAL_ENV"] == str(ROOT / ".venv")
+    assert environment["PATH"].split(os.pathsep)[0] == str(course.SCRIPTS)
+    assert [environment[name] for name in ("PIP_USER", "HTTPS_PROXY", "PIP_INDEX_URL")] == [
+        "0",
+        "proxy:3128",
+        "mirror",
+    ]
+
+
+# ---- the files beside it ------------------------------------------------------------------------
+
+
+def test_conda_installs_the_same() -> None:
+    text = (ROOT / "environment.yml").read_text(encoding="utf-8")
+    assert re.findall(r"^ +- -r (\S+)$", text, re.MULTILINE) == [
+        "requirements.txt",
+        "requirements-camera.txt",
+    ]
+    python = re.search(r"- python=3\.(\d+)$", text, re.MULTILINE)
+    minimum = re.search(
+        r'requires-python = ">=3\.(\d+)"', (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    )
+    assert python is not None
+    assert minimum is not None
+    assert int(minimum[1]) <= int(python[1]) <= 13
+
+
+def test_course_and_project_ask_for_the_same_python(course: ModuleType) -> None:
+    pyproject = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    assert f'requires-python = ">={course.MINIMUM[0]}.{course.MINIMUM[1]}"' in pyproject
+
+
+@pytest.mark.parametrize("name", REQUIREMENTS)
+def test_requirements_are_pinned_hashed_and_without_addresses(name: str) -> None:
+    text = (ROOT / name).read_text(encoding="utf-8")
+    assert not re.search(r"://|^\s*-(i|f)\b|index|find-links|trusted-host", text, re.MULTILINE)
+    entries = re.split(r"\n(?=\S)", text.strip())
+    pinned = re.compile(r"[\w.-]+==\S+( ; [^\\]+)? \\\n +--hash=sha256:[0-9a-f]{64}")
+    assert [entry for entry in entries if not pinned.match(entry)] == []
+    assert len(entries) >= 3
