@@ -1,0 +1,321 @@
+"""Rendered scenes against geometry done another way: triangles, planes, counting pixels."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from coursekit.geometry import Intrinsics, invert_transform, make_transform, project
+from coursekit.simulation import Box, raycast, render, tabletop
+from coursekit.specifications import device, lens
+
+UNIT = device("D435").unit
+NAMES = ["wall", "table", "60 mm block", "25 mm cube"]
+WALL, TABLE, BLOCK, CUBE = range(4)
+
+
+def box_triangles(box: Box, T_camera_scene: np.ndarray) -> np.ndarray:
+    """The 12 triangles of a box, (12, 3 corners, 3), in the camera frame."""
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+    corners = signs * box.size_m / 2
+    T = T_camera_scene @ box.T_scene_box
+    corners = corners @ T[:3, :3].T + T[:3, 3]
+    triangles = []
+    for axis in range(3):
+        for sign in (-1, 1):
+            face = np.flatnonzero(signs[:, axis] == sign)  # in the order --, -+, +-, ++
+            triangles += [corners[face[[0, 1, 2]]], corners[face[[3, 1, 2]]]]
+    return np.array(triangles)
+
+
+def moeller_trumbore(rays: np.ndarray, scene: tuple[Box, ...], T_scene_camera: np.ndarray):
+    """Depth along rays (n, 3) with Z = 1 and the box each hits, from triangles alone."""
+    T_camera_scene = np.linalg.inv(T_scene_camera)
+    triangles = np.concatenate([box_triangles(box, T_camera_scene) for box in scene])
+    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
+    edge1, edge2 = b - a, c - a
+    p = np.cross(rays[:, None], edge2)
+    determinant = np.einsum("rtk,tk->rt", p, edge1)
+    q = np.cross(-a, edge1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = -np.einsum("rtk,tk->rt", p, a) / determinant
+        v = rays @ q.T / determinant
+        t = np.einsum("tk,tk->t", q, edge2) / determinant
+    tolerance = 1e-12  # on the diagonal shared by two triangles either may claim the ray
+    inside = (u >= -tolerance) & (v >= -tolerance) & (u + v <= 1 + tolerance) & (t > 0)
+    t = np.where(inside, t, np.inf)
+    nearest = t.argmin(axis=1)
+    depth = t[np.arange(len(rays)), nearest]
+    hit = np.isfinite(depth)
+    return np.where(hit, depth, 0.0), np.where(hit, nearest // 12, -1)
+
+
+def pose(yaw_pitch_roll_deg: tuple[float, float, float], translation: tuple[float, float, float]):
+    """A camera that turns right by the yaw, then up by the pitch, then rolls."""
+    return make_transform(Rotation.from_euler("YXZ", yaw_pitch_roll_deg, degrees=True), translation)
+
+
+# librealsense's extrinsics are float32; made orthonormal to 1e-16 for a comparison to 1e-9
+BESIDE = invert_transform(UNIT.T_color_depth)
+BESIDE = make_transform(Rotation.from_matrix(BESIDE[:3, :3]), BESIDE[:3, 3])
+
+CAMERAS = {
+    "depth": (UNIT.depth, np.eye(4)),
+    "colour beside it": (UNIT.color, BESIDE),
+    "from above": (UNIT.color, pose((10, -40, 3), (0.05, -0.35, 0.10))),
+    "rolled, from the side": (UNIT.depth, pose((-68, -8, 85), (0.42, -0.08, 0.33))),
+    "distorted": (lens("opencv_left").intrinsics, np.eye(4)),
+    "wide": (lens("duckiebot_wide").intrinsics, pose((25, -20, -10), (-0.2, -0.1, 0.05))),
+}
+
+
+@pytest.mark.parametrize("which", CAMERAS)
+def test_random_rays_agree_with_moeller_trumbore(which):
+    intrinsics, T_scene_camera = CAMERAS[which]
+    scene = tabletop(0.45)
+    result = render(scene, intrinsics, T_scene_camera)
+    rng = np.random.default_rng(20)
+    v, u = np.divmod(rng.choice(result.depth_m.size, 3000, replace=False), result.depth_m.shape[1])
+    small = np.argwhere(result.object_index >= BLOCK)  # they cover few pixels: take some on purpose
+    v, u = np.concatenate([np.stack([v, u]), small[rng.integers(len(small), size=500)].T], axis=1)
+    xy = cv2.undistortPointsIter(
+        np.stack([u, v], -1).astype(float)[:, None],
+        intrinsics.K,
+        np.array(intrinsics.coeffs),
+        None,
+        None,
+        (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 500, 1e-15),
+    )[:, 0]
+    rays = np.column_stack([xy, np.ones(len(xy))])
+    depth, index = moeller_trumbore(rays, scene, T_scene_camera)
+    assert np.array_equal(index, result.object_index[v, u])
+    assert set(index) >= {WALL, TABLE, BLOCK, CUBE}
+    np.testing.assert_allclose(result.depth_m[v, u], depth, atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("distance", [0.30, 0.45, 0.60, 1.0, 2.0])
+def test_front_face_has_the_asked_depth_and_size(distance):
+    scene = tabletop(distance)
+    assert [box.name for box in scene] == NAMES
+    result = render(scene, UNIT.depth)
+    face = result.object_index == BLOCK
+    assert np.abs(result.depth_m[face] - distance).max() < 1e-12
+    half = UNIT.depth.fx * 0.030 / distance
+    columns, rows = np.flatnonzero(face.any(axis=0)), np.flatnonzero(face.any(axis=1))
+    left, right = UNIT.depth.cx - half, UNIT.depth.cx + half
+    assert columns.tolist() == list(range(int(np.ceil(left)), int(np.floor(right)) + 1))
+    top, bottom = UNIT.depth.cy - half, UNIT.depth.cy + half
+    assert rows.tolist() == list(range(int(np.ceil(top)), int(np.floor(bottom)) + 1))
+    assert face.sum() == len(columns) * len(rows)
+
+
+@pytest.mark.parametrize("distance", [0.30, 0.45, 0.60])
+def test_table_and_wall_have_the_depth_of_their_planes(distance):
+    result = render(tabletop(distance, wall_behind_m=0.4), UNIT.depth)
+    wall = result.object_index == WALL
+    np.testing.assert_allclose(result.depth_m[wall], distance + 0.4, atol=1e-12)
+    v, u = np.nonzero(result.object_index == TABLE)
+    depth = result.depth_m[v, u]
+    front = depth.min()
+    top = depth > front + 1e-9  # the table's own front face is the nearest part of it
+    np.testing.assert_allclose(
+        depth[top], UNIT.depth.fy * 0.030 / (v[top] - UNIT.depth.cy), rtol=1e-12
+    )
+    assert front < distance - 0.1
+    assert top.mean() > 0.4
+
+
+def test_both_cameras_see_the_whole_of_both_objects():
+    for distance in (0.30, 0.45, 0.60):
+        scene = tabletop(distance)
+        for box in scene[BLOCK:]:
+            signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+            corners = signs * box.size_m / 2 @ box.T_scene_box[:3, :3].T + box.T_scene_box[:3, 3]
+            for intrinsics, T in (
+                (UNIT.depth, np.eye(4)),
+                (UNIT.color, UNIT.T_color_depth),
+            ):
+                pixels = project(corners @ T[:3, :3].T + T[:3, 3], intrinsics.K)
+                assert (pixels > 20).all()
+                assert (pixels < np.array(intrinsics.size) - 20).all()
+
+
+def test_moving_the_camera_is_moving_the_scene_the_other_way():
+    T_scene_camera = pose((-8, 12, 20), (0.03, -0.10, -0.05))
+    T_camera_scene = np.linalg.inv(T_scene_camera)
+    moved = tuple(
+        Box(box.name, box.size_m, T_camera_scene @ box.T_scene_box, box.color, box.texture)
+        for box in tabletop()
+    )
+    camera_moved, scene_moved = (
+        render(tabletop(), UNIT.color, T_scene_camera),
+        render(moved, UNIT.color),
+    )
+    np.testing.assert_allclose(camera_moved.depth_m, scene_moved.depth_m, atol=1e-12)
+    assert (np.abs(camera_moved.color.astype(int) - scene_moved.color) <= 1).all()
+
+
+def test_nothing_hit_is_depth_0_and_index_minus_1():
+    one = (Box("far left", (0.1, 0.1, 0.1), pose((0, 0, 0), (-0.3, 0, 1.0)), (1, 0, 0)),)
+    result = render(one, UNIT.depth)
+    hit = result.object_index == 0
+    assert 0 < hit.sum() < 10_000
+    assert (result.object_index[~hit] == -1).all()
+    assert (result.depth_m[~hit] == 0).all()
+    assert (result.depth_m[hit] >= 0.95 - 1e-12).all()
+    behind = render(one, UNIT.depth, pose((180, 0, 0), (0, 0, 0)))
+    empty = render((), UNIT.depth)
+    for result in (behind, empty):
+        assert not result.depth_m.any()
+        assert (result.object_index == -1).all()
+        assert (result.color == result.color[0, 0]).all()
+
+
+def test_a_pixel_past_the_fold_of_the_distortion_hits_nothing():
+    folds = Intrinsics(320, 240, 120, 120, 160, 120, "brown_conrady", (-0.35, 0, 0, 0, 0))
+    index = render(tabletop(), folds).object_index
+    assert index[120, 160] == BLOCK
+    assert index[0, 0] == -1
+
+
+def test_shapes_types_and_repeatability():
+    first, second = (render(tabletop(), UNIT.color) for _ in range(2))
+    assert (first.depth_m.dtype, first.depth_m.shape) == (np.float64, (480, 640))
+    assert (first.object_index.dtype, first.object_index.shape) == (np.int16, (480, 640))
+    assert (first.color.dtype, first.color.shape) == (np.uint8, (480, 640, 3))
+    for name in ("depth_m", "object_index", "color"):
+        assert np.array_equal(getattr(first, name), getattr(second, name))
+
+
+def test_colours_tell_the_objects_apart():
+    result = render(tabletop(), UNIT.color, invert_transform(UNIT.T_color_depth))
+    wall, table, block, cube = (
+        np.median(result.color[result.object_index == i], axis=0) for i in range(4)
+    )
+    assert np.ptp(block) < 20  # grey
+    assert cube[0] > cube[1] > cube[2] + 80  # orange
+    assert table[0] > table[2] + 30  # brown
+    assert wall.min() > block.max()  # the block stands out against the wall
+    face = result.color[result.object_index == BLOCK].astype(int)
+    assert face.min() > 60  # the lamp shines on the face
+    assert face.max() < 255
+
+
+def test_lambert_shading_of_a_wall_in_plain_light():
+    """Brightness is ambient + diffuse * cosine, for a lamp at (-0.25, -0.40, -0.10) m."""
+    wall = (Box("wall", (4, 4, 0.1), pose((0, 0, 0), (0, 0, 1.05)), (1.0, 0.5, 0.25)),)
+    color = render(wall, UNIT.color).color
+    for u, v in ((10, 20), (320, 240), (630, 470)):
+        point = np.linalg.solve(UNIT.color.K, [u, v, 1])
+        to_lamp = np.array([-0.25, -0.40, -0.10]) - point
+        brightness = 0.42 - 0.58 * to_lamp[2] / np.linalg.norm(to_lamp)
+        assert np.abs(color[v, u] - 255 * brightness * np.array([1.0, 0.5, 0.25])).max() < 0.6
+
+
+@pytest.mark.parametrize("which", ["depth", "distorted"])
+def test_the_colour_image_is_where_the_geometry_says(which):
+    """The centre of a small plate, weighted by its colour, is where its centre projects."""
+    intrinsics, _ = CAMERAS[which]
+    for centre in ((0.0, 0.0, 1.0), (-0.31, 0.17, 1.0), (0.35, -0.2, 1.0)):
+        plate = Box("plate", (0.06, 0.06, 1e-4), pose((0, 0, 0), centre), (1, 1, 1))
+        light = render((plate,), intrinsics).color[..., 0].astype(float)
+        light -= light.min()
+        v, u = np.indices(light.shape)
+        found = np.array([(u * light).sum(), (v * light).sum()]) / light.sum()
+        assert np.abs(found - project(centre, intrinsics.K, intrinsics.dist)).max() < 0.2
+
+
+def test_the_wall_has_a_line_every_100_mm():
+    rows = []
+    for texture in ("grid", "plain"):
+        wall = Box("wall", (4, 4, 0.1), pose((0, 0, 0), (0, 0, 1.05)), (1, 1, 1), texture)
+        rows.append(render((wall,), UNIT.color).color[210, :, 0].astype(float))
+    step = UNIT.color.fx * 0.100
+    lines = UNIT.color.cx + step * np.arange(-5, 6)
+    lines = lines[(lines > 2) & (lines < 636)]
+    dark = np.flatnonzero(rows[0] < 0.95 * rows[1])
+    assert len(lines) == 11
+    assert np.abs(dark[:, None] - lines).min(axis=0).max() <= 1
+    assert np.abs(dark[:, None] - lines).min(axis=1).max() <= 2
+
+
+def test_a_hit_names_the_face_and_where_on_it():
+    """Rays from outside to chosen points of each face of a turned box."""
+    size = np.array([0.2, 0.3, 0.4])
+    T = pose((25, -40, 70), (0.1, -0.2, 1.5))
+    row = np.concatenate([T[:3, 3], size / 2, T[:3, :3].ravel()])[None]
+    rng = np.random.default_rng(8)
+    for face in range(6):
+        axis, sign = face // 2, 2 * (face % 2) - 1
+        others = [k for k in range(3) if k != axis]
+        point = rng.uniform(-0.45, 0.45, 3) * size
+        point[axis] = sign * size[axis] / 2
+        start = rng.uniform(-0.3, 0.3, 3)
+        start[axis] = sign * 0.9
+        start_out, point_out = T[:3, :3] @ start + T[:3, 3], T[:3, :3] @ point + T[:3, 3]
+        t, index, hit_face, p, q = raycast.nearest_hit(
+            row, *start_out, *(point_out - start_out) / 2
+        )
+        assert (index, hit_face) == (0, face)
+        assert (t, p, q) == pytest.approx((2, *point[others]), abs=1e-12)
+        outwards = start_out - point_out
+        assert raycast.nearest_hit(row, *start_out, *outwards)[1] == -1
+        assert raycast.nearest_hit(row, *T[:3, 3], *outwards)[1] == -1  # from inside
+    assert raycast.nearest_hit(row, 0.0, 0.0, 0.0, np.nan, 0.0, 1.0)[1] == -1
+
+
+def test_a_ray_along_a_face_hits_where_it_should():
+    unit = np.array([[0, 0, 2, 0.5, 0.5, 0.5, 1, 0, 0, 0, 1, 0, 0, 0, 1]], float)
+    assert raycast.nearest_hit(unit, 0.4, -0.2, 0.0, 0.0, 0.0, 1.0) == (1.5, 0, 4, 0.4, -0.2)
+    assert raycast.nearest_hit(unit, 0.6, 0.0, 0.0, 0.0, 0.0, 1.0)[1] == -1
+
+
+def test_the_block_throws_its_shadow_away_from_the_lamp():
+    """The lamp is up and to the left: the table is dark behind the block's right edge."""
+    result = render(tabletop(0.45), UNIT.color)
+
+    def brightness(x_m: float) -> float:
+        u, v = np.rint(project((x_m, 0.030, 0.47), UNIT.color.K)).astype(int)
+        assert result.object_index[v, u] == TABLE
+        return result.color[v, u].astype(float).mean()
+
+    assert brightness(0.036) < 0.8 * brightness(-0.036)
+
+
+def test_bad_input_is_named():
+    scene, eye = tabletop(), np.eye(4)
+    cases = {
+        "distance_m": [
+            lambda: tabletop(0),
+            lambda: tabletop(-1),
+            lambda: tabletop(float("nan")),
+            lambda: tabletop("0.45"),
+            lambda: tabletop(True),
+        ],
+        "wall_behind_m": [lambda: tabletop(wall_behind_m=0.05)],
+        "scene": [lambda: render(scene[0], UNIT.depth), lambda: render(("wall",), UNIT.depth)],
+        "intrinsics": [lambda: render(scene, UNIT.depth.K)],
+        "T_scene_camera": [
+            lambda: render(scene, UNIT.depth, np.eye(3)),
+            lambda: render(scene, UNIT.depth, 2 * eye),
+            lambda: render(scene, UNIT.depth, np.stack([eye, eye])),
+            lambda: render(scene, UNIT.depth, pose((0, 0, 0), (0, 0, 0.48))),  # in the block
+        ],
+        "size_m": [
+            lambda: Box("b", (1, 0, 1), eye, (1, 1, 1)),
+            lambda: Box("b", (1, 1), eye, (1, 1, 1)),
+            lambda: Box("b", (1, 1, np.inf), eye, (1, 1, 1)),
+        ],
+        "T_scene_box": [lambda: Box("b", (1, 1, 1), np.diag([1, 1, -1, 1]), (1, 1, 1))],
+        "color": [
+            lambda: Box("b", (1, 1, 1), eye, (255, 0, 0)),
+            lambda: Box("b", (1, 1, 1), eye, "red"),
+        ],
+        "texture": [lambda: Box("b", (1, 1, 1), eye, (1, 1, 1), "marble")],
+    }
+    for name, calls in cases.items():
+        for call in calls:
+            with pytest.raises(ValueError, match=f"^{name}: "):
+                call()

@@ -1,0 +1,146 @@
+"""The specification files: the figures in them, and what a wrong name or a wrong file says."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from coursekit.geometry import project
+from coursekit.specifications import DATA, device, device_names, lens, lens_names
+
+REAL = os.environ.get("COURSEKIT_REAL_DATA")
+needs_real = pytest.mark.skipif(not REAL, reason="COURSEKIT_REAL_DATA is not set")
+
+
+def test_d435_figures():
+    d435 = device("D435")
+    assert d435.name == "Intel RealSense D435"
+    assert d435.nominal.depth_fx_px() == pytest.approx(446.80, abs=0.005)
+    assert d435.nominal.depth_fx_px(1280) == pytest.approx(674.4, abs=0.05)
+    unit = d435.unit
+    assert unit.depth.size == (848, 480)
+    assert unit.color.size == (640, 480)
+    assert unit.depth.dist is None
+    assert abs(unit.depth.hfov_deg - d435.nominal.depth_hfov_deg) < 3  # the sheet's tolerance
+    assert abs(unit.color.hfov_deg - 55) < 1.5  # 640x480 is cropped from 69 degrees at 16:9
+    assert unit.baseline_m == pytest.approx(d435.nominal.baseline_m, rel=0.01)
+    assert unit.T_color_depth[:3, 3] == pytest.approx([0.0143, 0.0006, 0.0006], abs=1e-4)
+    assert not unit.T_color_depth.flags.writeable
+
+
+def test_the_848_crop_follows_the_rule_that_published_units_follow():
+    """(f, cx, cy) at 640x480 and 848x480 of two units, librealsense 3474, realsense-ros 2788."""
+    ratio = (848 / 1280) / (480 / 800)
+    published = [
+        ((382.918884, 321.015106, 235.879822), (422.806274, 425.120850, 235.450638), 1e-4),
+        ((384.207489, 319.480408, 236.351501), (424.229095, 423.426300, 236.046249), 0.08),
+    ]
+    depth = device("D435").unit.depth
+    bag = (390.43145751953125, 331.38787841796875, 242.18734741210938)
+    for small, large, tolerance in [*published, (bag, (depth.fx, depth.cx, depth.cy), 1e-4)]:
+        predicted = np.array([small[0], small[1] - 320, small[2] - 240]) * ratio + [0, 424, 240]
+        assert predicted[0] == pytest.approx(large[0], abs=1e-4)
+        assert predicted[1:] == pytest.approx(large[1:], abs=tolerance)
+
+
+@pytest.mark.real
+@needs_real
+def test_d435_unit_is_the_recorded_one():
+    recorded = json.loads((Path(REAL) / "realsense_d435/intrinsics.json").read_text())
+    unit = device("D435").unit
+    for mine, theirs in (("fx", "fx"), ("fy", "fy"), ("cx", "ppx"), ("cy", "ppy")):
+        assert getattr(unit.color, mine) == recorded["color"][theirs]
+    extrinsics = recorded["depth_to_color"]
+    rotation = np.reshape(extrinsics["rotation_colmajor"], (3, 3), order="F")
+    assert np.array_equal(unit.T_color_depth[:3, :3], rotation)
+    assert np.array_equal(unit.T_color_depth[:3, 3], extrinsics["translation"])
+
+
+@pytest.mark.real
+@needs_real
+def test_opencv_left_is_the_published_calibration():
+    path = Path(REAL) / "opencv_chessboard/left_intrinsics_published.txt"
+    numbers = [float(n) for n in re.findall(r"-?\d+\.\d+", path.read_text())][:8]
+    left = lens("opencv_left").intrinsics
+    assert numbers == [left.fx, left.cx, left.cy, *left.coeffs]
+
+
+def test_every_entry_loads_and_has_a_source():
+    assert set(device_names()) >= {"D435"}
+    assert set(lens_names()) >= {"opencv_left", "moveit_camera", "d405_color", "duckiebot_wide"}
+    for name in lens_names():
+        entry = lens(name)
+        assert entry.name == name
+        assert len(entry.source) > 20
+        assert entry.intrinsics.dist is not None
+    for name in device_names():
+        assert all(len(source) > 20 for source in device(name).unit.sources.values())
+
+
+@pytest.mark.parametrize("name", lens_names())
+def test_lenses_project_as_opencv_does(name):
+    intrinsics = lens(name).intrinsics
+    rng = np.random.default_rng(5)
+    points = np.column_stack([rng.uniform(-0.4, 0.4, (200, 2)), rng.uniform(0.8, 2.0, 200)])
+    expected, _ = cv2.projectPoints(
+        points, np.zeros(3), np.zeros(3), intrinsics.K, np.array(intrinsics.coeffs)
+    )
+    np.testing.assert_allclose(
+        project(points, intrinsics.K, intrinsics.dist), expected[:, 0], atol=1e-9
+    )
+
+
+def test_the_wide_lens_is_wide():
+    """Angle between the rays through the ends of the middle row, undistorted by OpenCV."""
+    wide = lens("duckiebot_wide").intrinsics
+    ends = np.array([[[-0.5, wide.cy]], [[wide.width - 0.5, wide.cy]]])
+    x = cv2.undistortPointsIter(ends, wide.K, np.array(wide.coeffs), None, None, (3, 1000, 1e-14))[
+        :, 0, 0
+    ]
+    assert np.degrees(np.arctan(x[1]) - np.arctan(x[0])) == pytest.approx(107, abs=0.5)
+
+
+def test_unknown_names_list_the_known_ones():
+    with pytest.raises(ValueError, match=r"no device called 'D999'.*D435"):
+        device("D999")
+    with pytest.raises(ValueError, match=r"no lens called 'fisheye'.*opencv_left.*d405_color"):
+        lens("fisheye")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("baseline_m = 0.0501707\n", "", r"\[D435\]: 'baseline_m' is missing"),
+        ("baseline_m = 0.0501707", "baseline_m = -1", "baseline_m: got -1"),
+        ("baseline_m = 0.0501707", 'baseline_m = "50 mm"', "baseline_m: got '50 mm'"),
+        ("fx = 431.1014\n", "", r"missing \['fx'\]"),
+        ("fx = 431.1014\n", "fx = 431.1014\nfz = 1\n", r"unknown \['fz'\]"),
+        ("depth_hfov_deg = 87.0", "depth_fov = 87.0", "depth_fov"),
+        ('source = "Colour stream of the same recording"\n', "", "'source' is missing"),
+        ("[D435]\n", "[D435\n", "not TOML"),
+    ],
+)
+def test_a_broken_file_is_named(tmp_path, old, new, message):
+    text = (DATA / "devices.toml").read_text(encoding="utf-8")
+    assert old in text
+    (tmp_path / "devices.toml").write_text(text.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(ValueError, match=message) as error:
+        device("D435", tmp_path)
+    assert "devices.toml" in str(error.value)
+
+
+def test_a_missing_file_or_coefficient_is_named(tmp_path):
+    with pytest.raises(ValueError, match=r"devices\.toml is missing"):
+        device("D435", tmp_path)
+    shutil.copy(DATA / "lenses.toml", tmp_path)
+    text = (tmp_path / "lenses.toml").read_text(encoding="utf-8")
+    (tmp_path / "lenses.toml").write_text(text.replace("coeffs = [", "coeffs = [0.0, ", 1))
+    with pytest.raises(ValueError, match=r"\[opencv_left\]: coeffs"):
+        lens("opencv_left", tmp_path)
