@@ -1,0 +1,197 @@
+"""Wrong answers to `deproject` of notebook 01."""
+
+import cv2
+import numpy as np
+
+from wrong_answers import wrong
+
+
+def _bent(x, y, dist):
+    """Where a lens puts the rays (x, y, 1), by OpenCV."""
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1)
+    return cv2.projectPoints(rays, np.zeros(3), np.zeros(3), np.eye(3), dist)[0][:, 0].T
+
+
+def _straight(x, y, dist):
+    """The rays that a lens puts at x, y: a right iteration."""
+    seen = np.array([x, y])
+    ideal = seen.copy()
+    for _ in range(0 if dist is None else 60):
+        ideal += seen - _bent(*ideal, dist)
+    return ideal
+
+
+def _seen(pixels, K):
+    return (pixels[:, 0] - K[0, 2]) / K[0, 0], (pixels[:, 1] - K[1, 2]) / K[1, 1]
+
+
+# --- from the pixel to the ray -------------------------------------------------------------------
+
+
+@wrong("inverse_missing", "homogeneous product")
+def K_for_its_inverse(pixels, depth, K, dist=None):
+    homogeneous = np.column_stack([pixels, np.ones(len(pixels))])
+    x, y, _ = K @ homogeneous.T
+    with np.errstate(all="ignore"):
+        x, y = _straight(x, y, dist)
+    return np.column_stack([x * depth, y * depth, depth])
+
+
+@wrong("principal_point_forgotten", "vectorised")
+def pixels_through_focal_length(pixels, depth, K, dist=None):
+    x, y = _straight(*(pixels / np.diag(K)[:2]).T, dist)
+    return np.stack([x, y, np.ones_like(x)], axis=1) * depth[:, np.newaxis]
+
+
+@wrong("fx_fy_swapped", "loop over an output array")
+def focal_lengths_swapped(pixels, depth, K, dist=None):
+    fx, fy = K[1, 1], K[0, 0]
+    out = np.zeros((len(pixels), 3))
+    for i in range(len(pixels)):
+        x = np.array([(pixels[i, 0] - K[0, 2]) / fx])
+        y = np.array([(pixels[i, 1] - K[1, 2]) / fy])
+        (x,), (y,) = _straight(x, y, dist)
+        out[i] = x * depth[i], y * depth[i], depth[i]
+    return out
+
+
+@wrong("input_swapped", "loop over lists")
+def row_before_column(pixels, depth, K, dist=None):
+    points = []
+    for (v, u), Z in zip(pixels, depth, strict=True):
+        x, y = _seen(np.array([[u, v]]), K)
+        (x,), (y,) = _straight(x, y, dist)
+        points.append([x * Z, y * Z, Z])
+    return points
+
+
+@wrong("y_up", "vectorised")
+def up_is_positive(pixels, depth, K, dist=None):
+    x = (pixels[:, 0] - K[0, 2]) / K[0, 0]
+    y = (K[1, 2] - pixels[:, 1]) / K[1, 1]
+    x, y = _straight(x, y, dist)
+    return np.column_stack([x * depth, y * depth, depth])
+
+
+# --- the distortion ------------------------------------------------------------------------------
+
+
+@wrong("coefficients_ignored", "inverse of K")
+def pinhole_only(pixels, depth, K, dist=None):
+    homogeneous = np.column_stack([pixels, np.ones(len(pixels))])
+    return (np.linalg.inv(K) @ homogeneous.T * depth).T
+
+
+@wrong("distorted_again", "loop over lists")
+def distortion_applied_forwards(pixels, depth, K, dist=None):
+    points = []
+    for (u, v), Z in zip(pixels, depth, strict=True):
+        x, y = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
+        if dist is not None:
+            k1, k2, p1, p2, k3 = dist
+            r2 = x * x + y * y
+            radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+            xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+            yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+            x, y = xd, yd
+        points.append((x * Z, y * Z, Z))
+    return points
+
+
+@wrong("one_step", "vectorised")
+def coefficients_negated(pixels, depth, K, dist=None):
+    x, y = _seen(pixels, K)
+    if dist is not None:
+        x, y = _bent(x, y, -dist)
+    return np.column_stack([x, y, np.ones_like(x)]) * depth[:, None]
+
+
+@wrong("one_step", "vectorised")
+def divided_by_the_radial_factor(pixels, depth, K, dist=None):
+    x, y = _seen(pixels, K)
+    if dist is not None:
+        k1, k2, p1, p2, k3 = dist
+        r2 = x**2 + y**2
+        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+        dx = 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
+        dy = p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
+        x, y = (x - dx) / radial, (y - dy) / radial
+    return np.array([x * depth, y * depth, depth]).T
+
+
+# --- from the ray to the point -------------------------------------------------------------------
+
+
+@wrong("depth_along_ray", "unit rays")
+def depth_is_the_length_of_the_ray(pixels, depth, K, dist=None):
+    x, y = _straight(*_seen(pixels, K), dist)
+    rays = np.column_stack([x, y, np.ones(len(pixels))])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    return rays * depth[:, None]
+
+
+@wrong("millimetres", "vectorised")
+def answer_in_millimetres(pixels, depth, K, dist=None):
+    x, y = _straight(*_seen(pixels, K), dist)
+    return np.column_stack([x * depth, y * depth, depth]) * 1000
+
+
+@wrong("millimetres", "inverse of K")
+def depth_taken_for_millimetres(pixels, depth, K, dist=None):
+    z = depth * 1e-3
+    straight = K @ np.vstack([_straight(*_seen(pixels, K), dist), np.ones(len(pixels))])
+    return (np.linalg.inv(K) @ straight * z).T
+
+
+@wrong("not_scaled", "loop over an output array")
+def rays_with_the_depth_beside(pixels, depth, K, dist=None):
+    out = np.empty((len(pixels), 3))
+    out[:, :2] = np.transpose(_straight(*_seen(pixels, K), dist))
+    for i, Z in enumerate(depth):
+        out[i, 2] = Z
+    return out
+
+
+# --- what is returned ----------------------------------------------------------------------------
+
+
+@wrong("transposed", "inverse of K")
+def one_column_a_point(pixels, depth, K, dist=None):
+    x, y = _straight(*_seen(pixels, K), dist)
+    return np.array([x * depth, y * depth, depth])
+
+
+@wrong("in_place", "vectorised")
+def the_callers_pixels_shifted(pixels, depth, K, dist=None):
+    pixels -= K[:2, 2]
+    pixels /= np.diag(K)[:2]
+    x, y = _straight(*pixels.T, dist)
+    return np.column_stack([x * depth, y * depth, depth])
+
+
+@wrong("several, first y_up", "vectorised")
+def y_up_and_along_the_ray(pixels, depth, K, dist=None):
+    x, y = _seen(pixels, K)
+    x, y = _straight(x, -y, dist)
+    scale = depth / np.sqrt(x**2 + y**2 + 1)
+    return np.column_stack([x * scale, y * scale, scale])
+
+
+@wrong(None, "vectorised")
+def two_rounds_are_too_few(pixels, depth, K, dist=None):
+    x, y = seen = np.array(_seen(pixels, K))
+    for _ in range(0 if dist is None else 2):
+        x, y = np.array([x, y]) + seen - _bent(x, y, dist)
+    return np.column_stack([x * depth, y * depth, depth])
+
+
+@wrong(None, "vectorised")
+def depth_times_columns(pixels, depth, K, dist=None):
+    x, y = _straight(*_seen(pixels, K), dist)
+    return np.column_stack([x, y, np.ones_like(x)]) * depth
+
+
+@wrong(None, "vectorised", kind="raised")
+def K_times_columns(pixels, depth, K, dist=None):
+    rays = np.linalg.inv(K) @ np.column_stack([pixels, np.ones(len(pixels))])
+    return rays * depth[:, None]

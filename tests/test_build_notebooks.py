@@ -1,0 +1,248 @@
+"""The builder of stored outputs, its checks, and nbval's comparison of what is stored."""
+
+import json
+import os
+import subprocess
+import sys
+
+import nbformat
+import pytest
+
+from tools import build_notebooks
+from tools.build_notebooks import WIDGET_VIEW, code_cells, problems, read
+
+SOURCES = {
+    "setup": "import os\nimport coursekit as ck",
+    "question": 'ck.checkpoint("pinhole.pitch")',
+    "stub": "def half(x):\n    ...",
+    "check": 'for part in ("one", "two"):\n    print(part, flush=True)\nhalf(3.0)',
+    "answer": "# An answer. Open it after your own attempt.\ndef half_answer(x):\n    return x / 2",
+    "sum": "print(f\"{1 / 7 + 1 / 3:.3f} m, camera {os.environ.get('COURSEKIT_CAMERA')}\")",
+}
+
+
+def toy(sources, path):
+    """Write a notebook as JupyterLab would save it, with one cell a source, named by its id."""
+    notebook = nbformat.v4.new_notebook(
+        metadata={"language_info": {"name": "python", "version": "3.11.7"}}
+    )
+    notebook.cells = [nbformat.v4.new_markdown_cell("# Toy", id="title")]
+    for name, source in sources.items():
+        cell = nbformat.v4.new_code_cell(source, id=name)
+        cell.metadata["execution"] = {"iopub.status.busy": "2026-01-01T00:00:00Z"}
+        if name in build_notebooks.PARTS:
+            cell.metadata["coursekit"] = {"exercise": "half", "part": name}
+        if name == "answer":
+            cell.metadata["jupyter"] = {"source_hidden": True}
+        notebook.cells.append(cell)
+    path.parent.mkdir(exist_ok=True)
+    nbformat.write(notebook, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def built_text(tmp_path_factory):
+    path = toy(SOURCES, tmp_path_factory.mktemp("toy") / "01_toy.ipynb")
+    assert build_notebooks.build(path) == len(SOURCES)
+    return path.read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def built(built_text, tmp_path):
+    path = tmp_path / "01_toy.ipynb"
+    path.write_text(built_text, encoding="utf-8")
+    return path
+
+
+def cell_of(notebook, name):
+    return next(cell for cell in notebook["cells"] if cell["id"] == name)
+
+
+def edit(path, change):
+    """Change a stored notebook as data, and write it in the tool's own format."""
+    notebook = read(path)
+    change(notebook)
+    text = json.dumps(notebook, ensure_ascii=False, indent=1, sort_keys=True) + "\n"
+    path.write_text(text, encoding="utf-8")
+
+
+# ---- building -----------------------------------------------------------------------------------
+
+
+def test_a_built_notebook_has_nothing_to_complain_about(built):
+    assert problems(built) == []
+
+
+def test_what_changes_from_run_to_run_is_not_stored(built):
+    notebook = read(built)
+    assert notebook["metadata"] == build_notebooks.METADATA
+    assert [cell["id"] for cell in notebook["cells"]] == ["title", *SOURCES]
+    cells = code_cells(notebook)
+    assert [cell["execution_count"] for cell in cells] == [1, 2, 3, 4, 5, 6]
+    assert not any("execution" in cell["metadata"] for cell in cells)
+    (question,) = cell_of(notebook, "question")["outputs"]
+    assert sorted(question["data"]) == ["text/html", "text/plain"]
+    (stream,) = cell_of(notebook, "check")["outputs"]
+    assert stream["text"] == ["one\n", "two\n"]
+    assert cell_of(notebook, "sum")["outputs"][0]["text"] == ["0.476 m, camera simulated\n"]
+
+
+def test_building_again_gives_the_same_bytes(built, built_text):
+    build_notebooks.build(built)
+    assert built.read_text(encoding="utf-8") == built_text
+
+
+def test_a_failing_cell_leaves_the_file_and_is_named(tmp_path, monkeypatch, capsys):
+    path = toy({"fine": "x = 0", "bad": "1 / x", "never": "print(1)"}, tmp_path / "02_bad.ipynb")
+    before = path.read_bytes()
+    monkeypatch.setattr(build_notebooks, "NOTEBOOKS", tmp_path)
+    assert build_notebooks.main([]) == 1
+    said = capsys.readouterr()
+    assert said.err == "02_bad, cell bad: ZeroDivisionError: division by zero\n"
+    assert said.out == "02_bad ... failed\n"
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_copy_keeps_its_widgets_and_the_users_environment(built, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(build_notebooks, "NOTEBOOKS", tmp_path)
+    monkeypatch.setenv("COURSEKIT_CAMERA", "728612070259")
+    before = built.read_bytes()
+    assert build_notebooks.main(["--into", str(tmp_path / "build"), "01_toy"]) == 0
+    assert capsys.readouterr().out.startswith("01_toy ... 6 cells, ")
+    assert built.read_bytes() == before
+    copy = read(tmp_path / "build" / "01_toy.ipynb")
+    assert WIDGET_VIEW in cell_of(copy, "question")["outputs"][0]["data"]
+    assert copy["metadata"]["widgets"]
+    assert cell_of(copy, "sum")["outputs"][0]["text"] == ["0.476 m, camera 728612070259\n"]
+
+
+def test_an_unknown_name_is_refused_with_the_known_ones(built, monkeypatch, capsys):
+    monkeypatch.setattr(build_notebooks, "NOTEBOOKS", built.parent)
+    with pytest.raises(SystemExit):
+        build_notebooks.main(["07_arm"])
+    assert "there is no notebook '07_arm'; there are 01_toy" in capsys.readouterr().err
+
+
+# ---- checking -----------------------------------------------------------------------------------
+
+
+def change(name, **fields):
+    return lambda notebook: cell_of(notebook, name).update(fields)
+
+
+def output(text, name="stdout"):
+    return [{"output_type": "stream", "name": name, "text": [text]}]
+
+
+def data(**content):
+    stored = {"text/plain": ["A"], **content}
+    return [{"output_type": "display_data", "metadata": {}, "data": stored}]
+
+
+def strip(notebook):
+    for cell in code_cells(notebook):
+        cell.update(outputs=[], execution_count=None)
+
+
+ERROR = [{"output_type": "error", "ename": "ValueError", "evalue": "no", "traceback": []}]
+TAG = {"coursekit": {"exercise": "half", "part": "answer"}}
+FLAWS = [
+    (strip, "cell setup: execution count is null, want 1"),
+    (change("sum", execution_count=7), "cell sum: execution count is 7, want 6"),
+    (change("sum", outputs=ERROR), "cell sum: the stored output is an error, ValueError"),
+    (change("sum", outputs=output("warned\n", "stderr")), "cell sum: text on stderr: warned"),
+    (change("sum", outputs=data(**{WIDGET_VIEW: {}})), "cell sum: a widget view is stored"),
+    (lambda n: n["metadata"].update(widgets={}), "widget state is stored"),
+    (
+        lambda n: n["metadata"]["language_info"].update(version="3.11.7"),
+        "metadata of the notebook or its kernel is not normalised",
+    ),
+    (
+        change("sum", outputs=output("<Line2D at 0x7f3a5c001d90>")),
+        "cell sum: a memory address in the output: 0x7f3a5c001d90",
+    ),
+    (
+        change("sum", outputs=data(**{"text/html": ["<b>/home/ada/x.json</b>"]})),
+        "cell sum: a machine path in the output: /home/ada/x.json",
+    ),
+    (
+        change("sum", source=["x = 1\n", "# why\n", "\n"] * 16),
+        "cell sum: 16 lines of code, want at most 15",
+    ),
+    (change("sum", source=["# nothing"]), "cell sum: there is no code in it"),
+    (change("answer", outputs=output("1")), "cell answer: an answer cell prints something"),
+    (
+        change("answer", metadata=TAG),
+        "cell answer: an answer cell is not hidden (metadata jupyter.source_hidden)",
+    ),
+    (
+        change("answer", source=["def half_answer(x):\n", "    return x / 2"]),
+        "cell answer: an answer cell does not begin with a comment, which is all that a learner "
+        "sees of it",
+    ),
+    (change("check", metadata={}), "exercise 'half' has 0 check cells, want 1"),
+    (change("stub", source=["half = None"]), "cell stub: does not define half()"),
+    (
+        change("check", metadata={"coursekit": {"exercise": "half", "part": "chek"}}),
+        "cell check: part 'chek' is not one of stub, check, answer",
+    ),
+    (change("sum", id="setup"), "cell id setup is used 2 times"),
+    (lambda n: cell_of(n, "title").pop("id"), "1 cells have no id"),
+    (change("sum", metadata={"execution": {}}), "cell sum: metadata 'execution' is stored"),
+]
+
+
+@pytest.mark.parametrize(("flaw", "message"), FLAWS, ids=[message for _, message in FLAWS])
+def test_check_names_each_flaw(built, flaw, message):
+    edit(built, flaw)
+    assert f"01_toy: {message}" in problems(built)
+
+
+def test_check_notices_a_file_that_another_program_wrote(built):
+    built.write_text(json.dumps(read(built), indent=2), encoding="utf-8")
+    assert [text for text in problems(built) if "was not written by" in text]
+
+
+def test_check_fails_on_a_file_that_is_no_notebook(tmp_path, monkeypatch, capsys):
+    (tmp_path / "01_toy.ipynb").write_text("[]", encoding="utf-8")
+    monkeypatch.setattr(build_notebooks, "NOTEBOOKS", tmp_path)
+    assert build_notebooks.main(["--check"]) == 1
+    assert "01_toy.ipynb: not a notebook" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("text", ["see https://a.org/b/c/d.html", "</td></tr>", "3 m/s", "1/2/3"])
+def test_these_are_no_machine_paths(text):
+    assert not build_notebooks.MACHINE_PATH.search(text)
+
+
+def test_the_stored_notebooks_are_in_order():
+    assert [text for path in build_notebooks.find([]) for text in problems(path)] == []
+
+
+# ---- what nbval makes of it ---------------------------------------------------------------------
+
+
+def nbval(path, scratch):
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-c", os.devnull]
+    command += ["--rootdir", str(path.parent), "--nbval", "--nbval-current-env", str(path)]
+    environment = build_notebooks.kernel_environment(scratch)
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+
+
+def test_nbval_passes_a_built_notebook_with_a_checkpoint(built, tmp_path):
+    run = nbval(built, tmp_path)
+    assert "6 passed" in run.stdout, run.stdout
+
+
+def test_nbval_fails_on_one_changed_digit(built, tmp_path):
+    edit(built, change("sum", outputs=output("0.477 m, camera simulated\n")))
+    run = nbval(built, tmp_path)
+    assert "1 failed, 5 passed" in run.stdout, run.stdout
+    assert "0.477 m" in run.stdout
+
+
+def test_nbval_passes_a_stripped_notebook_which_is_why_check_exists(built, tmp_path):
+    edit(built, strip)
+    assert "6 passed" in nbval(built, tmp_path).stdout
+    assert len(problems(built)) == len(SOURCES)

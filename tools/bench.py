@@ -1,0 +1,158 @@
+"""`python3 course.py bench`: every speed this project claims, as ratios measured in one run.
+
+Absolute times depend on the machine and the minute; two things timed in turn, many times over,
+give a ratio that means something. Medians are printed, with the quartiles behind them.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from coursekit import geometry
+from coursekit.cameras.librealsense import LibraryMissing, load_librealsense
+from coursekit.geometry import Intrinsics
+
+ROUNDS = 300
+CAMERA = Intrinsics(848, 480, 431.1, 431.1, 436.6, 242.4)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One comparison: times in s of ours and of the yardstick, in turn."""
+
+    what: str
+    against: str
+    ours: list[float]
+    theirs: list[float]
+    wanted: str = ""
+
+    def __str__(self) -> str:
+        ratio = np.median(self.ours) / np.median(self.theirs)
+        return (
+            f"{self.what:34} {_time(self.ours)}   {self.against:34} {_time(self.theirs)}"
+            f"   ratio {ratio:5.2f}  {self.wanted}"
+        )
+
+
+def _time(seconds: list[float]) -> str:
+    low, middle, high = 1000 * np.quantile(seconds, [0.25, 0.5, 0.75])
+    return f"{middle:8.3f} ms ({low:.3f}-{high:.3f})"
+
+
+def in_turn(rounds: int, *calls: Callable[[], object]) -> list[list[float]]:
+    """The times of each call, called in turn, after three rounds that are not counted."""
+    times: list[list[float]] = [[] for _ in calls]
+    for index in range(-3, rounds):
+        for call, kept in zip(calls, times, strict=True):
+            start = time.perf_counter()
+            call()
+            if index >= 0:
+                kept.append(time.perf_counter() - start)
+    return times
+
+
+def depth_image() -> np.ndarray:
+    """A depth image with a tenth of its pixels invalid, uint16 in mm."""
+    rng = np.random.default_rng(0)
+    depth = rng.integers(300, 2000, (480, 848)).astype(np.uint16)
+    depth[rng.random(depth.shape) < 0.1] = 0
+    return depth
+
+
+def one_liner(depth: np.ndarray) -> np.ndarray:
+    """What most people write."""
+    z = np.where(depth > 0, depth * np.float32(0.001), np.float32(np.nan))
+    v, u = np.indices(depth.shape, dtype=np.float32)
+    return np.stack([(u - CAMERA.cx) / CAMERA.fx * z, (v - CAMERA.cy) / CAMERA.fy * z, z], axis=-1)
+
+
+def bench_deproject() -> list[Row]:
+    """A full frame to points: ours, librealsense's point cloud, the NumPy one-liner."""
+    depth = depth_image()
+
+    def ours() -> np.ndarray:
+        return geometry.deproject_image(depth, CAMERA)
+
+    name = "deproject_image, 848x480"
+    try:
+        vendor = vendor_point_cloud(depth)
+    except LibraryMissing:
+        print("pyrealsense2 is not installed: no comparison with librealsense")
+        return [Row(name, "NumPy one-liner", *in_turn(ROUNDS, ours, lambda: one_liner(depth)))]
+    # In pairs: between two calls the one-liner's garbage would be in everybody's way.
+    return [
+        Row(
+            name, "rs.pointcloud.calculate", *in_turn(ROUNDS, ours, vendor), "wanted: at most 1.00"
+        ),
+        Row(name, "NumPy one-liner", *in_turn(ROUNDS, ours, lambda: one_liner(depth))),
+    ]
+
+
+def vendor_point_cloud(depth: np.ndarray) -> Callable[[], object]:
+    """A call of `pyrealsense2.pointcloud.calculate` on the same image, in a frame of its own."""
+    from coursekit.cameras.recording import realsense_intrinsics
+
+    rs = load_librealsense()
+    device = rs.software_device()
+    sensor = device.add_sensor("depth")
+    stream = rs.video_stream()
+    stream.type, stream.fmt, stream.bpp, stream.fps = rs.stream.depth, rs.format.z16, 2, 30
+    stream.width, stream.height = CAMERA.size
+    stream.intrinsics = realsense_intrinsics(rs, CAMERA)
+    profile = sensor.add_video_stream(stream)
+    sensor.add_read_only_option(rs.option.depth_units, 0.001)
+    queue = rs.frame_queue(1)
+    sensor.open(profile)
+    sensor.start(queue)
+    image = rs.software_video_frame()
+    image.pixels, image.stride, image.bpp = depth, 2 * CAMERA.width, 2
+    image.timestamp, image.frame_number = 0.0, 1
+    image.profile = profile.as_video_stream_profile()
+    image.depth_units = 0.001
+    sensor.on_video_frame(image)
+    frame = queue.wait_for_frame().as_depth_frame()
+    cloud = rs.pointcloud()
+
+    def calculate(keep: tuple[object, ...] = (device, sensor, queue)) -> object:
+        return cloud.calculate(frame)
+
+    check_agreement(calculate(), geometry.deproject_image(depth, CAMERA))
+    return calculate
+
+
+def check_agreement(theirs: object, ours: np.ndarray) -> None:
+    """Both must have computed the same thing, or the ratio would mean nothing."""
+    vertices = np.asarray(theirs.get_vertices()).view(np.float32)  # type: ignore[attr-defined]
+    difference = np.abs(vertices.reshape(ours.shape) - ours)[np.isfinite(ours)]
+    if difference.max() > 1e-5:
+        raise RuntimeError(f"the point clouds differ by {difference.max():.2e} m")
+
+
+def bench_import() -> Row:
+    """`import coursekit` over a bare interpreter."""
+
+    def run(code: str) -> Callable[[], object]:
+        return lambda: subprocess.run([sys.executable, "-c", code], check=True)
+
+    ours, bare = in_turn(15, run("import coursekit"), run("pass"))
+    extra = np.median(ours) - np.median(bare)
+    wanted = f"{1000 * extra:+.0f} ms, wanted: below +150"
+    return Row("import coursekit", "bare interpreter", ours, bare, wanted)
+
+
+def main() -> None:
+    """Print one table."""
+    print(f"{os.cpu_count()} cores, Python {sys.version.split()[0]}; medians (quartiles)")
+    for row in [*bench_deproject(), bench_import()]:
+        print(row)
+
+
+if __name__ == "__main__":
+    main()
