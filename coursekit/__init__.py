@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from coursekit import cameras, geometry, lessons, plots, results, simulation, specifications
     from coursekit.cameras import open_camera
-    from coursekit.lessons import check, checkpoint
+    from coursekit.lessons import check, checkpoint, evidence
     from coursekit.plots import drag
 
 __all__ = [
@@ -19,6 +19,7 @@ __all__ = [
     "check",
     "checkpoint",
     "drag",
+    "evidence",
     "geometry",
     "lessons",
     "open_camera",
@@ -32,6 +33,7 @@ _FUNCTIONS = {
     "open_camera": "coursekit.cameras",
     "check": "coursekit.lessons",
     "checkpoint": "coursekit.lessons",
+    "evidence": "coursekit.lessons",
     "drag": "coursekit.plots",
 }
 

@@ -131,7 +131,7 @@ class Intrinsics:
         )
 
 
-# --- project and deproject -----------------------------------------------------------------
+# --- project and deproject ---
 
 
 def project(points: ArrayLike, K: ArrayLike, dist: ArrayLike | None = None) -> Floats:
@@ -254,7 +254,7 @@ def _fold_radius(dist: Floats) -> float:
     return 1.0 / math.sqrt(positive.max()) if positive.size else math.inf
 
 
-# --- whole images ----------------------------------------------------------------------------
+# --- whole images ---
 
 
 def pixel_grid(width: int, height: int) -> Floats:
@@ -357,7 +357,7 @@ def _align_sources(depth: Floats, of: Intrinsics, to: Intrinsics, T: Floats) -> 
     return kernels.nearest_footprint(depth, first, last, to.width, to.height)
 
 
-# --- rigid transforms --------------------------------------------------------------------------
+# --- rigid transforms ---
 
 
 def make_transform(rotation: Rotation | ArrayLike, translation: ArrayLike) -> Floats:
@@ -403,7 +403,7 @@ def transform_points(T: ArrayLike, points: ArrayLike) -> Floats:
     return _array("points", points, (3,)) @ T[:3, :3].T + T[:3, 3]
 
 
-# --- checks at the boundary ----------------------------------------------------------------------
+# --- checks at the boundary ---
 
 
 def _array(name: str, value: Any, tail: tuple[int, ...] = (), leading: bool = True) -> Floats:

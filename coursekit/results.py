@@ -84,7 +84,7 @@ def save(lesson: str, camera: Camera, quantities: Mapping[str, Quantity]) -> Pat
 
 
 def load(lesson: str) -> Result:
-    """Read `results/<lesson>.json`; FileNotFoundError when it is not there, ValueError when damaged."""
+    """Read `results/<lesson>.json`; FileNotFoundError if there is none, ValueError if damaged."""
     path = _path(lesson)
     content = read_json(path)
     try:

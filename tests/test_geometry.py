@@ -40,7 +40,7 @@ def points_in_view(seed: int, n: int = 40) -> np.ndarray:
     return np.column_stack([rng.uniform(-0.6, 0.6, (n, 2)) * z[:, None], z])
 
 
-# --- against OpenCV ----------------------------------------------------------------------------
+# --- against OpenCV ---
 
 
 @settings(max_examples=2000, deadline=None, derandomize=True)
@@ -103,7 +103,7 @@ def test_distortion_jacobian_is_the_numerical_one() -> None:
     assert np.allclose([[a, b], [b, d]], np.transpose(columns), atol=1e-9)
 
 
-# --- any leading shape, and the documented results of bad values -------------------------------
+# --- any leading shape, and the documented results of bad values ---
 
 
 @pytest.mark.parametrize("shape", [(), (0,), (1,), (5,), (2, 3), (0, 4), (2, 1, 3)])
@@ -162,7 +162,7 @@ BAD_ARRAYS = {
         ("fx", lambda x: Intrinsics(2, 2, x, 1, 0, 0)),
         ("width", lambda x: Intrinsics(x, 2, 1, 1, 0, 0)),
         ("width", lambda x: geometry.pixel_grid(x, 4)),
-        ("fields", lambda x: Intrinsics.from_dict(x)),
+        ("fields", Intrinsics.from_dict),
     ],
 )
 def test_bad_input_names_the_argument(name: str, call, bad) -> None:
@@ -172,7 +172,7 @@ def test_bad_input_names_the_argument(name: str, call, bad) -> None:
 
 @pytest.mark.parametrize("bad", ["{", "", "[1", None, 3])
 def test_bad_json(bad) -> None:
-    with pytest.raises(ValueError, match="^text: "):
+    with pytest.raises(ValueError, match=r"^text: "):
         Intrinsics.from_json(bad)
 
 
@@ -209,7 +209,7 @@ def test_depths_that_do_not_fit_the_pixels() -> None:
         geometry.deproject(np.zeros((3, 2)), np.ones(4), K)
 
 
-# --- Intrinsics -----------------------------------------------------------------------------------
+# --- Intrinsics ---
 
 
 def test_intrinsics_round_trip() -> None:
@@ -250,7 +250,7 @@ def test_bad_intrinsics(fields: dict, name: str) -> None:
         Intrinsics.from_dict(LESSON.to_dict() | fields)
 
 
-# --- whole images -----------------------------------------------------------------------------------
+# --- whole images ---
 
 
 @pytest.mark.parametrize("dist", [None, DIST])
@@ -319,7 +319,7 @@ def test_aligned_depth_is_in_the_colour_frame() -> None:
     assert np.abs(aligned - wanted)[filled].max() < 0.0015
 
 
-# --- rigid transforms --------------------------------------------------------------------------------
+# --- rigid transforms ---
 
 
 def test_transforms() -> None:
@@ -348,7 +348,7 @@ def test_a_matrix_that_is_no_transform(broken: np.ndarray) -> None:
         geometry.invert_transform(broken)
 
 
-# --- import time ------------------------------------------------------------------------------------
+# --- import time ---
 
 
 def test_import_is_lazy() -> None:

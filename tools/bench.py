@@ -25,19 +25,18 @@ CAMERA = Intrinsics(848, 480, 431.1, 431.1, 436.6, 242.4)
 
 @dataclass(frozen=True)
 class Row:
-    """One comparison: times in s of ours and of the yardstick, in turn."""
+    """One comparison: the times in s of ours and of the yardstick, taken in turn."""
 
     what: str
     against: str
-    ours: list[float]
-    theirs: list[float]
+    times: tuple[list[float], list[float]]
     wanted: str = ""
 
     def __str__(self) -> str:
-        ratio = np.median(self.ours) / np.median(self.theirs)
+        ours, theirs = self.times
         return (
-            f"{self.what:34} {_time(self.ours)}   {self.against:34} {_time(self.theirs)}"
-            f"   ratio {ratio:5.2f}  {self.wanted}"
+            f"{self.what:26} {_time(ours)}   {self.against:24} {_time(theirs)}"
+            f"   ratio {np.median(ours) / np.median(theirs):5.2f}  {self.wanted}"
         )
 
 
@@ -46,11 +45,13 @@ def _time(seconds: list[float]) -> str:
     return f"{middle:8.3f} ms ({low:.3f}-{high:.3f})"
 
 
-def in_turn(rounds: int, *calls: Callable[[], object]) -> list[list[float]]:
-    """The times of each call, called in turn, after three rounds that are not counted."""
-    times: list[list[float]] = [[] for _ in calls]
+def in_turn(
+    rounds: int, ours: Callable[[], object], theirs: Callable[[], object]
+) -> tuple[list[float], list[float]]:
+    """The times of two calls, made in turn, after three rounds that are not counted."""
+    times: tuple[list[float], list[float]] = ([], [])
     for index in range(-3, rounds):
-        for call, kept in zip(calls, times, strict=True):
+        for call, kept in zip((ours, theirs), times, strict=True):
             start = time.perf_counter()
             call()
             if index >= 0:
@@ -85,13 +86,11 @@ def bench_deproject() -> list[Row]:
         vendor = vendor_point_cloud(depth)
     except LibraryMissing:
         print("pyrealsense2 is not installed: no comparison with librealsense")
-        return [Row(name, "NumPy one-liner", *in_turn(ROUNDS, ours, lambda: one_liner(depth)))]
+        return [Row(name, "NumPy one-liner", in_turn(ROUNDS, ours, lambda: one_liner(depth)))]
     # In pairs: between two calls the one-liner's garbage would be in everybody's way.
     return [
-        Row(
-            name, "rs.pointcloud.calculate", *in_turn(ROUNDS, ours, vendor), "wanted: at most 1.00"
-        ),
-        Row(name, "NumPy one-liner", *in_turn(ROUNDS, ours, lambda: one_liner(depth))),
+        Row(name, "rs.pointcloud.calculate", in_turn(ROUNDS, ours, vendor), "wanted: at most 1.00"),
+        Row(name, "NumPy one-liner", in_turn(ROUNDS, ours, lambda: one_liner(depth))),
     ]
 
 
@@ -141,10 +140,10 @@ def bench_import() -> Row:
     def run(code: str) -> Callable[[], object]:
         return lambda: subprocess.run([sys.executable, "-c", code], check=True)
 
-    ours, bare = in_turn(15, run("import coursekit"), run("pass"))
-    extra = np.median(ours) - np.median(bare)
-    wanted = f"{1000 * extra:+.0f} ms, wanted: below +150"
-    return Row("import coursekit", "bare interpreter", ours, bare, wanted)
+    times = in_turn(15, run("import coursekit"), run("pass"))
+    extra = 1000 * (np.median(times[0]) - np.median(times[1]))
+    wanted = f"{extra:+.0f} ms, wanted: below +150"
+    return Row("import coursekit", "bare interpreter", times, wanted)
 
 
 def main() -> None:

@@ -8,9 +8,10 @@ from typing import Any
 
 from coursekit.lessons.checkpoints import Checkpoint
 from coursekit.lessons.exercises import Exercise
+from coursekit.lessons.objectives import Evidence
 from coursekit.lessons.verdict import Verdict
 
-__all__ = ["LESSONS", "check", "checkpoint", "checkpoints", "exercises"]
+__all__ = ["LESSONS", "check", "checkpoint", "checkpoints", "evidence", "exercises"]
 
 LESSONS = ("pinhole",)
 
@@ -23,6 +24,13 @@ def checkpoint(name: str) -> Checkpoint:
 def check(name: str, function: Callable[..., Any]) -> Verdict:
     """What is right or wrong with a learner's function: `ck.check("pinhole.project", project)`."""
     return _find(name, "exercise", exercises()).check(function)
+
+
+def evidence(lesson: str) -> Evidence:
+    """The objectives of a lesson and the student's own evidence: `ck.evidence("pinhole")`."""
+    if lesson not in LESSONS:
+        raise ValueError(f"lesson: there is no {lesson!r}; there are {', '.join(LESSONS)}")
+    return Evidence(importlib.import_module(f"coursekit.lessons.{lesson}").OBJECTIVES)
 
 
 def checkpoints() -> dict[str, Checkpoint]:

@@ -61,14 +61,13 @@ class Checkpoint:
     def __repr__(self) -> str:
         return f'Checkpoint: commit your answer with ck.checkpoint("{self.name}").answer(...)'
 
-    def _repr_mimebundle_(self, **kwargs: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+    def _repr_mimebundle_(self, **kwargs: Any) -> dict[str, Any]:
         call = f'ck.checkpoint("{self.name}").answer({self.example})'
-        bundle: dict[str, Any] = {
+        widget: dict[str, Any] = _panel(self)._repr_mimebundle_(**kwargs)
+        return widget | {
             "text/plain": repr(self),
             "text/html": f"<em>Run this cell to answer here, or call <code>{call}</code>.</em>",
         }
-        widget_data, metadata = _panel(self)._repr_mimebundle_(**kwargs)
-        return bundle | {k: v for k, v in widget_data.items() if k not in bundle}, metadata
 
 
 @dataclass(frozen=True, repr=False)

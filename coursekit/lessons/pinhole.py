@@ -10,15 +10,17 @@ import numpy as np
 
 from coursekit.lessons.checkpoints import Choice, Classic, Number, Option
 from coursekit.lessons.exercises import Exercise, Model, Step
+from coursekit.lessons.objectives import Objective
 
 Array = np.ndarray
 
-# --- project -------------------------------------------------------------------------------------
+# --- project ---
 
 GENERIC_K = np.array([[612.5, 0.0, 331.4], [0.0, 598.0, 236.8], [0.0, 0.0, 1.0]])
 LESSON_K = np.array([[447.0, 0.0, 424.0], [0.0, 447.0, 240.0], [0.0, 0.0, 1.0]])
 SINGLE = np.array([[0.30, -0.20, 0.90]])
-SEVERAL = np.array([[0.25, 0.40, 0.80], [-0.31, 0.12, 0.55], [0.07, -0.26, 0.62]])
+# Four points, not two or three: a wrong broadcast over (N, 2) or (N, 3) must not go through.
+SEVERAL = np.array([[0.25, 0.40, 0.80], [-0.31, 0.12, 0.55], [0.07, -0.26, 0.62], [0.1, 0.2, 0.4]])
 MIXED = np.array([-0.27, 0.11, 0.0018, -0.0012, 0.05])
 
 
@@ -338,7 +340,24 @@ def truncated(u: Array, v: Array) -> Array:
     return np.trunc(np.stack([u, v], axis=1))
 
 
-# --- deproject -----------------------------------------------------------------------------------
+_HALF = (
+    "every pixel is half a pixel off",
+    "OpenCV and RealSense give the *centre* of the top-left pixel the coordinates (0, 0). "
+    "Which of your lines moves it?",
+)
+
+
+@PROJECT.mistake("columns", *_HALF, name="half_pixel")
+def half_pixel_more(u: Array, v: Array) -> Array:
+    return np.stack([u, v], axis=1) + 0.5
+
+
+@PROJECT.mistake("columns", *_HALF, name="half_pixel")
+def half_pixel_less(u: Array, v: Array) -> Array:
+    return np.stack([u, v], axis=1) - 0.5
+
+
+# --- deproject ---
 
 
 def _to_normalised(pixels: Array, K: Array) -> Any:
@@ -379,8 +398,8 @@ def _describe_deproject(args: tuple[Any, ...]) -> str:
 
 
 _PIXEL = np.array([[600.0, 140.0]])
-_PIXELS = np.array([[600.0, 140.0], [52.5, 310.2], [400.1, 20.8]])
-_DEPTHS = np.array([0.90, 0.55, 0.62])
+_PIXELS = np.array([[600.0, 140.0], [52.5, 310.2], [400.1, 20.8], [210.3, 199.9]])
+_DEPTHS = np.array([0.90, 0.55, 0.62, 0.48])
 
 DEPROJECT = Exercise(
     name="pinhole.deproject",
@@ -520,7 +539,7 @@ def one_division(x: Array, y: Array, dist: Array) -> Any:
 
 EXERCISES = [PROJECT, DEPROJECT]
 
-# --- checkpoints ---------------------------------------------------------------------------------
+# --- checkpoints ---
 
 CHECKPOINTS = [
     Choice(
@@ -616,7 +635,7 @@ CHECKPOINTS = [
             Option(
                 "an excellent lens",
                 "Lenses are glued to within tens of micrometres, and pixels measure a few. The "
-                "cameras in this course are 0.1 to 22 px off centre.",
+                "cameras in this course are 0.4 to 23 px off centre.",
             ),
             Option(
                 "nothing was estimated: that is the image centre, held fixed",
@@ -653,3 +672,22 @@ CHECKPOINTS = [
         ),
     ),
 ]
+
+OBJECTIVES = (
+    Objective(
+        "derive the projection equation and say what projection throws away",
+        ("pinhole.twice_as_far", "pinhole.same_size"),
+    ),
+    Objective(
+        "explain each entry of K for the camera in hand, with its unit",
+        ("pinhole.pitch", "pinhole.half_size", "pinhole.exact_centre"),
+    ),
+    Objective(
+        "write project and deproject with distortion, and prove their conventions",
+        ("pinhole.project", "pinhole.deproject"),
+    ),
+    Objective(
+        "turn a depth image into points and say what its numbers mean",
+        ("pinhole.range",),
+    ),
+)

@@ -32,7 +32,8 @@ class Verdict:
     def _repr_html_(self) -> str:
         body = "".join(f"<div>{_markup(line)}</div>" for line in self.lines)
         return (
-            f'<div style="border-left: 4px solid {COLORS[self.kind]}; padding: 2px 0 2px 12px">'
+            f'<div style="border-left: 4px solid {COLORS[self.kind]}; padding: 2px 0 2px 12px;'
+            f' line-height: 1.4; max-width: 52em">'
             f"<b>{_markup(self.headline)}</b>{body}</div>"
         )
 

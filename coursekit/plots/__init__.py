@@ -1,4 +1,4 @@
-"""Figures of the notebooks, one module a notebook; each function returns a figure, none shows it."""
+"""Figures of the notebooks, one module a notebook; functions return a figure, none shows it."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ class Draggable:
             for name, (low, high, start) in self.sliders.items()
         }
         first = self.start()
-        image = ipywidgets.Image(value=first.png(), format="png", alt=first.alt)
+        image = ipywidgets.Image(value=first.png(), format="png")
         image.layout.max_width = "100%"
 
         def redraw(_: Any) -> None:
@@ -63,8 +63,7 @@ class Draggable:
 
     def _repr_mimebundle_(self, **kwargs: Any) -> tuple[dict[str, Any], dict[str, Any]]:
         data, metadata = self.start()._repr_mimebundle_()
-        widget_data, _ = self.widget()._repr_mimebundle_(**kwargs)
-        return widget_data | data, metadata
+        return self.widget()._repr_mimebundle_(**kwargs) | data, metadata
 
 
 def label(name: str) -> str:

@@ -1,0 +1,112 @@
+"""What librealsense does with each distortion model, measured against `geometry`.
+
+`measure()` needs pyrealsense2; `table()` also answers without it, from data/vendor_models.json.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from coursekit import geometry, results
+from coursekit.geometry import Intrinsics
+from coursekit.specifications import DATA
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+STORED = DATA / "vendor_models.json"
+POINTS = 2000
+# A 640x480 camera with fx != fy, p1 != p2 and every coefficient in use, so that nothing cancels.
+CAMERA = Intrinsics(640, 480, 612.5, 598.0, 331.4, 236.8)
+COEFFS = {
+    "none": (0.0, 0.0, 0.0, 0.0, 0.0),
+    "radial": (-0.27, 0.11, 0.0, 0.0, 0.05),
+    "radial and tangential": (-0.27, 0.11, 0.0018, -0.0012, 0.05),
+}
+CASES = (
+    ("none", "none"),
+    ("brown_conrady", "radial and tangential"),
+    ("inverse_brown_conrady", "radial"),
+    ("inverse_brown_conrady", "radial and tangential"),
+    ("modified_brown_conrady", "radial"),
+    ("modified_brown_conrady", "radial and tangential"),
+)
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """One distortion model in librealsense, the largest of many points, px.
+
+    project_px: its projection against `geometry.project`. round_trip_px: its own deprojection,
+    projected again, against the pixel it started from.
+    """
+
+    model: str
+    coefficients: str
+    project_px: float
+    round_trip_px: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.model:23} {self.coefficients:22} {self.project_px:8.3f} px"
+            f" {self.round_trip_px:8.3f} px"
+        )
+
+
+def measure() -> list[Agreement]:
+    """Each distortion model of librealsense, over random points all over the image."""
+    rng = np.random.default_rng(1)
+    pixels = rng.uniform([0, 0], [CAMERA.width - 1, CAMERA.height - 1], (POINTS, 2))
+    depths = rng.uniform(0.2, 4.0, POINTS)
+    return [_measure(model, name, pixels, depths) for model, name in CASES]
+
+
+def _measure(
+    model: str, name: str, pixels: NDArray[np.float64], depths: NDArray[np.float64]
+) -> Agreement:
+    from coursekit.cameras.librealsense import load_librealsense
+    from coursekit.cameras.recording import realsense_intrinsics
+
+    rs = load_librealsense()
+    camera = Intrinsics(**CAMERA.to_dict() | {"model": model, "coeffs": COEFFS[name]})
+    theirs = realsense_intrinsics(rs, camera)
+    points = geometry.deproject(pixels, depths, camera.K, camera.dist)
+    projected = np.array([rs.rs2_project_point_to_pixel(theirs, p) for p in points.tolist()])
+    again = np.array(
+        [
+            rs.rs2_project_point_to_pixel(theirs, rs.rs2_deproject_pixel_to_point(theirs, uv, z))
+            for uv, z in zip(projected.tolist(), depths.tolist(), strict=True)
+        ]
+    )
+    ours = geometry.project(points, camera.K, camera.dist)
+    return Agreement(model, name, _largest(projected - ours), _largest(again - projected))
+
+
+def _largest(difference: NDArray[np.float64]) -> float:
+    return float(np.linalg.norm(difference, axis=1).max())
+
+
+def stored() -> list[Agreement]:
+    """The table in data/vendor_models.json; a test measures it again."""
+    return [Agreement(**row) for row in results.read_json(STORED)["rows"]]
+
+
+def table() -> tuple[list[Agreement], str]:
+    """The rows, measured here or else the stored ones, and a sentence that says which."""
+    from coursekit.cameras.librealsense import LibraryMissing
+
+    try:
+        return measure(), "measured on this computer"
+    except LibraryMissing:
+        return stored(), "stored: pyrealsense2 is not installed here"
+
+
+def store() -> None:
+    """Measure and write data/vendor_models.json (called by tools/make_data.py)."""
+    from importlib.metadata import version
+
+    note = f"coursekit.cameras.conventions, pyrealsense2 {version('pyrealsense2')}"
+    results.write_json(STORED, {"source": note, "rows": [asdict(row) for row in measure()]})

@@ -1,0 +1,110 @@
+"""The vendor's library: loading it, what it sees on USB, and its errors in words of advice."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from coursekit.cameras.camera import CameraError
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+USB_DEVICES = Path("/sys/bus/usb/devices")  # Linux only
+
+UDEV_ADVICE = (
+    "install librealsense's udev rules (config/99-realsense-libusb.rules of its repository into "
+    "/etc/udev/rules.d, then `sudo udevadm control --reload-rules && sudo udevadm trigger`) "
+    "and plug the camera in again"
+)
+# (words in librealsense's message, what happened and what to do next)
+START_ADVICE = (
+    (
+        ("busy", "power state"),
+        "another program uses it: close the RealSense Viewer, shut down other notebooks' kernels, "
+        "or unplug it and plug it in again",
+    ),
+    (("permission", "access"), f"you have no permission to use it: {UDEV_ADVICE}"),
+    (
+        ("resolve", "no device connected"),
+        "it does not offer depth 848x480 with colour 640x480 at 30 Hz here: plug it into a USB 3 "
+        "port with a USB 3 cable",
+    ),
+)
+
+
+class LibraryMissing(CameraError):
+    """pyrealsense2 cannot be used on this computer."""
+
+
+def load_librealsense() -> ModuleType:
+    """The module pyrealsense2; LibraryMissing, with what to do, where it cannot be loaded."""
+    if sys.platform == "linux":
+        # The wheel links libusb-1.0.so.0 and does not ship it; this needs neither root nor apt.
+        # Where it fails the system's own libusb may do, and the import below says if it does not.
+        with contextlib.suppress(ImportError, OSError):
+            import libusb_package
+
+            path = libusb_package.get_library_path()
+            ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
+    try:
+        import pyrealsense2
+    except ModuleNotFoundError:
+        raise LibraryMissing(
+            "pyrealsense2 is not installed, so neither a RealSense nor a recording can be opened: "
+            "`pip install -r requirements-camera.txt` installs it on x86-64 Linux and Windows; "
+            "there is none for macOS and most ARM computers, where the simulated camera works"
+        ) from None
+    except ImportError as error:
+        raise LibraryMissing(
+            f"pyrealsense2 is installed but does not load ({error}): "
+            "`pip install --force-reinstall -r requirements-camera.txt` may help; "
+            "the simulated camera works without it"
+        ) from error
+    return pyrealsense2
+
+
+def connected_realsenses() -> dict[str, str]:
+    """Serial number and name of every RealSense that librealsense sees on USB.
+
+    Raises LibraryMissing, and CameraError when one is plugged in that it may not touch.
+    """
+    rs = load_librealsense()
+    try:
+        found = {
+            device_info(rs, device, "serial_number"): device_info(rs, device, "name")
+            for device in rs.context().query_devices()
+        }
+    except RuntimeError as error:
+        raise CameraError(start_problem("the RealSense", error)) from error
+    found.pop("", None)  # a device in recovery mode has no serial number
+    if not found and _realsense_on_usb():
+        raise CameraError(
+            "a RealSense is plugged in, but librealsense cannot open it; most likely you have no "
+            f"permission to use it: {UDEV_ADVICE}"
+        )
+    return found
+
+
+def device_info(rs: ModuleType, device: Any, name: str) -> str:
+    """What the device says under `name` (a member of rs.camera_info), "" if it does not say."""
+    field = getattr(rs.camera_info, name)
+    return str(device.get_info(field)) if device.supports(field) else ""
+
+
+def start_problem(what: str, error: RuntimeError) -> str:
+    """The message for a live camera that does not start: what happened and what to do next."""
+    text = str(error).lower()
+    for words, advice in START_ADVICE:
+        if any(word in text for word in words):
+            return f"{what} does not start; {advice} (librealsense says: {error})"
+    return f"{what} does not start (librealsense says: {error}): unplug it, plug it in, try again"
+
+
+def _realsense_on_usb() -> bool:
+    """Whether the operating system (Linux only) sees a RealSense on USB."""
+    names = (path.read_text(errors="replace") for path in USB_DEVICES.glob("*/product"))
+    return any("RealSense" in name for name in names)

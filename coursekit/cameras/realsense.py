@@ -1,0 +1,333 @@
+"""RealSense cameras on USB, and recordings of them: one class, because librealsense plays both."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import itertools
+import threading
+import time
+import weakref
+from collections.abc import Callable, Generator, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from coursekit.cameras.camera import Camera, CameraError, Frame
+from coursekit.cameras.librealsense import device_info, load_librealsense, start_problem
+from coursekit.cameras.recording import check_recording, depth_frame_numbers
+from coursekit.geometry import Intrinsics, make_transform
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+DEPTH_SIZE, COLOR_SIZE, FRAMES_PER_S = (848, 480), (640, 480), 30
+WARM_UP_FRAMES = 30  # automatic exposure settles in about a second
+SETTLE_FRAMES = 6  # a new exposure shows up to five frames later (librealsense issue 11228)
+POLL_MS = 50  # a recording's last wait always runs out, so it is short
+SILENCE_S = 5.0  # without a frame for so long, the camera is gone
+
+UNPLUGGED = "is it still plugged in? Plug it in again, directly and with its own cable, and reopen"
+
+_live_cameras: weakref.WeakValueDictionary[str, RealSense] = weakref.WeakValueDictionary()
+
+
+class RealSense(Camera):
+    """A RealSense on USB (by serial number) or a recording (by path) in librealsense's hands.
+
+    Raises LibraryMissing without pyrealsense2, and CameraError for a camera or file that does not
+    open. All attributes are what the device or the recording reports about itself.
+    """
+
+    def __init__(self, serial: str | None = None, path: Path | None = None) -> None:
+        if (serial is None) == (path is None):
+            raise ValueError("serial, path: got both or neither, want exactly one")
+        self._rs = load_librealsense()
+        self._path, self._pipeline = path, None
+        self._what = f"the RealSense {serial}"
+        self.source, self.serial = "live", serial or ""
+        if path is not None:
+            self._what = f"the recording {path.name}"
+            self.source = "recorded"
+            check_recording(path)
+        elif self.serial in _live_cameras:  # the setup cell was run again
+            _live_cameras[self.serial].close()
+        self._start()
+        try:
+            self._query()
+            if self.source == "live":
+                _live_cameras[self.serial] = self
+                self._skip(WARM_UP_FRAMES)
+        except CameraError:
+            self.close()
+            raise
+        except (RuntimeError, ValueError) as error:
+            self.close()
+            raise CameraError(f"{self._what} does not describe itself fully: {error}") from error
+
+    # --- opening and closing -------------------------------------------------------------------
+
+    def _start(self) -> None:
+        """Start streaming; of a recording from its beginning."""
+        try:
+            pipeline = self._rs.pipeline()
+            config = self._playback_config(pipeline) if self._path else self._live_config()
+            self._profile = pipeline.start(config)
+            if self._path:
+                # resume() waits for the reading thread, and for 10 s if that reaches the end of a
+                # short or damaged file first; so it waits in a thread of its own.
+                playback = self._profile.get_device().as_playback()
+                threading.Thread(target=playback.resume, daemon=True).start()
+        except CameraError:
+            raise
+        except RuntimeError as error:
+            if self._path is None:
+                raise CameraError(start_problem(self._what, error)) from error
+            reason = str(error).rsplit("Reason: ", maxsplit=1)[-1]
+            raise CameraError(
+                f"{self._what} cannot be read: it is damaged, incomplete or not from a RealSense; "
+                f"copy it again or record it anew (librealsense says: {reason})"
+            ) from error
+        self._pipeline = pipeline
+
+    def _live_config(self) -> Any:
+        rs, config = self._rs, self._rs.config()
+        config.enable_device(self.serial)
+        config.enable_stream(rs.stream.depth, *DEPTH_SIZE, rs.format.z16, FRAMES_PER_S)
+        config.enable_stream(rs.stream.color, *COLOR_SIZE, rs.format.rgb8, FRAMES_PER_S)
+        return config
+
+    def _playback_config(self, pipeline: Any) -> Any:
+        """Depth and colour of the file, whatever else it holds, as fast as they are asked for."""
+        rs, wrapper = self._rs, self._rs.pipeline_wrapper(pipeline)
+
+        def from_file() -> Any:
+            config = rs.config()
+            config.enable_device_from_file(str(self._path), repeat_playback=False)
+            return config
+
+        everything = from_file().resolve(wrapper)
+        streams = {profile.stream_type() for profile in everything.get_streams()}
+        if rs.stream.depth not in streams:
+            raise CameraError(f"{self._what} holds no depth images: record depth and colour")
+        config = from_file()
+        for stream in streams & {rs.stream.depth, rs.stream.color}:
+            config.enable_stream(stream)
+        # Both before the start, or images are lost: at the recorded pace those that are not fetched
+        # in time, and the first ones while the sensors are started one after the other.
+        playback = config.resolve(wrapper).get_device().as_playback()
+        playback.set_real_time(False)
+        playback.pause()
+        return config
+
+    def close(self) -> None:
+        """Stop the camera, or close the file; a second call does nothing."""
+        pipeline, self._pipeline = self._pipeline, None
+        if pipeline is not None:
+            with contextlib.suppress(RuntimeError):  # an unplugged camera cannot be stopped
+                pipeline.stop()
+
+    # --- what the device says about itself -----------------------------------------------------
+
+    def _query(self) -> None:
+        rs, device = self._rs, self._profile.get_device()
+        sensor = device.first_depth_sensor()
+        self.name = device_info(rs, device, "name") or "RealSense"
+        self.serial = device_info(rs, device, "serial_number")
+        self.depth_scale_m = _decimal(sensor.get_depth_scale())
+        self.baseline_m = None
+        if sensor.supports(rs.option.stereo_baseline):
+            self.baseline_m = _decimal(sensor.get_option(rs.option.stereo_baseline)) / 1000.0
+        profiles = {p.stream_type(): p for p in self._profile.get_streams()}
+        depth = profiles[rs.stream.depth].as_video_stream_profile()
+        self.depth = Intrinsics.from_realsense(depth.get_intrinsics())
+        self.color = self.T_color_depth = self._to_rgb = None
+        if rs.stream.color in profiles:
+            color = profiles[rs.stream.color].as_video_stream_profile()
+            self.color = Intrinsics.from_realsense(color.get_intrinsics())
+            self._to_rgb = _rgb_converter(str(color.format()).rsplit(".", 1)[-1])
+            extrinsics = depth.get_extrinsics_to(color)
+            rotation = np.reshape(extrinsics.rotation, (3, 3), order="F")  # column by column
+            self.T_color_depth = make_transform(rotation, extrinsics.translation)
+
+    def __repr__(self) -> str:
+        where = f"recording {self._path.name}" if self._path else f"live, serial {self.serial}"
+        color = f"colour {self.color.width}x{self.color.height}" if self.color else "no colour"
+        baseline = "unknown" if self.baseline_m is None else f"{1000 * self.baseline_m:.1f} mm"
+        return (
+            f"{self.name} ({where}): depth {self.depth.width}x{self.depth.height}, {color}, "
+            f"baseline {baseline}, depth unit {1000 * self.depth_scale_m:g} mm"
+        )
+
+    # --- frames --------------------------------------------------------------------------------
+
+    def _stream(self) -> Generator[Frame, None, None]:
+        if self._pipeline is None:
+            raise CameraError(f"{self._what} is closed: open it again with open_camera()")
+        if self._path is not None:
+            self.close()
+            self._start()
+        # A playback gives each depth image with the colour image before it and the one after it;
+        # a live camera gives matching images, and repeats one when the other is late.
+        choose = functools.partial(min, key=_time_apart) if self._path else next
+        frame = None
+        for _, pairs in itertools.groupby(self._pairs(), key=_identity):
+            frame = self._frame(*choose(pairs))
+            yield frame
+        self._check_end(frame)
+
+    def _pairs(self) -> Iterator[tuple[Any, Any]]:
+        """(depth, colour or None) as librealsense groups them, until a recording ends."""
+        playback = None if self._path is None else self._profile.get_device().as_playback()
+        while (frameset := self._next_frameset(playback)) is not None:
+            depth, color = frameset.get_depth_frame(), frameset.get_color_frame()
+            if depth:
+                yield depth, color or None
+
+    def _check_end(self, last: Frame | None) -> None:
+        """CameraError unless a playback that ended has given all depth images of its file.
+
+        librealsense ends it silently at the first message that it cannot decode.
+        """
+        if self._path is not None and self._path.suffix == ".db3":
+            numbers = depth_frame_numbers(self._path)
+            lost = len(numbers)
+            if last is not None and last.number in numbers:
+                lost = numbers[::-1].index(last.number)
+            if lost:
+                raise CameraError(
+                    f"{self._what} is damaged: its last {lost} depth images cannot be read; "
+                    "ask for fewer frames, copy the file again or record it anew"
+                )
+        if last is None:
+            raise CameraError(f"{self._what} holds no frames: record it anew")
+
+    def _next_frameset(self, playback: Any) -> Any:
+        """The next group of images; None once a recording has ended."""
+        rs, ended, deadline = self._rs, False, time.monotonic() + SILENCE_S
+        while time.monotonic() < deadline:
+            if self._pipeline is None:
+                raise CameraError(f"{self._what} was closed while it was giving frames")
+            try:
+                arrived, frameset = self._pipeline.try_wait_for_frames(POLL_MS)
+            except RuntimeError as error:
+                raise CameraError(
+                    f"{self._what} stopped giving frames ({error}): {UNPLUGGED}"
+                ) from error
+            if arrived:
+                return frameset
+            if ended:
+                return None
+            ended = playback and playback.current_status() == rs.playback_status.stopped
+        raise CameraError(f"no frame came from {self._what} for {SILENCE_S:g} s: {UNPLUGGED}")
+
+    def _frame(self, depth: Any, color: Any) -> Frame:
+        return Frame(
+            depth=np.array(depth.get_data(), dtype=np.uint16),
+            color=self._to_rgb(np.asarray(color.get_data())) if color and self._to_rgb else None,
+            depth_scale_m=self.depth_scale_m,
+            time_s=depth.get_timestamp() / 1000.0,
+            number=depth.get_frame_number(),
+            depth_intrinsics=self.depth,
+            color_intrinsics=self.color,
+            T_color_depth=self.T_color_depth,
+        )
+
+    def _skip(self, n: int) -> None:
+        for _ in itertools.islice(self._stream(), n):
+            pass
+
+    # --- exposure ------------------------------------------------------------------------------
+
+    def lock(self) -> str:
+        """Switch automatic exposure, gain and white balance off, at the values they have now.
+
+        The colour camera does not report its automatic exposure (librealsense issue 2549), so it
+        takes its manual setting. A recording is left as it is. Returns one sentence that says so.
+        """
+        if self._path is not None:
+            return "A recording cannot be changed: exposure and focus are as they were recorded."
+        if self._pipeline is None:
+            raise CameraError(f"{self._what} is closed: open it again with open_camera()")
+        rs, locked = self._rs, []
+        try:
+            for sensor in self._profile.get_device().query_sensors():
+                if sensor.supports(rs.option.enable_auto_exposure):
+                    locked.append(self._lock_exposure(sensor))
+                if sensor.supports(rs.option.enable_auto_white_balance):
+                    sensor.set_option(rs.option.enable_auto_white_balance, 0)
+                    locked.append("white balance")
+            self._skip(SETTLE_FRAMES)
+        except CameraError:
+            raise
+        except RuntimeError as error:
+            raise CameraError(f"{self._what} does not let itself be locked: {error}") from error
+        fixed = ", ".join(locked) or "nothing: this camera has no automatic exposure"
+        return f"Locked {fixed}; the focus is fixed by the lenses."
+
+    def _lock_exposure(self, sensor: Any) -> str:
+        rs, option = self._rs, self._rs.option
+        if sensor.is_depth_sensor():
+            exposure, gain = self._depth_exposure(sensor)
+            name, us_per_count = "depth", 1.0
+        else:
+            exposure, gain = sensor.get_option(option.exposure), sensor.get_option(option.gain)
+            name, us_per_count = "colour (manual setting)", 100.0
+        sensor.set_option(rs.option.enable_auto_exposure, 0)
+        sensor.set_option(option.exposure, exposure)
+        sensor.set_option(option.gain, gain)
+        return f"{name} exposure at {exposure * us_per_count / 1000.0:.1f} ms"
+
+    def _depth_exposure(self, sensor: Any) -> tuple[float, float]:
+        """Exposure (us) and gain of the newest depth image, which automatic exposure chose."""
+        rs, option = self._rs, self._rs.option
+        depth, _ = next(self._pairs())
+        return tuple(
+            depth.get_frame_metadata(value)
+            if depth.supports_frame_metadata(value)
+            else sensor.get_option(setting)
+            for value, setting in (
+                (rs.frame_metadata_value.actual_exposure, option.exposure),
+                (rs.frame_metadata_value.gain_level, option.gain),
+            )
+        )
+
+
+# --- images ------------------------------------------------------------------------------------
+
+
+def _identity(pair: tuple[Any, Any]) -> tuple[int, float]:
+    return pair[0].get_frame_number(), pair[0].get_timestamp()
+
+
+def _time_apart(pair: tuple[Any, Any]) -> float:
+    depth, color = pair
+    return abs(depth.get_timestamp() - color.get_timestamp()) if color else np.inf
+
+
+def _rgb_converter(form: str) -> Callable[[NDArray[Any]], NDArray[np.uint8]]:
+    """The function that makes (h, w, 3) RGB of a colour image in librealsense's format `form`."""
+    slices = {
+        "rgb8": np.s_[..., :3],
+        "rgba8": np.s_[..., :3],
+        "bgr8": np.s_[..., ::-1],
+        "bgra8": np.s_[..., 2::-1],
+    }
+    if form in slices:
+        return lambda image: image[slices[form]].copy()
+    if form in ("yuyv", "uyvy"):
+        import cv2
+
+        code = cv2.COLOR_YUV2RGB_YUYV if form == "yuyv" else cv2.COLOR_YUV2RGB_UYVY
+        return lambda image: cv2.cvtColor(_two_bytes_a_pixel(image), code)  # type: ignore[return-value]
+    raise ValueError(f"colour is stored as {form}, want {', '.join(slices)}, yuyv or uyvy")
+
+
+def _two_bytes_a_pixel(image: NDArray[Any]) -> NDArray[np.uint8]:
+    return np.ascontiguousarray(image).view(np.uint8).reshape(*image.shape[:2], 2)
+
+
+def _decimal(value: float) -> float:
+    """The shortest decimal number that is the same in float32: 0.001, not 0.0010000000475."""
+    return float(str(np.float32(value)))

@@ -1,0 +1,271 @@
+"""Figures of notebook 01."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from coursekit import geometry
+from coursekit.geometry import Intrinsics
+from coursekit.plots.style import COLORS, LessonFigure, figure
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from coursekit.cameras import Frame
+    from coursekit.simulation.scenes import Box
+
+POINT_X_M = 0.10  # how far right of the axis the point of `similar_triangles` is
+
+
+def similar_triangles(focal_length_mm: float = 1.93, depth_m: float = 0.45) -> LessonFigure:
+    """The two similar triangles seen from above, and the spot on the sensor.
+
+    focal_length_mm: lens to image plane, mm. depth_m: Z of a point 100 mm right of the axis, m.
+    The image plane is drawn 40 times too far from the pinhole, or nobody would see it.
+    """
+    x_mm = focal_length_mm * POINT_X_M / depth_m
+    fig = figure(9.0, 3.8)
+    above, sensor = fig.subplots(1, 2, width_ratios=[2.4, 1])
+    _triangles(above, 0.040 * focal_length_mm, depth_m)
+    sensor.axhline(0, color=COLORS["faint"], lw=1)
+    sensor.axvline(0, color=COLORS["faint"], lw=1)
+    sensor.plot([x_mm], [0], "o", color=COLORS["measured"], ms=10)
+    sensor.set(xlim=(-3.2, 3.2), ylim=(-2, 2), xlabel="x on the sensor (mm)", aspect="equal")
+    sensor.set_yticks([])
+    sensor.set_title(f"x = f X / Z = {x_mm:.3f} mm")
+    fig.alt = (
+        f"Side by side: the ray from a point {1000 * POINT_X_M:.0f} mm off the axis at Z = "
+        f"{depth_m:.2f} m through the pinhole, and its image {x_mm:.3f} mm off the sensor's "
+        f"centre for f = {focal_length_mm:.2f} mm."
+    )
+    return fig
+
+
+def _triangles(ax: Any, plane_m: float, depth_m: float) -> None:
+    """The large triangle up to the point and the small one up to the image plane, both in m."""
+    inner = POINT_X_M * plane_m / depth_m
+    ax.axhline(0, color=COLORS["faint"], lw=1)
+    ax.fill([0, depth_m, depth_m], [0, 0, POINT_X_M], color=COLORS["depth"], alpha=0.25)
+    ax.fill([0, plane_m, plane_m], [0, 0, inner], color=COLORS["measured"], alpha=0.5)
+    ax.plot([0, depth_m], [0, POINT_X_M], color=COLORS["model"])
+    ax.plot([plane_m, plane_m], [-0.16, 0.16], color=COLORS["ink"], lw=1.5)
+    ax.plot([depth_m], [POINT_X_M], "o", color=COLORS["truth"], ms=9)
+    ax.plot([plane_m], [inner], "o", color=COLORS["measured"], ms=9)
+    ax.plot([0], [0], "o", color=COLORS["ink"])
+    ax.text(-0.03, 0.012, "pinhole", ha="right")
+    ax.text(plane_m + 0.02, -0.155, "image plane\n(40 times too far out)")
+    point = f"P: X = {1000 * POINT_X_M:.0f} mm"
+    ax.text(depth_m, POINT_X_M + 0.015, point, ha="center", color=COLORS["truth"])
+    ax.set(xlim=(-0.3, 2.1), ylim=(-0.18, 0.18), xlabel="Z (m)", ylabel="X (m)")
+    ax.set_title("from above: two triangles with the same angle")
+
+
+def pixel_grid(principal: tuple[float, float] = (3.3, 2.2)) -> LessonFigure:
+    """A sensor of 8 x 5 pixels: (0, 0) is the centre of the top-left one, edges are at +-0.5."""
+    columns, rows = 8, 5
+    fig = figure(6.5, 4.4)
+    ax = fig.subplots()
+    for u in range(columns + 1):
+        ax.plot([u - 0.5] * 2, [-0.5, rows - 0.5], color=COLORS["faint"], lw=1)
+    for v in range(rows + 1):
+        ax.plot([-0.5, columns - 0.5], [v - 0.5] * 2, color=COLORS["faint"], lw=1)
+    centres = geometry.pixel_grid(columns, rows).reshape(-1, 2)
+    ax.plot(*centres.T, ".", color=COLORS["ink"], ms=4, label="pixel centres")
+    ax.plot(0, 0, "s", color=COLORS["model"], ms=9, label="(0, 0)")
+    ax.plot(*principal, "+", color=COLORS["measured"], ms=16, mew=3,
+            label=f"principal point {principal}")  # fmt: skip
+    ax.set(xlim=(-0.8, columns - 0.2), ylim=(rows - 0.2, -0.8), aspect="equal")
+    ax.set(xlabel="u (px), to the right", ylabel="v (px), down")
+    fig.legend(loc="outside lower center", ncols=3)
+    fig.alt = (
+        f"A grid of {columns} by {rows} pixels. The origin (0, 0) is the centre of the top-left "
+        f"pixel; the principal point, {principal}, falls between pixel centres."
+    )
+    return fig
+
+
+def entries_of_K(scene: tuple[Box, ...], camera: Intrinsics, **moved: float) -> LessonFigure:
+    """The edges of a scene's boxes, drawn with the camera's K and with some entries changed."""
+    changed = Intrinsics.from_dict(camera.to_dict() | moved)
+    fig = figure(8.0, 4.8)
+    ax = fig.subplots()
+    for intrinsics, color, name in (
+        (camera, COLORS["model"], "K of the camera"),
+        (changed, COLORS["measured"], "your K"),
+    ):
+        for line in _edges(scene):
+            ax.plot(*geometry.project(line, intrinsics.K).T, color=color, lw=1.5)
+        ax.plot([], [], color=color, label=name)
+        ax.plot(intrinsics.cx, intrinsics.cy, "+", color=color, ms=14, mew=2)
+    ax.plot([], [], "+", color=COLORS["ink"], ms=12, label="principal point")
+    _image_axes(ax, camera)
+    ax.legend(loc="upper right")
+    values = ", ".join(f"{k} = {getattr(changed, k):.0f}" for k in ("fx", "fy", "cx", "cy"))
+    ax.set_title(values + " px")
+    fig.alt = f"Wire frame of the tabletop in the image with the camera's K and with {values} px."
+    return fig
+
+
+def _edges(scene: tuple[Box, ...]) -> list[NDArray[np.float64]]:
+    """The twelve edges of each free-standing box, (2, 3) each, m."""
+    signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]) / 2
+    lines = []
+    for box in scene:
+        if max(box.size_m) > 0.2:  # the wall and the table are larger than the image
+            continue
+        corners = geometry.transform_points(box.T_scene_box, signs * box.size_m)
+        for a in range(8):
+            for b in range(a + 1, 8):
+                if np.count_nonzero(signs[a] != signs[b]) == 1:
+                    lines.append(corners[[a, b]])
+    return lines
+
+
+def field_of_view(depth: Intrinsics, color: Intrinsics | None, distance_m: float) -> LessonFigure:
+    """What the depth and the colour camera see, from above, and how wide that is at a distance."""
+    fig = figure(8.0, 4.0)
+    ax = fig.subplots()
+    texts = []
+    cameras = [("depth", depth)] + ([("color", color)] if color else [])
+    for (name, camera), label in zip(cameras, ("depth", "colour"), strict=False):
+        edges = np.array([[-0.5, camera.cy], [camera.width - 0.5, camera.cy]])
+        left, right = geometry.deproject(edges, distance_m, camera.K)[:, 0]
+        width = 1000 * (right - left)
+        text = f"{label}: {camera.hfov_deg:.1f}°, {width:.0f} mm wide at {distance_m:.2f} m"
+        far = 1.25
+        ax.fill([0, left * far, right * far], [0, distance_m * far, distance_m * far],
+                color=COLORS[name], alpha=0.35, label=text)  # fmt: skip
+        texts.append(text)
+    ax.axhline(distance_m, color=COLORS["ink"], lw=1, ls="--")
+    ax.plot([0, 0], [0, 1.25 * distance_m], color=COLORS["ink"], lw=1)
+    ax.set(xlabel="X (m)", ylabel="Z (m)", aspect="equal", ylim=(0, 1.25 * distance_m))
+    fig.legend(loc="outside lower center", ncols=2)
+    fig.alt = "Fields of view from above. " + "; ".join(texts) + "."
+    return fig
+
+
+def same_pixel(near_m: float, near_size_m: float, far_m: float, K: NDArray[Any]) -> LessonFigure:
+    """A small near and a large far object that cover the same pixels."""
+    far_size = near_size_m * far_m / near_m
+    pixels = K[0, 0] * near_size_m / near_m
+    fig = figure(8.0, 3.2)
+    ax = fig.subplots()
+    for z, size, name in ((near_m, near_size_m, "cube"), (far_m, far_size, "block")):
+        ax.plot([z, z], [-size / 2, size / 2], color=COLORS[name], lw=6,
+                label=f"{1000 * size:.0f} mm at {z:.4g} m")  # fmt: skip
+    reach = far_m * 1.15
+    for sign in (-1, 1):
+        ax.plot([0, reach], [0, sign * far_size / 2 * reach / far_m], color=COLORS["model"], lw=1.5)
+    ax.plot(0, 0, "o", color=COLORS["ink"])
+    ax.set(xlabel="Z (m)", ylabel="X (m)", title=f"both are {pixels:.1f} px wide in the image")
+    fig.legend(loc="outside lower center", ncols=2)
+    fig.alt = (
+        f"Two objects between the same two rays: {1000 * near_size_m:.0f} mm wide at {near_m:.4g} m"
+        f" and {1000 * far_size:.0f} mm wide at {far_m:.4g} m; both are {pixels:.1f} px wide."
+    )
+    return fig
+
+
+def displacement(lenses: Mapping[str, Intrinsics]) -> LessonFigure:
+    """How far distortion moves each pixel, in px, one map a lens; arrows not to scale."""
+    columns = 2
+    rows = -(-len(lenses) // columns)
+    fig = figure(8.5, 3.3 * rows)
+    axes = np.atleast_1d(fig.subplots(rows, columns)).ravel()
+    texts = []
+    for ax, (name, lens) in zip(axes, lenses.items(), strict=False):
+        shift, size = displacement_px(lens)
+        shown = ax.imshow(size, extent=(-0.5, lens.width - 0.5, lens.height - 0.5, -0.5))
+        fig.colorbar(shown, ax=ax, label="px", shrink=0.8)
+        step = lens.width // 9
+        grid = geometry.pixel_grid(*lens.size)[step // 2 :: step, step // 2 :: step]
+        arrows = shift[step // 2 :: step, step // 2 :: step]
+        ax.quiver(*np.moveaxis(grid, -1, 0), *np.moveaxis(arrows, -1, 0),
+                  angles="xy", color="white", width=0.004)  # fmt: skip
+        edge, corner = edge_and_corner(size)
+        said = f"{edge:.1f} px at the edges, {corner:.1f} px in the corners"
+        ax.set_title(f"{name}\nedges {edge:.1f} px, corners {corner:.1f} px", fontsize=10)
+        _image_axes(ax, lens)
+        texts.append(f"{name}, {said}")
+    for ax in axes[len(lenses) :]:
+        ax.set_visible(False)
+    fig.alt = "Maps of the displacement by distortion: " + "; ".join(texts) + "."
+    return fig
+
+
+def displacement_px(lens: Intrinsics) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """How far, and from the pinhole's place, the lens moves each pixel: (H, W, 2), (H, W) px."""
+    grid = geometry.pixel_grid(*lens.size)
+    ideal = geometry.deproject(grid, np.ones(grid.shape[:2]), lens.K)
+    shift = geometry.project(ideal, lens.K, lens.dist) - grid
+    return shift, np.linalg.norm(shift, axis=-1)
+
+
+def edge_and_corner(size: NDArray[np.float64]) -> tuple[float, float]:
+    """The largest displacement at the middle of an edge, and in a corner, px."""
+    height, width = size.shape
+    edge = max(
+        size[height // 2, 0], size[height // 2, -1], size[0, width // 2], size[-1, width // 2]
+    )
+    return float(edge), float(max(size[0, 0], size[0, -1], size[-1, 0], size[-1, -1]))
+
+
+def frame(shot: Frame) -> LessonFigure:
+    """The depth image, and the colour image where there is one, as the camera delivers them."""
+    images = 1 if shot.color is None else 2
+    fig = figure(4.6 * images, 3.3)
+    axes = np.atleast_1d(fig.subplots(1, images))
+    depth = np.where(shot.depth_m > 0, shot.depth_m, np.nan)
+    shown = axes[0].imshow(depth)
+    fig.colorbar(shown, ax=axes[0], label="depth Z (m)", shrink=0.8)
+    axes[0].set(title="depth (white: no depth)", xlabel="u (px)", ylabel="v (px)")
+    if shot.color is not None:
+        axes[1].imshow(shot.color)
+        axes[1].set(title="colour", xlabel="u (px)", ylabel="v (px)")
+    height, width = depth.shape
+    fig.alt = (
+        f"Depth image of {width} by {height} pixels from {np.nanmin(depth):.3f} to "
+        f"{np.nanmax(depth):.3f} m, {np.isnan(depth).mean():.1%} of it without depth"
+        + ("." if shot.color is None else ", and the colour image beside it.")
+    )
+    return fig
+
+
+def point_cloud(
+    points: NDArray[np.float32], colors: NDArray[np.uint8] | None = None
+) -> LessonFigure:
+    """A point cloud (H, W, 3) in m, from beside the camera and from above; NaN points are left out.
+
+    colors (H, W, 3): RGB of each point; without it, colour is depth.
+    """
+    seen = np.isfinite(points).all(axis=-1)
+    some = np.random.default_rng(0).permutation(int(seen.sum()))[:30_000]  # a stride makes moiré
+    cloud = points[seen][some]
+    look: dict[str, Any] = {"s": 2, "linewidths": 0}
+    look["c"] = cloud[:, 2] if colors is None else colors[seen][some] / 255
+    fig = figure(9.0, 3.8)
+    fig.set_layout_engine("none")  # the 3-D axes reserve far more room than they use
+    solid: Any = fig.add_axes((0.0, 0.0, 0.5, 0.98), projection="3d")
+    solid.scatter(cloud[:, 0], cloud[:, 2], -cloud[:, 1], depthshade=False, **look)
+    solid.set(xlabel="X (m)", ylabel="Z (m)", zlabel="-Y (m)")
+    solid.locator_params(nbins=4)
+    solid.locator_params(axis="y", nbins=2)
+    solid.view_init(elev=18, azim=-70)
+    solid.set_box_aspect(np.maximum(np.ptp(cloud[:, [0, 2, 1]], axis=0), 0.05), zoom=0.85)
+    above = fig.add_axes((0.6, 0.15, 0.38, 0.7))
+    above.scatter(cloud[:, 0], cloud[:, 2], **look)
+    above.set(xlabel="X (m)", ylabel="Z (m)", title="from above", aspect="equal")
+    low, high = cloud.min(axis=0), cloud.max(axis=0)
+    fig.alt = (
+        f"Point cloud of {int(seen.sum())} points, X from {low[0]:.2f} to {high[0]:.2f} m, "
+        f"Z from {low[2]:.2f} to {high[2]:.2f} m, from beside the camera and from above."
+    )
+    return fig
+
+
+def _image_axes(ax: Any, camera: Intrinsics) -> None:
+    ax.set(xlim=(-0.5, camera.width - 0.5), ylim=(camera.height - 0.5, -0.5), aspect="equal")
+    ax.set(xlabel="u (px)", ylabel="v (px)")

@@ -1,0 +1,208 @@
+"""A stand-in for the module pyrealsense2 with one live D435, for what no test machine has."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coursekit.cameras.librealsense import LibraryMissing, load_librealsense
+
+SERIAL = "728612070259"
+
+
+def real_library() -> Any:
+    """The module pyrealsense2 itself; the test is skipped where it cannot be used."""
+    try:
+        return load_librealsense()
+    except LibraryMissing as missing:
+        pytest.skip(str(missing))
+
+
+class _Names:
+    """Any attribute is its own name, like the members of the library's enumerations."""
+
+    def __getattr__(self, name: str) -> str:
+        return name
+
+
+class FakeSensor:
+    def __init__(self, depth: bool, options: dict[str, float]) -> None:
+        self._depth, self.options = depth, options
+        self.set_calls: list[tuple[str, float]] = []
+
+    def is_depth_sensor(self) -> bool:
+        return self._depth
+
+    def supports(self, option: str) -> bool:
+        return option in self.options
+
+    def get_option(self, option: str) -> float:
+        return self.options[option]
+
+    def set_option(self, option: str, value: float) -> None:
+        self.set_calls.append((option, value))
+        self.options[option] = value
+
+    def get_depth_scale(self) -> float:
+        return float(np.float32(0.001))
+
+
+class FakeProfile:
+    def __init__(self, stream: str, form: str, width: int, height: int, fx: float) -> None:
+        self._stream, self._form = stream, form
+        self._intrinsics = SimpleNamespace(
+            width=width,
+            height=height,
+            fx=fx,
+            fy=fx + 0.25,
+            ppx=width / 2 + 1.5,
+            ppy=height / 2 - 2.5,
+            model="distortion.inverse_brown_conrady",
+            coeffs=[0.1, -0.2, 0.001, 0.002, 0.05],
+        )
+
+    def stream_type(self) -> str:
+        return self._stream
+
+    def format(self) -> str:
+        return f"format.{self._form}"
+
+    def as_video_stream_profile(self) -> FakeProfile:
+        return self
+
+    def get_intrinsics(self) -> SimpleNamespace:
+        return self._intrinsics
+
+    def get_extrinsics_to(self, other: FakeProfile) -> SimpleNamespace:
+        # A quarter turn about z, listed by columns as the library does: x goes to y.
+        return SimpleNamespace(rotation=[0, 1, 0, -1, 0, 0, 0, 0, 1], translation=[0.015, 0, 0])
+
+
+class FakeImage:
+    def __init__(self, number: int, pixels: np.ndarray) -> None:
+        self._number, self._pixels = number, pixels
+
+    def get_data(self) -> np.ndarray:
+        return self._pixels
+
+    def get_frame_number(self) -> int:
+        return self._number
+
+    def get_timestamp(self) -> float:
+        return 1000.0 * self._number / 30
+
+    def supports_frame_metadata(self, value: str) -> bool:
+        return value in ("actual_exposure", "gain_level")
+
+    def get_frame_metadata(self, value: str) -> int:
+        return {"actual_exposure": 8500, "gain_level": 16}[value]
+
+
+class FakeRealSense:
+    """The module: `pyrealsense2` as far as the course's live camera uses it.
+
+    start_error: what pipeline.start raises. frames: how many framesets come before `then` happens:
+    an exception to raise, or None for silence. color_late: each depth image comes twice.
+    """
+
+    __version__ = "fake"
+
+    def __init__(
+        self,
+        start_error: str | None = None,
+        frames: int = 10**9,
+        then: BaseException | None = None,
+        color_late: bool = False,
+        color_format: str = "rgb8",
+    ) -> None:
+        self.start_error, self.limit, self.then = start_error, frames, then
+        self.color_late, self.color_format = color_late, color_format
+        self.serials = [SERIAL]
+        self.starts = self.stops = self.given = 0
+        self.enabled: list[tuple[Any, ...]] = []
+        self.query_error: str | None = None
+        self.depth_sensor = FakeSensor(
+            True,
+            {"enable_auto_exposure": 1, "exposure": 33000, "gain": 16, "stereo_baseline": 50.17},
+        )
+        self.color_sensor = FakeSensor(
+            False,
+            {
+                "enable_auto_exposure": 1,
+                "exposure": 156,
+                "gain": 64,
+                "enable_auto_white_balance": 1,
+            },
+        )
+        self.motion_sensor = FakeSensor(False, {})
+        for group in ("stream", "format", "option", "camera_info", "frame_metadata_value"):
+            setattr(self, group, _Names())
+        self.playback_status = _Names()
+
+    # module level
+    def context(self) -> Any:
+        if self.query_error:
+            raise RuntimeError(self.query_error)
+        return SimpleNamespace(query_devices=lambda: [_Device(self, s) for s in self.serials])
+
+    def pipeline(self) -> Any:
+        return _Pipeline(self)
+
+    def config(self) -> Any:
+        return SimpleNamespace(
+            enable_device=lambda serial: self.enabled.append(("device", serial)),
+            enable_stream=lambda *stream: self.enabled.append(stream),
+        )
+
+
+class _Device:
+    def __init__(self, rs: FakeRealSense, serial: str) -> None:
+        self._rs, self._serial = rs, serial
+
+    def supports(self, field: str) -> bool:
+        return True
+
+    def get_info(self, field: str) -> str:
+        return {"name": "Intel RealSense D435", "serial_number": self._serial}[field]
+
+    def first_depth_sensor(self) -> FakeSensor:
+        return self._rs.depth_sensor
+
+    def query_sensors(self) -> list[FakeSensor]:
+        return [self._rs.depth_sensor, self._rs.color_sensor, self._rs.motion_sensor]
+
+
+class _Pipeline:
+    def __init__(self, rs: FakeRealSense) -> None:
+        self._rs, self._waits = rs, 0
+
+    def start(self, config: Any) -> Any:
+        self._rs.starts += 1
+        if self._rs.start_error:
+            raise RuntimeError(self._rs.start_error)
+        streams = [
+            FakeProfile("depth", "z16", 848, 480, 426.0),
+            FakeProfile("color", self._rs.color_format, 640, 480, 613.0),
+        ]
+        device = _Device(self._rs, SERIAL)
+        return SimpleNamespace(get_device=lambda: device, get_streams=lambda: streams)
+
+    def try_wait_for_frames(self, timeout_ms: int) -> tuple[bool, Any]:
+        rs = self._rs
+        if rs.given >= rs.limit:
+            if rs.then is not None:
+                raise rs.then
+            return False, None
+        rs.given += 1
+        number = (rs.given + 1) // 2 if rs.color_late else rs.given
+        depth = FakeImage(number, np.full((480, 848), 400 + number % 7, np.uint16))
+        color = FakeImage(number, np.full((480, 640, 3), 128, np.uint8))
+        return True, SimpleNamespace(get_depth_frame=lambda: depth, get_color_frame=lambda: color)
+
+    def stop(self) -> None:
+        self._rs.stops += 1
+        if self._rs.then is not None:
+            raise RuntimeError("the device is gone")

@@ -1,0 +1,421 @@
+"""The same tests for the simulated camera and a recording of it, then what is special to each."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_realsense import real_library
+
+import coursekit as ck
+from coursekit.cameras import Camera, CameraError, Frame, Frames, open_camera
+from coursekit.cameras.camera import _looks_still, _noise_std
+from coursekit.cameras.simulated import SimulatedCamera
+from coursekit.geometry import Intrinsics, deproject, project, transform_points
+from coursekit.simulation import tabletop
+
+CALIBRATION_TOLERANCE = 1e-6  # the recorder writes extrinsics with six decimals
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """12 frames of the simulated camera as librealsense recorded them."""
+    real_library()
+    path = tmp_path_factory.mktemp("recording") / "tabletop.db3"
+    with SimulatedCamera() as camera:
+        return camera.record(path, 12)
+
+
+@pytest.fixture(params=["simulated", "recorded"])
+def camera(request):
+    recorded = request.param == "recorded"
+    with open_camera(request.getfixturevalue("recording") if recorded else "simulated") as opened:
+        yield opened
+
+
+# --- one protocol ---
+
+
+def test_describes_itself(camera):
+    truth = ck.specifications.device("D435").unit
+    assert isinstance(camera, Camera)
+    assert (camera.name, camera.serial) == ("Simulated D435", "seed-7")
+    assert camera.depth_scale_m == 0.001
+    assert camera.baseline_m == pytest.approx(truth.baseline_m, abs=1e-9)
+    for mine, true in ((camera.depth, truth.depth), (camera.color, truth.color)):
+        assert mine.size == true.size
+        assert mine.model == true.model
+        np.testing.assert_array_equal(np.float32(mine.K), np.float32(true.K))
+        np.testing.assert_array_equal(np.float32(mine.coeffs), np.float32(true.coeffs))
+    np.testing.assert_allclose(
+        camera.T_color_depth, truth.T_color_depth, rtol=0, atol=CALIBRATION_TOLERANCE
+    )
+
+
+def test_frames_are_a_sequence_numbered_and_timed_at_30_hz(camera, capsys):
+    frames = camera.frames(5, progress=False)
+    assert isinstance(frames, Frames)
+    assert len(frames) == 5
+    assert frames.depth.shape == (5, 480, 848)
+    assert frames.depth.dtype == np.uint16
+    assert [frame.number for frame in frames] == list(range(frames[0].number, frames[0].number + 5))
+    np.testing.assert_allclose(np.diff([frame.time_s for frame in frames]), 1 / 30, atol=1e-6)
+    assert isinstance(frames[1:3], Frames)
+    assert [frame.number for frame in frames[1:3]] == [frames[1].number, frames[2].number]
+    assert capsys.readouterr() == ("", "")
+
+
+def test_a_frame_carries_its_calibration(camera):
+    frame = camera.frame()
+    assert frame.depth.shape == (480, 848)
+    assert frame.depth.dtype == np.uint16
+    assert frame.color.shape == (480, 640, 3)
+    assert frame.color.dtype == np.uint8
+    assert frame.depth_intrinsics == camera.depth
+    assert frame.color_intrinsics == camera.color
+    assert frame.depth_scale_m == camera.depth_scale_m
+    assert frame.depth_m.dtype == np.float32
+    np.testing.assert_allclose(frame.depth_m, frame.depth / 1000, rtol=1e-6)
+
+
+def test_the_block_is_where_the_scene_says(camera):
+    frame = camera.frame()
+    v, u = (round(x) for x in (camera.depth.cy, camera.depth.cx))
+    assert frame.depth[v, u] == 450
+    points = frame.points()
+    assert points.shape == (480, 848, 3)
+    expected = deproject((u, v), 0.45, camera.depth.K)
+    np.testing.assert_allclose(points[v, u], expected, atol=1e-6)
+    assert np.isnan(points[frame.depth == 0]).all()
+
+
+def test_depth_on_color_puts_the_block_on_the_block(camera):
+    frame = camera.frame()
+    aligned = frame.depth_on_color()
+    assert aligned.shape == (480, 640)
+    corner = np.array([[-0.02, 0.02, 0.45], [0.02, -0.02, 0.45]])  # on the front face
+    seen = transform_points(camera.T_color_depth, corner)
+    for (u, v), z in zip(project(seen, camera.color.K), seen[:, 2], strict=True):
+        assert aligned[round(v), round(u)] == pytest.approx(z, abs=0.6e-3)
+
+
+def test_shoots_when_still(camera):
+    first = camera.frames(1)[0].number
+    frame = camera.frame_when_still()
+    restart = 0 if camera.source == "recorded" else 1
+    assert frame.number == first + restart + 5
+
+
+@pytest.mark.parametrize("n", [0, -1, 2.5, True, "3", None])
+def test_refuses_a_bad_count(camera, n, tmp_path):
+    with pytest.raises(ValueError, match=r"^n: got"):
+        camera.frames(n)
+    with pytest.raises(ValueError, match=r"^n: got"):
+        camera.record(tmp_path / "a.db3", n)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("timeout_s", [0, -1, float("nan")])
+def test_refuses_a_bad_timeout(camera, timeout_s):
+    with pytest.raises(ValueError, match=r"^timeout_s: got"):
+        camera.frame_when_still(timeout_s=timeout_s)
+
+
+def test_closing_twice_is_fine_and_a_closed_camera_says_so(camera):
+    camera.close()
+    camera.close()
+    for use in (camera.frame, camera.frame_when_still):
+        with pytest.raises(CameraError, match=r"closed: open it again with open_camera\(\)"):
+            use()
+
+
+def test_lock_says_why_there_is_nothing_to_lock(camera):
+    sentence = camera.lock()
+    assert sentence.endswith(".")
+    assert {"simulated": "nothing to lock", "recorded": "cannot be changed"}[
+        camera.source
+    ] in sentence
+
+
+def test_description_is_one_line(camera):
+    assert (
+        repr(camera)
+        == {
+            "simulated": "Simulated D435, seed 7: no real camera in use. Plug in a RealSense and "
+            'run this cell again, or name a recording: ck.open_camera("file.bag")',
+            "recorded": "Simulated D435 (recording tabletop.db3): depth 848x480, colour 640x480, "
+            "baseline 50.2 mm, depth unit 1 mm",
+        }[camera.source]
+    )
+
+
+def test_ctrl_c_keeps_the_frames_so_far(camera, capsys, monkeypatch):
+    stream = camera._stream
+
+    def interrupted_after_three():
+        yield from itertools.islice(stream(), 3)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(camera, "_stream", interrupted_after_three)
+    frames = camera.frames(9)
+    assert len(frames) == 3
+    assert capsys.readouterr().out == "Stopped after 3 of 9 frames; they are kept.\n"
+
+
+def test_ctrl_c_before_the_first_frame_is_not_swallowed(camera, monkeypatch):
+    def interrupted():
+        raise KeyboardInterrupt
+        yield
+
+    monkeypatch.setattr(camera, "_stream", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        camera.frames(9)
+
+
+def test_an_error_carries_the_frames_so_far(camera, monkeypatch):
+    stream = camera._stream
+
+    def failing_after_two():
+        yield from itertools.islice(stream(), 2)
+        raise CameraError("gone")
+
+    monkeypatch.setattr(camera, "_stream", failing_after_two)
+    with pytest.raises(CameraError, match="gone") as caught:
+        camera.frames(9)
+    assert len(caught.value.frames) == 2
+    assert caught.value.frames.depth.shape == (2, 480, 848)
+
+
+# --- a recording ---
+
+
+def test_a_recording_always_begins_at_its_start(recording):
+    with open_camera(str(recording)) as camera:
+        numbers = [[frame.number for frame in camera.frames(3)] for _ in range(2)]
+    assert numbers == [[1, 2, 3], [1, 2, 3]]
+
+
+def test_a_short_recording_gives_what_there_is_and_says_so(recording, capsys):
+    with open_camera(recording) as camera:
+        frames = camera.frames(50, progress=False)
+    assert [frame.number for frame in frames] == list(range(1, 13))
+    assert capsys.readouterr() == ("The recording ends after 12 of the 50 frames asked for.\n", "")
+
+
+def test_two_views_of_one_recording_do_not_disturb_each_other(recording):
+    with open_camera(recording) as one, open_camera(recording) as other:
+        assert len(one.frames(4)) == 4
+        assert len(other.frames(12)) == 12
+        one.close()
+        assert other.frame().number == 1
+
+
+# --- the simulated camera ---
+
+
+def test_simulated_frames_are_equal_and_do_not_share_memory():
+    with SimulatedCamera() as camera:
+        one, two = camera.frames(2)
+        np.testing.assert_array_equal(one.depth, two.depth)
+        np.testing.assert_array_equal(one.color, two.color)
+        one.depth[:] = 0
+        one.color[:] = 0
+        assert two.depth.any()
+        assert camera.frame().color.any()
+
+
+def test_simulated_numbers_go_on_from_call_to_call():
+    with SimulatedCamera() as camera:
+        assert [frame.number for frame in camera.frames(2)] == [1, 2]
+        assert camera.frame().number == 3
+
+
+@pytest.mark.parametrize("distance_m", [0.3, 0.4504, 1.2345])
+def test_simulated_depth_is_the_distance_rounded_to_the_depth_unit(distance_m):
+    with SimulatedCamera(scene=tabletop(distance_m)) as camera:
+        depth = camera.frame().depth
+        assert depth[round(camera.depth.cy), round(camera.depth.cx)] == round(1000 * distance_m)
+
+
+def test_simulated_depth_beyond_16_bits_is_invalid():
+    with SimulatedCamera(scene=tabletop(66.0)) as camera:
+        assert camera.frame().depth[round(camera.depth.cy), round(camera.depth.cx)] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"device": "D999"}, "D999"),
+        ({"seed": -1}, "^seed: got -1"),
+        ({"seed": 1.5}, "^seed: got 1.5"),
+    ],
+)
+def test_simulated_refuses(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        SimulatedCamera(**arguments)
+
+
+# --- frames ---
+
+
+def depth_only_frame() -> Frame:
+    intrinsics = Intrinsics(4, 2, 5.0, 5.0, 1.5, 0.5)
+    depth = np.array([[0, 1000, 2000, 65535], [1, 2, 3, 4]], np.uint16)
+    return Frame(depth, None, 0.0001, 0.5, 9, intrinsics)
+
+
+def test_depth_in_metres_uses_the_depth_unit():
+    expected = [[0, 0.1, 0.2, 6.5535], [1e-4, 2e-4, 3e-4, 4e-4]]
+    frame = depth_only_frame()
+    np.testing.assert_allclose(frame.depth_m, expected, rtol=1e-6)
+    np.testing.assert_allclose(
+        frame.points()[0, 3], [1.5 / 5 * 6.5535, -0.65535, 6.5535], rtol=1e-6
+    )
+
+
+def test_a_frame_without_colour_says_so():
+    frame = depth_only_frame()
+    with pytest.raises(CameraError, match="no colour stream"):
+        frame.depth_on_color()
+    assert repr(frame) == "Frame 9 at 0.500 s: depth 4x2, no colour"
+
+
+def test_no_frames():
+    assert repr(Frames()) == "no frames"
+    with pytest.raises(ValueError, match="there are none"):
+        _ = Frames().depth
+    assert len(CameraError("x").frames) == 0
+
+
+# --- standing still ---
+
+
+class FilmCamera(Camera):
+    """Plays a list of colour (or, with depth=True, depth) images at 30 Hz."""
+
+    source = "simulated"
+
+    def __init__(self, images, depth=False):
+        self.images, self.as_depth = images, depth
+
+    def _stream(self):
+        for number, image in enumerate(self.images):
+            size = Intrinsics(image.shape[1], image.shape[0], 100, 100, 0, 0)
+            depth = np.rint(image).astype(np.uint16)
+            color = None if self.as_depth else np.stack([np.clip(image, 0, 255)] * 3, -1)
+            color = None if color is None else np.rint(color).astype(np.uint8)
+            yield Frame(depth, color, 0.001, number / 30, number, size)
+
+    def lock(self):
+        return ""
+
+    def close(self):
+        pass
+
+
+def film(moving, still, noise, seed, px_a_frame=1.0):
+    """Images of smooth blobs that drift for `moving` frames and then stand for `still`."""
+    rng = np.random.default_rng(seed)
+    v, u = np.mgrid[0:240, 0:320]
+    for number in range(moving + still):
+        x = u + px_a_frame * min(number, moving)
+        image = 120 + 50 * np.sin(x / 9.0) * np.sin(v / 11.0) + 20 * np.sign(np.sin(x / 31.0))
+        yield image + rng.normal(0, noise, image.shape)
+
+
+@pytest.mark.parametrize("depth", [False, True])
+@pytest.mark.parametrize("noise", [0.0, 1.0, 3.0, 6.0])
+def test_waits_for_the_scene_to_stand(noise, depth):
+    camera = FilmCamera(film(moving=12, still=20, noise=noise, seed=1), depth)
+    assert 12 + 5 <= camera.frame_when_still().number <= 12 + 6
+
+
+def test_slow_drift_is_motion():
+    camera = FilmCamera(film(moving=100, still=0, noise=1.0, seed=2, px_a_frame=0.4))
+    with pytest.raises(CameraError, match=r"the recording ended before 6 frames in a row"):
+        camera.frame_when_still()
+
+
+def test_nothing_stands_still_in_time():
+    camera = FilmCamera(film(moving=200, still=0, noise=1.0, seed=3, px_a_frame=3.0))
+    with pytest.raises(CameraError, match=r"nothing stood still within 2 s: put the camera"):
+        camera.frame_when_still(timeout_s=2)
+
+
+def test_all_invalid_depth_never_looks_still():
+    camera = FilmCamera([np.zeros((48, 64))] * 20, depth=True)
+    with pytest.raises(CameraError, match="ended before"):
+        camera.frame_when_still()
+
+
+@pytest.mark.parametrize("sigma", [0.5, 2.0, 8.0])
+def test_noise_is_estimated_from_one_image_with_slopes_and_edges(sigma):
+    rng = np.random.default_rng(4)
+    v, u = np.mgrid[0:120, 0:160].astype(np.float32)
+    image = 0.3 * u - 0.2 * v + 60 * (u > 70) + rng.normal(0, sigma, u.shape)
+    assert _noise_std(image.astype(np.float32)) == pytest.approx(sigma, rel=0.05)
+
+
+def test_noise_alone_looks_still():
+    rng = np.random.default_rng(5)
+    for sigma in (0.3, 1.0, 4.0, 16.0):
+        images = rng.normal(100, sigma, (2, 120, 160)).astype(np.float32)
+        assert _looks_still(*images)
+        assert not _looks_still(images[0], images[1] + 3 * sigma + 1)
+
+
+# --- open_camera ---
+
+
+def test_the_environment_variable_names_the_camera_of_auto(monkeypatch, recording):
+    monkeypatch.setenv("COURSEKIT_CAMERA", "simulated")
+    assert open_camera().source == "simulated"
+    monkeypatch.setenv("COURSEKIT_CAMERA", str(recording))
+    with open_camera("auto") as camera:
+        assert camera.source == "recorded"
+    with open_camera("simulated") as camera:
+        assert camera.source == "simulated"
+
+
+def test_a_bad_environment_variable_is_named(monkeypatch):
+    monkeypatch.setenv("COURSEKIT_CAMERA", "bogus")
+    with pytest.raises(ValueError, match=r"^COURSEKIT_CAMERA: got 'bogus'"):
+        open_camera()
+
+
+@pytest.mark.parametrize("which", ["", "bogus", 7, None, b"a.db3", "Simulated"])
+def test_nonsense_is_refused_with_what_is_wanted(which):
+    with pytest.raises(ValueError, match=r'^which: got .*, want "auto", "simulated", a serial'):
+        open_camera(which)
+
+
+def test_opening_the_simulated_camera_loads_no_hardware_library():
+    code = (
+        "import sys, coursekit as ck; ck.open_camera('simulated').depth; "
+        "sys.exit('pyrealsense2' in sys.modules or 'libusb_package' in sys.modules)"
+    )
+    root = Path(ck.__file__).parents[1]
+    environment = os.environ | {"PYTHONPATH": str(root)}
+    assert (
+        subprocess.run([sys.executable, "-c", code], env=environment, check=False).returncode == 0
+    )
+
+
+def test_ctrl_c_from_the_keyboard_stops_an_endless_capture(capsys):
+    """The signal itself, not an exception raised by hand."""
+    with SimulatedCamera() as camera:
+        camera.frame()
+        timer = threading.Timer(0.2, signal.raise_signal, [signal.SIGINT])
+        timer.start()
+        frames = camera.frames(600, progress=False)
+        timer.join()
+        assert 1 <= len(frames) <= 600
+        if len(frames) < 600:
+            assert capsys.readouterr().out.startswith("Stopped after")

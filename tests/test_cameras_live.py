@@ -1,0 +1,311 @@
+"""A live RealSense, played by a fake of the vendor's module: no test machine has one."""
+
+from __future__ import annotations
+
+import gc
+import sys
+
+import numpy as np
+import pytest
+from fake_realsense import SERIAL, FakeRealSense, real_library
+
+from coursekit.cameras import CameraError, librealsense, open_camera, realsense
+from coursekit.cameras.librealsense import LibraryMissing, load_librealsense
+
+
+@pytest.fixture
+def plug_in(monkeypatch, tmp_path):
+    """Plug in a fake D435 that behaves as the arguments say; a short patience with silence."""
+    monkeypatch.delenv("COURSEKIT_CAMERA", raising=False)
+    monkeypatch.setattr(librealsense, "USB_DEVICES", tmp_path)
+    monkeypatch.setattr(realsense, "SILENCE_S", 0.05)
+    monkeypatch.setattr(realsense, "_live_cameras", {})
+
+    def plug(**behaviour):
+        rs = FakeRealSense(**behaviour)
+        for module in (librealsense, realsense):
+            monkeypatch.setattr(module, "load_librealsense", lambda: rs)
+        return rs
+
+    return plug
+
+
+def put_on_usb(folder, product):
+    (folder / "1-2").mkdir()
+    (folder / "1-2" / "product").write_text(product)
+
+
+# --- opening ---
+
+
+@pytest.mark.parametrize("which", ["auto", SERIAL])
+def test_opens_the_connected_camera_and_asks_it_for_everything(plug_in, which):
+    rs = plug_in()
+    with open_camera(which) as camera:
+        assert rs.enabled == [
+            ("device", SERIAL),
+            ("depth", 848, 480, "z16", 30),
+            ("color", 640, 480, "rgb8", 30),
+        ]
+        assert (camera.name, camera.source, camera.serial) == (
+            "Intel RealSense D435", "live", SERIAL,
+        )  # fmt: skip
+        assert (camera.depth_scale_m, camera.baseline_m) == (0.001, pytest.approx(0.05017))
+        assert camera.depth.size == (848, 480)
+        assert (camera.depth.fx, camera.depth.fy) == (426.0, 426.25)
+        assert (camera.color.cx, camera.color.cy) == (321.5, 237.5)
+        assert camera.color.model == "inverse_brown_conrady"
+        assert camera.color.coeffs == (0.1, -0.2, 0.001, 0.002, 0.05)
+        # The library lists rotations by columns: this one takes the depth camera's x to y.
+        np.testing.assert_array_equal(camera.T_color_depth @ [1, 0, 0, 1], [0.015, 1, 0, 1])
+        assert repr(camera) == (
+            f"Intel RealSense D435 (live, serial {SERIAL}): depth 848x480, colour 640x480, "
+            "baseline 50.2 mm, depth unit 1 mm"
+        )
+
+
+def test_automatic_exposure_settles_before_the_first_frame(plug_in):
+    plug_in()
+    with open_camera() as camera:
+        assert camera.frame().number == 31
+
+
+def test_consecutive_captures_go_on(plug_in):
+    plug_in()
+    with open_camera() as camera:
+        assert [frame.number for frame in camera.frames(3)] == [31, 32, 33]
+        assert camera.frame().number == 34
+        assert camera.frame_when_still().depth.shape == (480, 848)
+
+
+def test_a_depth_image_is_never_given_twice(plug_in):
+    plug_in(color_late=True)
+    with open_camera() as camera:
+        numbers = [frame.number for frame in camera.frames(10, progress=False)]
+    assert len(set(numbers)) == 10
+
+
+def test_running_the_setup_cell_again_lets_go_of_the_first_camera(plug_in):
+    rs = plug_in()
+    first = open_camera()
+    second = open_camera()
+    assert (rs.starts, rs.stops) == (2, 1)
+    with pytest.raises(CameraError, match="closed"):
+        first.frame()
+    assert second.frame().number > 30
+    second.close()
+    second.close()
+    assert rs.stops == 2
+
+
+def test_the_register_of_live_cameras_does_not_keep_them_alive():
+    class Anything:
+        pass
+
+    thing = Anything()
+    register = type(realsense._live_cameras)()
+    register["1"] = thing
+    del thing
+    gc.collect()
+    assert not register
+
+
+def test_no_camera_is_simulated(plug_in):
+    plug_in().serials = []
+    assert open_camera().source == "simulated"
+
+
+def test_a_serial_number_that_is_not_there_lists_those_that_are(plug_in):
+    rs = plug_in()
+    with pytest.raises(CameraError, match=rf"no RealSense with serial number 123 .* {SERIAL} \("):
+        open_camera("123")
+    rs.serials = []
+    with pytest.raises(CameraError, match="there is none: plug it in"):
+        open_camera("123")
+    assert rs.starts == 0  # librealsense would wait 15 s
+
+
+# --- what goes wrong ---
+
+
+@pytest.mark.parametrize(
+    ("error", "advice"),
+    [
+        ("xioctl(VIDIOC_S_FMT) failed, errno=16 Last Error: Device or resource busy", "another pr"),
+        ("failed to set power state", "another program uses it: close the RealSense Viewer"),
+        ("failed to open usb interface: 0, error: RS2_USB_STATUS_ACCESS", "udev rules"),
+        ("Cannot open '/dev/video2': Permission denied", "udev rules"),
+        ("Couldn't resolve requests", "USB 3 port with a USB 3 cable"),
+        ("something new", r"something new\): unplug it"),
+    ],
+)
+@pytest.mark.parametrize("which", ["auto", SERIAL])
+def test_a_camera_that_does_not_start_is_never_replaced(plug_in, which, error, advice):
+    plug_in(start_error=error)
+    with pytest.raises(CameraError, match=advice) as caught:
+        open_camera(which)
+    assert error in str(caught.value)
+    assert f"the RealSense {SERIAL} does not start" in str(caught.value)
+
+
+def test_no_permission_to_list_devices(plug_in):
+    plug_in().query_error = "failed to open usb interface: 0, error: RS2_USB_STATUS_ACCESS"
+    with pytest.raises(CameraError, match="no permission to use it: install librealsense's udev"):
+        open_camera()
+
+
+def test_plugged_in_but_invisible_to_the_library_is_not_simulated(plug_in, tmp_path):
+    plug_in().serials = []
+    put_on_usb(tmp_path, "USB Keyboard\n")
+    assert open_camera().source == "simulated"
+    (tmp_path / "1-2" / "product").write_text("Intel(R) RealSense(TM) Depth Camera 435\n")
+    with pytest.raises(CameraError, match=r"a RealSense is plugged in, .* udev rules"):
+        open_camera()
+
+
+def test_another_colour_format_is_refused_with_the_camera_closed(plug_in):
+    rs = plug_in(color_format="raw16")
+    with pytest.raises(CameraError, match="colour is stored as raw16, want rgb8"):
+        open_camera()
+    assert rs.stops == 1
+
+
+def test_unplugged_while_the_exposure_settles(plug_in):
+    rs = plug_in(frames=12, then=RuntimeError("Device disconnected"))
+    with pytest.raises(CameraError, match=r"stopped giving frames \(Device disconnected\)"):
+        open_camera()
+    assert rs.stops == 1
+
+
+@pytest.mark.parametrize(
+    ("then", "message"),
+    [
+        (RuntimeError("Frame didn't arrive within 5000"), "stopped giving frames .* plugged in"),
+        (None, "no frame came from the RealSense .* is it still plugged in"),
+    ],
+)
+def test_unplugged_keeps_the_frames_so_far(plug_in, then, message):
+    plug_in(frames=30 + 7, then=then)
+    camera = open_camera()
+    with pytest.raises(CameraError, match=message) as caught:
+        camera.frames(100)
+    assert [frame.number for frame in caught.value.frames] == list(range(31, 38))
+    camera.close()
+
+
+def test_unplugged_while_recording_leaves_a_readable_file(plug_in, tmp_path, monkeypatch):
+    real_library()
+    path = tmp_path / "a.db3"
+    plug_in(frames=30 + 5, then=RuntimeError("Device disconnected"))
+    camera = open_camera()
+    with pytest.raises(CameraError, match=r"disconnected.*its 5 frames so far are in .*a\.db3"):
+        camera.record(path, 100)
+    camera.close()
+    monkeypatch.setattr(realsense, "load_librealsense", load_librealsense)
+    monkeypatch.setattr(realsense, "SILENCE_S", 5.0)
+    with open_camera(path) as played:
+        assert (played.name, played.serial) == ("Intel RealSense D435", SERIAL)
+        assert played.color.model == "inverse_brown_conrady"
+        np.testing.assert_allclose(played.T_color_depth, camera.T_color_depth, atol=1e-6)
+        frames = played.frames(5)
+        assert [frame.number for frame in frames] == [31, 32, 33, 34, 35]
+        assert [frame.depth[0, 0] for frame in frames] == [403, 404, 405, 406, 400]
+
+
+def test_ctrl_c_while_waiting_for_a_frame(plug_in, capsys):
+    plug_in(frames=30 + 4, then=KeyboardInterrupt())
+    camera = open_camera()
+    assert len(camera.frames(100)) == 4
+    assert capsys.readouterr().out == "Stopped after 4 of 100 frames; they are kept.\n"
+
+
+# --- lock ---
+
+
+def test_lock_fixes_the_exposure_that_the_camera_chose(plug_in):
+    rs = plug_in()
+    with open_camera() as camera:
+        sentence = camera.lock()
+    assert rs.depth_sensor.set_calls == [
+        ("enable_auto_exposure", 0),
+        ("exposure", 8500),  # of the newest image, not the 33000 of the manual setting
+        ("gain", 16),
+    ]
+    assert rs.color_sensor.set_calls == [
+        ("enable_auto_exposure", 0),
+        ("exposure", 156),
+        ("gain", 64),
+        ("enable_auto_white_balance", 0),
+    ]
+    assert rs.motion_sensor.set_calls == []
+    assert sentence == (
+        "Locked depth exposure at 8.5 ms, colour (manual setting) exposure at 15.6 ms, "
+        "white balance; the focus is fixed by the lenses."
+    )
+
+
+def test_lock_waits_until_the_new_exposure_shows(plug_in):
+    rs = plug_in()
+    with open_camera() as camera:
+        before = rs.given
+        camera.lock()
+        assert rs.given - before == 1 + 6
+
+
+def test_lock_that_the_camera_refuses(plug_in, monkeypatch):
+    rs = plug_in()
+
+    def refuse(option, value):
+        raise RuntimeError("hwmon command failed")
+
+    monkeypatch.setattr(rs.color_sensor, "set_option", refuse)
+    with open_camera() as camera, pytest.raises(CameraError, match="be locked: hwmon command"):
+        camera.lock()
+
+
+def test_lock_of_a_closed_camera(plug_in):
+    plug_in()
+    camera = open_camera()
+    camera.close()
+    with pytest.raises(CameraError, match="closed: open it again"):
+        camera.lock()
+
+
+# --- without the library ---
+
+
+@pytest.fixture
+def no_library(monkeypatch):
+    monkeypatch.delenv("COURSEKIT_CAMERA", raising=False)
+    monkeypatch.setitem(sys.modules, "pyrealsense2", None)
+    monkeypatch.setitem(sys.modules, "libusb_package", None)
+
+
+def test_without_the_library_auto_is_simulated_and_says_why(no_library):
+    camera = open_camera()
+    assert camera.source == "simulated"
+    assert repr(camera).startswith(
+        "Simulated D435, seed 7: no real camera in use. The reason: pyrealsense2 is not "
+        "installed, so neither a RealSense nor a recording can be opened"
+    )
+    assert "requirements-camera.txt" in repr(camera)
+
+
+@pytest.mark.parametrize("which", [SERIAL, "a.db3"])
+def test_without_the_library_a_named_camera_says_what_to_do(no_library, which):
+    with pytest.raises(LibraryMissing, match=r"requirements-camera\.txt.*simulated camera works"):
+        open_camera(which)
+
+
+def test_without_the_library_nothing_is_recorded(no_library, tmp_path):
+    with open_camera("simulated") as camera, pytest.raises(LibraryMissing):
+        camera.record(tmp_path / "a.db3", 2)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_library_that_does_not_load_says_so(monkeypatch, tmp_path):
+    (tmp_path / "pyrealsense2.py").write_text("raise ImportError('libusb-1.0.so.0: no such file')")
+    monkeypatch.delitem(sys.modules, "pyrealsense2", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(LibraryMissing, match=r"does not load \(libusb-1\.0\.so\.0: no such file"):
+        load_librealsense()

@@ -1,0 +1,549 @@
+"""Recordings: what is written is what is read, and every bad file ends in words of advice."""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+import sqlite3
+import time
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fake_realsense import real_library
+
+from coursekit.cameras import Camera, CameraError, Frame, open_camera
+from coursekit.cameras.realsense import _rgb_converter
+from coursekit.cameras.recording import depth_frame_numbers
+from coursekit.geometry import Intrinsics, make_transform
+
+SIX_DECIMALS = 6e-7  # the recorder writes extrinsics with %f: half a unit, and float32
+
+
+@pytest.fixture(scope="module")
+def rs():
+    return real_library()
+
+
+class RandomCamera(Camera):
+    """Small frames of seeded random pixels, with generic calibration; ends after `n` of them."""
+
+    def __init__(self, n=10, color=True, baseline_m=0.0501707, scale_m=0.0001, size=(64, 48)):
+        self.name, self.source, self.serial = "Test D405", "simulated", "218622273411"
+        k = (0.154, -0.249, 0.0035, -0.0011, 0.0625)
+        width, height = size
+        self.depth = Intrinsics(width, height, 390.43145751953125, 391.5, 31.38, 24.18)
+        self.color = None
+        self.T_color_depth = None
+        if color:
+            self.color = Intrinsics(
+                width // 2, height, 613.2, 613.4, 15.9, 23.1, "inverse_brown_conrady", k
+            )
+            angles = np.cos(0.3), np.sin(0.3)
+            rotation = [[1, 0, 0], [0, angles[0], -angles[1]], [0, angles[1], angles[0]]]
+            self.T_color_depth = make_transform(rotation, [0.0143113, 0.0006023, -0.1234567])
+        self.baseline_m, self.depth_scale_m, self.n = baseline_m, scale_m, n
+
+    def _stream(self):
+        rng = np.random.default_rng(11)
+        for number in range(1, self.n + 1):
+            depth = rng.integers(0, 65536, (self.depth.height, self.depth.width), np.uint16)
+            color = None
+            if self.color is not None:
+                shape = (self.color.height, self.color.width, 3)
+                color = rng.integers(0, 256, shape, np.uint8)
+            time_s = 1000.0 + number / 30
+            yield Frame(
+                depth, color, self.depth_scale_m, time_s, 7 * number, self.depth, self.color,
+                self.T_color_depth,
+            )  # fmt: skip
+
+    def lock(self):
+        return ""
+
+    def close(self):
+        pass
+
+
+def same_float32(one: Intrinsics, other: Intrinsics) -> bool:
+    def rounded(intrinsics):
+        values = {name: float(np.float32(getattr(intrinsics, name))) for name in ("fx", "fy")}
+        values |= {name: float(np.float32(getattr(intrinsics, name))) for name in ("cx", "cy")}
+        return replace(intrinsics, coeffs=tuple(np.float32(intrinsics.coeffs).tolist()), **values)
+
+    return rounded(one) == rounded(other)
+
+
+# --- what is written is what is read ---
+
+
+@pytest.mark.parametrize("color", [True, False])
+def test_round_trip(rs, tmp_path, color):
+    camera = RandomCamera(n=12, color=color)
+    path = camera.record(tmp_path / "all.db3", 12)
+    with open_camera(path) as played:
+        assert (played.name, played.serial, played.source) == (
+            camera.name, camera.serial, "recorded",
+        )  # fmt: skip
+        assert played.depth_scale_m == camera.depth_scale_m
+        assert played.baseline_m == pytest.approx(camera.baseline_m, abs=1e-9)
+        assert same_float32(played.depth, camera.depth)
+        frames = played.frames(12)
+        if color:
+            assert same_float32(played.color, camera.color)
+            np.testing.assert_allclose(
+                played.T_color_depth, camera.T_color_depth, rtol=0, atol=SIX_DECIMALS
+            )
+        else:
+            assert played.color is None
+            assert played.T_color_depth is None
+            assert "no colour" in repr(played)
+    for mine, theirs in zip(camera._stream(), frames, strict=True):
+        assert theirs.number == mine.number
+        assert theirs.time_s == pytest.approx(mine.time_s, abs=1e-8)
+        np.testing.assert_array_equal(theirs.depth, mine.depth)
+        if color:
+            np.testing.assert_array_equal(theirs.color, mine.color)
+        else:
+            assert theirs.color is None
+    assert [entry.name for entry in tmp_path.iterdir()] == ["all.db3"]
+
+
+@pytest.mark.parametrize("model", ["none", "brown_conrady", "modified_brown_conrady"])
+def test_the_distortion_model_survives(rs, tmp_path, model):
+    camera = RandomCamera(n=1)
+    camera.color = replace(camera.color, model=model)
+    with open_camera(camera.record(tmp_path / "a.db3", 1)) as played:
+        assert played.color.model == model
+
+
+def test_a_recording_without_baseline_says_unknown(rs, tmp_path):
+    path = RandomCamera(n=1, baseline_m=None).record(tmp_path / "a.db3", 1)
+    with open_camera(path) as played:
+        assert played.baseline_m is None
+        assert "baseline unknown" in repr(played)
+
+
+def test_a_recording_of_a_recording_is_the_same(rs, tmp_path):
+    first = RandomCamera(n=5).record(tmp_path / "first.db3", 5)
+    with open_camera(first) as played:
+        second = played.record(tmp_path / "second.db3", 5)
+        with open_camera(second) as again:
+            for one, other in zip(played.frames(5), again.frames(5), strict=True):
+                assert (one.number, one.time_s) == (other.number, other.time_s)
+                np.testing.assert_array_equal(one.depth, other.depth)
+                np.testing.assert_array_equal(one.color, other.color)
+
+
+def test_no_frame_is_lost_at_the_start_of_a_playback(rs, tmp_path):
+    """Without the pause before the start, librealsense loses the first in one opening of six."""
+    path = RandomCamera(n=3).record(tmp_path / "a.db3", 3)
+    with open_camera(path) as played:
+        for _ in range(40):
+            assert played.frame().number == 7
+
+
+def test_no_frame_is_lost_by_a_slow_reader(rs, tmp_path):
+    path = RandomCamera(n=10).record(tmp_path / "a.db3", 10)
+    with open_camera(path) as played:
+        numbers = []
+        for frame in played._stream():
+            numbers.append(frame.number)
+            time.sleep(0.04)  # longer than the recorded pace
+    assert numbers == [7 * k for k in range(1, 11)]
+
+
+def test_other_streams_in_a_recording_do_not_disturb(rs, tmp_path):
+    path = tmp_path / "infrared.db3"
+    camera = RandomCamera(n=6)
+    record_with_infrared(rs, path, camera)
+    with open_camera(path) as played:
+        frames = played.frames(6)
+    for mine, theirs in zip(camera._stream(), frames, strict=True):
+        np.testing.assert_array_equal(theirs.depth, mine.depth)
+        np.testing.assert_array_equal(theirs.color, mine.color)
+
+
+def test_memory_does_not_grow_while_recording(rs, tmp_path):
+    """300 depth images are 244 MB; without flow control librealsense keeps most of them waiting."""
+    resource = pytest.importorskip("resource")
+    camera = RandomCamera(n=1, color=False, size=(848, 480))
+    frame = next(camera._stream())
+    camera._stream = lambda: (replace(frame, number=k, time_s=k / 30) for k in range(1, 301))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    camera.record(tmp_path / "long.db3", 300)
+    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+    assert depth_frame_numbers(tmp_path / "long.db3") == list(range(1, 301))
+    assert grown < 100
+
+
+# --- recordings that end early ---
+
+
+def ending_after(camera: Camera, k: int, with_what: BaseException) -> None:
+    stream = camera._stream
+
+    def shortened():
+        yield from itertools.islice(stream(), k)
+        raise with_what
+
+    camera._stream = shortened
+
+
+def test_ctrl_c_keeps_what_came(rs, tmp_path, capsys):
+    camera = RandomCamera()
+    ending_after(camera, 4, KeyboardInterrupt())
+    path = camera.record(tmp_path / "a.db3", 9)
+    assert capsys.readouterr().out == "Stopped: a.db3 holds the 4 frames so far.\n"
+    with open_camera(path) as played:
+        assert len(played.frames(4)) == 4
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.db3"]
+
+
+def test_ctrl_c_between_colour_and_depth_leaves_whole_frames(rs, tmp_path, monkeypatch, capsys):
+    from coursekit.cameras import recording
+
+    add, calls = recording._Writer._add, itertools.count(1)
+
+    def interrupted(self, stream, pixels, frame):
+        if next(calls) == 6:  # the depth image of the third frame
+            raise KeyboardInterrupt
+        add(self, stream, pixels, frame)
+
+    monkeypatch.setattr(recording._Writer, "_add", interrupted)
+    camera = RandomCamera()
+    path = camera.record(tmp_path / "a.db3", 9)
+    assert "holds the 2 frames" in capsys.readouterr().out
+    with open_camera(path) as played:
+        for mine, theirs in zip(camera._stream(), played.frames(2), strict=False):
+            np.testing.assert_array_equal(theirs.color, mine.color)
+            np.testing.assert_array_equal(theirs.depth, mine.depth)
+
+
+def test_unplugged_while_recording_keeps_what_came(rs, tmp_path):
+    camera = RandomCamera()
+    ending_after(camera, 7, CameraError("it was unplugged"))
+    with pytest.raises(CameraError, match=r"unplugged \(its 7 frames so far are in .*a\.db3\)"):
+        camera.record(tmp_path / "a.db3", 9)
+    with open_camera(tmp_path / "a.db3") as played:
+        assert [frame.number for frame in played.frames(7)] == [7, 14, 21, 28, 35, 42, 49]
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), CameraError("gone")])
+def test_no_frame_at_all_leaves_no_file(rs, tmp_path, error):
+    camera = RandomCamera()
+    ending_after(camera, 0, error)
+    with pytest.raises(type(error)):
+        camera.record(tmp_path / "a.db3", 9)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_any_other_failure_leaves_no_file(rs, tmp_path):
+    camera = RandomCamera()
+    ending_after(camera, 2, ZeroDivisionError())
+    with pytest.raises(ZeroDivisionError):
+        camera.record(tmp_path / "a.db3", 9)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_frames_that_do_not_reach_the_disk_are_noticed(rs, tmp_path, monkeypatch):
+    """librealsense says nothing on a full disk: 5 of 20 frames arrived on one of 8 MB."""
+    from coursekit.cameras import recording
+
+    add, calls = recording._Writer._add, itertools.count(1)
+
+    def lossy(self, stream, pixels, frame):
+        if next(calls) < 10:
+            add(self, stream, pixels, frame)
+
+    monkeypatch.setattr(recording._Writer, "_add", lossy)
+    with pytest.raises(CameraError, match=r"only 4 of 9 frames could be written .* disk is"):
+        RandomCamera().record(tmp_path / "a.db3", 9)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_file_is_kept_unless_told(rs, tmp_path):
+    path = tmp_path / "a.db3"
+    path.write_text("precious")
+    with pytest.raises(ValueError, match=r"^path: .*a\.db3 exists already: choose another name"):
+        RandomCamera().record(path, 1)
+    assert path.read_text() == "precious"
+    RandomCamera().record(path, 2, overwrite=True)
+    assert depth_frame_numbers(path) == [7, 14]
+
+
+def test_a_failed_overwrite_keeps_the_old_file(rs, tmp_path):
+    path = RandomCamera().record(tmp_path / "a.db3", 3)
+    camera = RandomCamera()
+    ending_after(camera, 0, CameraError("gone"))
+    with pytest.raises(CameraError):
+        camera.record(path, 9, overwrite=True)
+    assert depth_frame_numbers(path) == [7, 14, 21]
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("a.bag", r"want a name that ends in \.db3"),
+        ("a", r"want a name that ends in \.db3"),
+        ("a.DB3", r"want a name that ends in \.db3"),
+        ("nowhere/a.db3", "there is no folder .*nowhere: make it first"),
+        ("folder.db3", "is a folder"),
+    ],
+)
+def test_refuses_a_bad_path(tmp_path, name, message):
+    (tmp_path / "folder.db3").mkdir()
+    with pytest.raises(ValueError, match=f"^path: .*{message}"):
+        RandomCamera().record(tmp_path / name, 1)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["folder.db3"]
+
+
+def test_frames_stay_in_order_though_the_recorders_clock_steps_back(rs, tmp_path):
+    from coursekit.cameras.recording import _restore_order
+
+    path = RandomCamera(n=8).record(tmp_path / "a.db3", 8)
+    with sqlite3.connect(path) as file:  # what a late correction did to the third frame
+        (third,) = file.execute(
+            "SELECT timestamp FROM messages JOIN topics ON topic_id = topics.id "
+            "WHERE name LIKE '%/Depth_0/image/data%' ORDER BY timestamp LIMIT 1 OFFSET 2"
+        ).fetchone()
+        file.execute("UPDATE messages SET timestamp = 10 * ? WHERE timestamp = ?", (third, third))
+    assert depth_frame_numbers(path) == [7, 14, 28, 35, 42, 49, 56, 21]
+    _restore_order(path)
+    with open_camera(path) as played:
+        assert [frame.number for frame in played.frames(8)] == [7 * k for k in range(1, 9)]
+
+
+def test_names_with_spaces_and_accents(rs, tmp_path):
+    folder = tmp_path / "Prüfstand #1 100%"
+    folder.mkdir()
+    path = RandomCamera().record(folder / "erster Versuch?.db3", 2)
+    with open_camera(path) as played:
+        assert len(played.frames(2)) == 2
+
+
+# --- bad files ---
+
+
+@pytest.fixture(scope="module")
+def good(rs, tmp_path_factory):
+    return RandomCamera(n=20).record(tmp_path_factory.mktemp("good") / "good.db3", 20)
+
+
+@pytest.mark.parametrize("fraction", [0.0001, 0.01, 0.1, 0.25, 0.5, 0.75, 0.9, 0.999])
+def test_a_truncated_recording(good, tmp_path, fraction):
+    data = good.read_bytes()
+    path = tmp_path / "cut.db3"
+    path.write_bytes(data[: int(fraction * len(data))])
+    with (
+        pytest.raises(CameraError, match=r"record it anew|is not a \.db3 recording"),
+        open_camera(path) as played,
+    ):
+        played.frames(20)  # the last pages hold the last image, which is all that 99.9 % lack
+    assert [entry.name for entry in tmp_path.iterdir()] == ["cut.db3"]
+
+
+def foreign(path):
+    with sqlite3.connect(path) as file:
+        file.execute("CREATE TABLE shopping (item TEXT)")
+
+
+def robot(path):
+    with sqlite3.connect(path) as file:
+        file.execute(
+            "CREATE TABLE topics(id INTEGER PRIMARY KEY,name TEXT NOT NULL,type TEXT NOT NULL,"
+            "serialization_format TEXT NOT NULL,offered_qos_profiles TEXT NOT NULL)"
+        )
+        file.execute(
+            "CREATE TABLE messages(id INTEGER PRIMARY KEY,topic_id INTEGER NOT NULL,"
+            "timestamp INTEGER NOT NULL, data BLOB NOT NULL)"
+        )
+
+
+def zipped(path):
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("frame.txt", "no frame")
+
+
+@pytest.mark.parametrize(
+    ("name", "make", "message"),
+    [
+        ("empty.db3", lambda path: path.touch(), "is empty: copy it again"),
+        ("empty.bag", lambda path: path.touch(), "is empty: copy it again"),
+        ("text.db3", lambda path: path.write_text("hello"), r"is not a \.db3 recording, though"),
+        ("text.bag", lambda path: path.write_text("hello"), r"is not a \.bag recording, though"),
+        ("zip.bag", zipped, r"is not a \.bag recording, though"),
+        ("zip.db3", zipped, r"is not a \.db3 recording, though"),
+        ("foreign.db3", foreign, "not from a RealSense; copy it again"),
+        ("robot.db3", robot, "not from a RealSense; copy it again"),
+        ("header.bag", lambda path: path.write_text("#ROSBAG V2.0\n"), "damaged, incomplete"),
+        ("folder.db3", lambda path: path.mkdir(), "is a folder: name the"),
+        ("film.mp4", lambda path: path.touch(), r"its name must end in \.db3 or \.bag"),
+        ("GOOD.DB3", lambda path: path.touch(), r"its name must end in \.db3 or \.bag, in lower"),
+        ("nothing.db3", lambda path: None, "there is no file .*nothing.db3: check the name"),
+        ("nothing.bag", lambda path: None, "there is no file .*nothing.bag: check the name"),
+    ],
+)
+def test_a_foreign_file(rs, tmp_path, name, make, message):
+    path = tmp_path / name
+    make(path)
+    before = sorted(entry.name for entry in tmp_path.iterdir())
+    with pytest.raises(CameraError, match=message):
+        open_camera(path)
+    with pytest.raises(CameraError, match=message):
+        open_camera(str(path))
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == before
+
+
+def test_a_recording_without_depth(rs, tmp_path):
+    path = tmp_path / "colour.db3"
+    shutil.copy(RandomCamera().record(tmp_path / "a.db3", 2), path)
+    with sqlite3.connect(path) as file:
+        file.execute(
+            "DELETE FROM messages "
+            "WHERE topic_id IN (SELECT id FROM topics WHERE name LIKE '%Depth%')"
+        )
+        file.execute("DELETE FROM topics WHERE name LIKE '%Depth%'")
+    with pytest.raises(CameraError, match="holds no depth images: record depth and colour"):
+        open_camera(path)
+
+
+def damage(path, k):
+    """Halve the k-th depth image's data, as a bad copy of the file might."""
+    with sqlite3.connect(path) as file:
+        key, data = file.execute(
+            "SELECT messages.id, data FROM messages JOIN topics ON topic_id = topics.id "
+            "WHERE name LIKE '%/Depth_0/image/data%' ORDER BY timestamp LIMIT 1 OFFSET ?",
+            (k - 1,),
+        ).fetchone()
+        file.execute("UPDATE messages SET data = ? WHERE id = ?", (data[: len(data) // 2], key))
+
+
+@pytest.mark.parametrize("k", [1, 8, 20])
+def test_damage_inside_is_noticed_though_librealsense_just_stops(good, tmp_path, k):
+    path = tmp_path / "damaged.db3"
+    shutil.copy(good, path)
+    damage(path, k)
+    with open_camera(path) as played:
+        with pytest.raises(CameraError, match=f"its last {21 - k} depth images") as caught:
+            played.frames(20)
+        assert [frame.number for frame in caught.value.frames] == [7 * i for i in range(1, k)]
+        if k > 1:
+            assert len(played.frames(k - 1)) == k - 1
+
+
+# --- colour formats ---
+
+
+def test_colour_formats_become_rgb():
+    rgb = np.random.default_rng(3).integers(0, 256, (4, 6, 3), np.uint8)
+    alpha = np.full((4, 6, 1), 255, np.uint8)
+    stored = {
+        "rgb8": rgb,
+        "bgr8": rgb[..., ::-1],
+        "rgba8": np.concatenate([rgb, alpha], -1),
+        "bgra8": np.concatenate([rgb[..., ::-1], alpha], -1),
+    }
+    for form, image in stored.items():
+        converted = _rgb_converter(form)(image)
+        np.testing.assert_array_equal(converted, rgb, err_msg=form)
+        assert not np.shares_memory(converted, image)
+
+
+@pytest.mark.parametrize(("form", "luma"), [("yuyv", 0), ("uyvy", 1)])
+def test_yuv_becomes_rgb(form, luma):
+    """BT.601 limited range: Y 81, U 90, V 240 is pure red."""
+    pixel = [[81, 90, 81, 240], [90, 81, 240, 81]][luma]
+    image = np.tile(np.array(pixel, np.uint8), (2, 3)).view(np.uint16)
+    for stored in (image, image.view(np.uint8).reshape(2, 6, 2)):
+        rgb = _rgb_converter(form)(stored)
+        assert rgb.shape == (2, 6, 3)
+        np.testing.assert_allclose(rgb, np.broadcast_to([254, 0, 0], rgb.shape), atol=2)
+
+
+def test_other_colour_formats_are_refused(rs, tmp_path):
+    with pytest.raises(ValueError, match="colour is stored as raw16, want rgb8, rgba8, bgr8"):
+        _rgb_converter("raw16")
+
+
+@pytest.mark.parametrize("form", ["bgr8", "bgra8", "yuyv"])
+def test_a_recording_in_another_colour_format(rs, tmp_path, form):
+    path, camera = tmp_path / "a.db3", RandomCamera(n=2)
+    bpp = {"bgr8": 3, "bgra8": 4, "yuyv": 2}[form]
+    pixels = np.full((48, 32, bpp), 128, np.uint8)
+    pixels[..., 0] = 200  # blue, or luma
+    record_raw(rs, path, camera, form, pixels)
+    with open_camera(path) as played:
+        color = played.frame().color
+    assert color.shape == (48, 32, 3)
+    expected = [214, 214, 214] if form == "yuyv" else [128, 128, 200]
+    np.testing.assert_allclose(color[5, 5], expected, atol=1)
+
+
+def test_a_grey_recording_is_refused(rs, tmp_path):
+    path = tmp_path / "a.db3"
+    record_raw(rs, path, RandomCamera(n=2), "y8", np.full((48, 32), 9, np.uint8))
+    with pytest.raises(CameraError, match="colour is stored as y8, want rgb8"):
+        open_camera(path)
+
+
+# --- recordings that the course's own writer does not make ---
+
+
+def record_raw(rs, path, camera, form, pixels):
+    """Record frames with the colour stream in the format `form`, all colour images `pixels`."""
+    from coursekit.cameras import recording
+
+    class Writer(recording._Writer):
+        pass
+
+    video_stream = recording._video_stream
+
+    def stream_of_form(rs, kind, fmt, bpp, intrinsics):
+        stream = video_stream(rs, kind, fmt, bpp, intrinsics)
+        if kind == rs.stream.color:
+            stream.fmt = getattr(rs.format, form)
+            stream.bpp = pixels.shape[2] if pixels.ndim == 3 else 1
+        return stream
+
+    recording._video_stream = stream_of_form
+    try:
+        writer = Writer(rs, path, camera)
+    finally:
+        recording._video_stream = video_stream
+    for frame in camera._stream():
+        writer.add(replace(frame, color=pixels))
+    writer.close()
+
+
+def record_with_infrared(rs, path, camera):
+    """Record depth, colour and one infrared image a frame."""
+    from coursekit.cameras import recording
+
+    recorder = rs.recorder
+
+    class Writer(recording._Writer):
+        def add(self, frame):
+            self._add("infrared", (frame.depth >> 8).astype(np.uint8), frame)
+            super().add(frame)
+
+    def recorder_with_infrared(name, device):
+        sensor = device.add_sensor("Infrared")
+        stream = recording._video_stream(rs, rs.stream.infrared, rs.format.y8, 1, camera.depth)
+        stream.uid = 2
+        profile = sensor.add_video_stream(stream)
+        streams["infrared"] = (sensor, profile.as_video_stream_profile())
+        return recorder(name, device)
+
+    streams: dict = {}
+    rs.recorder = recorder_with_infrared
+    try:
+        writer = Writer(rs, path, camera)
+    finally:
+        rs.recorder = recorder
+    writer._streams |= streams
+    streams.clear()
+    for frame in camera._stream():
+        writer.add(frame)
+    writer.close()

@@ -1,0 +1,91 @@
+"""The command line: what it writes, what it says, how it exits."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from fake_realsense import real_library
+
+import coursekit
+from coursekit import cli
+from coursekit.cameras import CameraError, open_camera
+from coursekit.cameras.simulated import SimulatedCamera
+
+
+def test_record_writes_a_recording_and_says_how_to_play_it(tmp_path, capsys):
+    real_library()
+    path = tmp_path / "a.db3"
+    arguments = ["record", "--out", str(path), "--frames", "3", "--camera", "simulated"]
+    assert cli.main(arguments) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[0].startswith("Simulated D435, seed 7: no real camera in use.")
+    assert said[-1] == f"Wrote {path}. Play it with ck.open_camera({str(path)!r})."
+    with open_camera(path) as played:
+        assert len(played.frames(3)) == 3
+
+    assert cli.main(arguments) == 1
+    assert capsys.readouterr().err.endswith(
+        "a.db3 exists already: choose another name or overwrite=True\n"
+    )
+    assert cli.main([*arguments, "--overwrite"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--out", "a.bag", "--frames", "3", "--camera", "simulated"], "path: got 'a.bag', want"),
+        (["--out", "a.db3", "--frames", "0", "--camera", "simulated"], "n: got 0, want a whole"),
+        (["--out", "a.db3", "--frames", "3", "--camera", "bogus"], "which: got 'bogus', want"),
+        (["--out", "a.db3", "--frames", "3", "--camera", ""], "which: got '', want"),
+    ],
+)
+def test_a_failure_is_one_line_and_exit_code_1(arguments, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["record", *arguments]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith(f"coursekit: {message}")
+    assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [[], ["record"], ["record", "--out", "a.db3"], ["fly"], ["record", "--frames", "x"]],
+)
+def test_wrong_usage_exits_with_2(arguments, capsys):
+    with pytest.raises(SystemExit) as caught:
+        cli.main(arguments)
+    assert caught.value.code == 2
+    assert capsys.readouterr().err.startswith("usage: coursekit")
+
+
+@pytest.mark.parametrize(("error", "code"), [(CameraError("gone"), 1), (KeyboardInterrupt(), 130)])
+def test_a_camera_that_fails_at_once(error, code, tmp_path, monkeypatch, capsys):
+    real_library()
+
+    def fail(self):
+        raise error
+        yield
+
+    monkeypatch.setattr(SimulatedCamera, "_stream", fail)
+    arguments = ["record", "--out", str(tmp_path / "a.db3"), "--frames", "3"]
+    assert cli.main([*arguments, "--camera", "simulated"]) == code
+    assert capsys.readouterr().err.startswith("coursekit: ")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_runs_as_a_module_and_shows_help():
+    root = Path(coursekit.__file__).parents[1]
+    result = subprocess.run(
+        [sys.executable, "-m", "coursekit.cli", "record", "--help"],
+        env=os.environ | {"PYTHONPATH": str(root)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "--out FILE" in result.stdout
+    assert result.stderr == ""

@@ -1,0 +1,163 @@
+"""geometry against librealsense, point by point and frame by frame."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from coursekit import geometry
+from coursekit.cameras import conventions
+from coursekit.cameras.librealsense import load_librealsense
+from coursekit.cameras.recording import realsense_intrinsics
+from coursekit.geometry import Intrinsics
+
+pytest.importorskip("pyrealsense2", reason="no pyrealsense2 for this platform")
+
+cameras = st.builds(
+    lambda f, aspect, cx, cy, coeffs: Intrinsics(
+        640, 480, f, f * aspect, cx, cy, "brown_conrady", coeffs
+    ),
+    st.floats(350, 900),
+    st.floats(0.9, 1.1),
+    st.floats(290, 350),
+    st.floats(210, 270),
+    st.tuples(
+        st.floats(-0.3, 0.3),
+        st.floats(-0.1, 0.1),
+        st.floats(-0.003, 0.003),
+        st.floats(-0.003, 0.003),
+        st.floats(-0.05, 0.05),
+    ),
+)
+
+
+@pytest.mark.parametrize("model", ["brown_conrady", "none"])
+@settings(max_examples=300, deadline=None, derandomize=True)
+@given(camera=cameras, seed=st.integers(0, 10**6))
+def test_same_pixels_and_points_as_librealsense(model: str, camera: Intrinsics, seed: int) -> None:
+    """300 cameras with 20 points each: below 2e-3 px, and back below 10 µm a metre."""
+    camera = Intrinsics(**camera.to_dict() | {"model": model})
+    rs = load_librealsense()
+    theirs = realsense_intrinsics(rs, camera)
+    rng = np.random.default_rng(seed)
+    z = rng.uniform(0.2, 4.0, 20)
+    points = np.column_stack([rng.uniform(-0.45, 0.45, (20, 2)) * z[:, None], z])
+    pixels = geometry.project(points, camera.K, camera.dist)
+    vendor = np.array([rs.rs2_project_point_to_pixel(theirs, p) for p in points.tolist()])
+    assert np.abs(vendor - pixels).max() < 2e-3
+    if model == "none" or _mild(camera):  # its inverse is ten rounds of fixed-point iteration
+        back = np.array(
+            [
+                rs.rs2_deproject_pixel_to_point(theirs, uv, d)
+                for uv, d in zip(pixels.tolist(), z.tolist(), strict=True)
+            ]
+        )
+        assert (np.abs(back - points) / z[:, None]).max() < 1e-5
+
+
+def _mild(camera: Intrinsics) -> bool:
+    return abs(camera.coeffs[0]) < 0.1
+
+
+def test_the_stored_table_is_what_is_measured() -> None:
+    measured, stored = conventions.measure(), conventions.stored()
+    for row, was in zip(measured, stored, strict=True):
+        assert (row.model, row.coefficients) == (was.model, was.coefficients)
+        assert row.project_px == pytest.approx(was.project_px, abs=1e-3)
+        assert row.round_trip_px == pytest.approx(was.round_trip_px, abs=1e-3)
+
+
+def test_what_the_table_says() -> None:
+    table = {(r.model, r.coefficients): r for r in conventions.measure()}
+    assert table["none", "none"].project_px < 2e-3
+    assert table["brown_conrady", "radial and tangential"].project_px < 2e-3
+    inverse = table["inverse_brown_conrady", "radial and tangential"]
+    assert 0.03 < inverse.project_px < 0.30  # forward, but tangential terms of the bent point
+    assert inverse.round_trip_px < 2e-3
+    assert table["inverse_brown_conrady", "radial"].project_px < 2e-3
+    assert 4 < table["modified_brown_conrady", "radial and tangential"].round_trip_px < 40
+
+
+def test_the_vendors_inverse_model_is_the_named_misconception() -> None:
+    """Tangential terms after the radial factor: what exercise 1 calls a mistake is their model."""
+    from coursekit.lessons.pinhole import PROJECT
+
+    (mistake,) = [m for m in PROJECT.mistakes if m.name == "tangential_after_radial"]
+    camera = Intrinsics(640, 480, 612.5, 598.0, 331.4, 236.8, "inverse_brown_conrady",
+                        conventions.COEFFS["radial and tangential"])  # fmt: skip
+    rs = load_librealsense()
+    points = np.random.default_rng(2).uniform([-0.4, -0.3, 1], [0.4, 0.3, 2], (500, 3))
+    vendor = [
+        rs.rs2_project_point_to_pixel(realsense_intrinsics(rs, camera), p) for p in points.tolist()
+    ]
+    ours = PROJECT.model(mistake)(points, camera.K, camera.dist)
+    assert np.abs(ours - vendor).max() < 2e-3
+
+
+def test_the_stored_table_serves_without_the_library(monkeypatch: pytest.MonkeyPatch) -> None:
+    from coursekit.cameras import librealsense
+
+    def missing() -> None:
+        raise librealsense.LibraryMissing("not here")
+
+    monkeypatch.setattr(librealsense, "load_librealsense", missing)
+    rows, origin = conventions.table()
+    assert rows == conventions.stored()
+    assert "stored" in origin
+
+
+# --- depth aligned to colour ---
+
+
+def vendor_align(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """librealsense's own `align` of a recording's first frame: (raw depth, aligned), counts."""
+    rs = load_librealsense()
+    pipeline, config = rs.pipeline(), rs.config()
+    config.enable_device_from_file(str(path), repeat_playback=False)
+    profile = pipeline.start(config)
+    profile.get_device().as_playback().set_real_time(False)
+    try:
+        frames = pipeline.wait_for_frames()
+        raw = np.array(frames.get_depth_frame().get_data())
+        aligned = rs.align(rs.stream.color).process(frames)
+        return raw, np.array(aligned.get_depth_frame().get_data())
+    finally:
+        pipeline.stop()
+
+
+def compare_with_vendor(path: Path) -> tuple[float, float]:
+    """Share of colour pixels filled alike, and of those with the same depth pixel's number."""
+    import coursekit as ck
+
+    raw, theirs = vendor_align(path)
+    with ck.open_camera(path) as camera:
+        assert camera.color is not None
+        depth_m = raw * camera.depth_scale_m
+        source = geometry._align_sources(depth_m, camera.depth, camera.color, camera.T_color_depth)
+    ours = np.where(source >= 0, raw.ravel()[source], 0)
+    both = (ours > 0) & (theirs > 0)
+    return float(((ours > 0) == (theirs > 0)).mean()), float((ours == theirs)[both].mean())
+
+
+def test_align_is_librealsenses_on_a_simulated_recording(tmp_path: Path) -> None:
+    import coursekit as ck
+
+    with ck.open_camera("simulated") as camera:
+        camera.record(tmp_path / "table.db3", 5)
+    same_footprint, same_depth = compare_with_vendor(tmp_path / "table.db3")
+    assert same_footprint > 0.9999
+    assert same_depth > 0.999
+
+
+@pytest.mark.real
+@pytest.mark.skipif("COURSEKIT_REAL_DATA" not in os.environ, reason="COURSEKIT_REAL_DATA not set")
+def test_align_is_librealsenses_on_a_real_d435() -> None:
+    folder = Path(os.environ["COURSEKIT_REAL_DATA"]) / "realsense_d435"
+    same_footprint, same_depth = compare_with_vendor(folder / "single_depth_color_640x480.bag")
+    assert same_footprint > 0.9999
+    assert same_depth > 0.999

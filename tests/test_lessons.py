@@ -1,0 +1,375 @@
+"""The check engine and the checkpoints: verdicts on right, wrong, blank and broken answers."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from coursekit import lessons
+from coursekit.lessons import progress
+from coursekit.lessons.checkpoints import Choice, _panel
+from coursekit.lessons.exercises import Exercise, _as_numbers, _run
+from coursekit.lessons.verdict import Verdict
+
+EXERCISES = lessons.exercises()
+CHECKPOINTS = lessons.checkpoints()
+each_exercise = pytest.mark.parametrize("exercise", EXERCISES.values(), ids=EXERCISES.keys())
+
+
+@pytest.fixture(autouse=True)
+def own_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("COURSEKIT_RESULTS", str(tmp_path))
+    return tmp_path
+
+
+# --- every exercise ---
+
+
+@each_exercise
+def test_the_right_model_is_right(exercise: Exercise) -> None:
+    verdict = exercise.judge(exercise.model())
+    assert verdict.kind == "right"
+    assert verdict.named is None
+
+
+@each_exercise
+def test_each_wrong_model_is_named(exercise: Exercise) -> None:
+    for mistake in exercise.mistakes:
+        verdict = exercise.judge(exercise.model(mistake))
+        assert verdict.kind == "wrong"
+        assert verdict.named == mistake.name
+        assert mistake.says in verdict.headline
+        assert mistake.ask in verdict.lines
+
+
+@each_exercise
+def test_the_cases_separate_every_two_models(exercise: Exercise) -> None:
+    """Any two models differ somewhere by far more than the tolerance, or share a name."""
+    models = [("right", exercise.model())] + [
+        (m.name, exercise.model(m)) for m in exercise.mistakes
+    ]
+    answers = [
+        (name, [_as_numbers(_run(model, args).value) for args in exercise.cases])
+        for name, model in models
+    ]
+    for (name_a, a), (name_b, b) in itertools.combinations(answers, 2):
+        gap = max(np.abs(x - y).max() for x, y in zip(a, b, strict=True))
+        assert name_a == name_b or gap > 20 * exercise.tolerance, (name_a, name_b, gap)
+
+
+@each_exercise
+def test_two_mistakes_are_called_more_than_one(exercise: Exercise) -> None:
+    """Unless one hides the other, and then that one is named: it explains every number."""
+    steps = list(exercise.steps)
+    for a, b in itertools.permutations(exercise.mistakes, 2):
+        if steps.index(a.step) >= steps.index(b.step):
+            continue
+        verdict = exercise.judge(exercise.model(a, b))
+        assert verdict.kind == "wrong"
+        single = verdict.named in {a.name, b.name}
+        first_named = (verdict.named or "").removeprefix("several, first ") in {a.name, b.name}
+        assert single or first_named or verdict.headline.count("more than one"), (a.name, b.name)
+        if not single:
+            assert "more than one mistake" in verdict.headline
+
+
+@each_exercise
+def test_a_near_match_is_not_named(exercise: Exercise) -> None:
+    for mistake in exercise.mistakes:
+        model = exercise.model(mistake)
+        verdict = exercise.judge(lambda *args, model=model: model(*args) + 0.02)
+        assert verdict.kind == "wrong"
+        assert verdict.named is None
+        assert "not right yet" in verdict.headline
+
+
+@each_exercise
+def test_no_verdict_shows_the_answer(exercise: Exercise) -> None:
+    """The texts may ask, but contain no line of code that would solve it."""
+    for mistake in exercise.mistakes:
+        text = repr(exercise.judge(exercise.model(mistake)))
+        assert "K[" not in text
+        assert "np." not in text.replace("`np.stack`", "")
+
+
+# --- broken, blank and odd functions ---
+
+PROJECT = EXERCISES["pinhole.project"]
+right = PROJECT.model()
+
+
+def without_dist(points, K):
+    return right(points, K)
+
+
+def raises_late(points, K, dist=None):
+    if dist is not None:
+        return right(points, K) @ np.eye(7)
+    return right(points, K)
+
+
+def exits(points, K, dist=None):
+    raise SystemExit(3)
+
+
+def recursion(points, K, dist=None):
+    return recursion(points, K, dist)
+
+
+def unready(points, K, dist=None):
+    raise NotImplementedError
+
+
+def in_place(points, K, dist=None):
+    answer = right(points, K, dist)
+    points /= points[:, 2:]
+    return answer
+
+
+def in_place_and_swapped(points, K, dist=None):
+    answer = right(points, K, dist)[:, ::-1]
+    points[:] = 0
+    return answer
+
+
+def half_none(points, K, dist=None):
+    return right(points, K) if dist is None else None
+
+
+@pytest.mark.parametrize(
+    ("function", "kind", "says"),
+    [
+        (lambda points, K, dist=None: None, "not attempted", "returns None"),
+        (unready, "not attempted", "not attempted yet"),
+        (42, "not attempted", "not a function"),
+        (without_dist, "raised", "positional arguments"),
+        (raises_late, "raised", "return right(points, K) @ np.eye(7)"),
+        (exits, "raised", "SystemExit"),
+        (recursion, "raised", "RecursionError"),
+        (half_none, "wrong", "is a `return` missing"),
+        (lambda *args: "pixels", "wrong", "a str"),
+        (lambda *args: {1: 2}, "wrong", "a dict"),
+        (lambda *args: [[1, 2], [3]], "wrong", "a list"),
+        (lambda *args: right(*args) + 0j, "wrong", "not an array of numbers"),
+        (lambda *args: np.c_[right(*args), right(*args)], "wrong", "wrong shape"),
+        (lambda *args: right(*args)[0], "wrong", "wrong shape"),
+        (lambda *args: 3.0, "wrong", "wrong shape"),
+        (lambda *args: np.full((len(args[0]), 2), np.nan), "wrong", "not right yet"),
+        (lambda *args: right(*args).T, "wrong", "transposed"),
+        (in_place, "wrong", "changes the array it is given. The numbers are right"),
+        (in_place_and_swapped, "wrong", "more than one mistake"),
+        (lambda *args: right(*args)[:, ::-1].T, "wrong", "more than one mistake"),
+    ],
+)
+def test_odd_functions(function, kind: str, says: str) -> None:
+    verdict = lessons.check("pinhole.project", function)
+    assert verdict.kind == kind
+    assert says in repr(verdict)
+    assert verdict._repr_html_().count("<div") >= 1
+
+
+def bent(x, y, dist):
+    k1, k2, p1, p2, k3 = dist if dist is not None else [0] * 5
+    r2 = x * x + y * y
+    radial = 1 + k1 * r2 + k2 * r2 * r2 + k3 * r2**3
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+    )
+
+
+def by_opencv(points, K, dist=None):
+    return cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, dist)[0][:, 0]
+
+
+def in_lists(points, K, dist=None):
+    pairs = [bent(X / Z, Y / Z, dist) for X, Y, Z in points.tolist()]
+    return [[K[0][0] * x + K[0][2], K[1][1] * y + K[1][2]] for x, y in pairs]
+
+
+def homogeneous(points, K, dist=None):
+    rays = points / points[:, 2:3]
+    rays[:, 0], rays[:, 1] = bent(rays[:, 0].copy(), rays[:, 1].copy(), dist)
+    uvw = np.einsum("ij,nj->ni", K, rays)
+    return uvw[:, :2] / uvw[:, 2:]
+
+
+def in_float32(points, K, dist=None):
+    return np.array(in_lists(points.astype(np.float32), K, dist), np.float32)
+
+
+@pytest.mark.parametrize("function", [by_opencv, in_lists, homogeneous, in_float32])
+def test_right_projects_in_other_styles_are_not_blamed(function) -> None:
+    verdict = PROJECT.judge(function)
+    assert verdict.kind == "right", verdict
+
+
+def undistorted_by_opencv(pixels, depth, K, dist=None):
+    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 500, 1e-14)
+    dist = np.zeros(5) if dist is None else dist
+    rays = cv2.undistortPointsIter(pixels[:, None], K, dist, None, None, criteria)[:, 0]
+    return depth[:, None] * np.column_stack([rays, np.ones(len(rays))])
+
+
+def twenty_rounds_of_division(pixels, depth, K, dist=None):
+    k1, k2, p1, p2, k3 = (0, 0, 0, 0, 0) if dist is None else dist
+    out = []
+    for (u, v), z in zip(pixels.tolist(), depth.tolist(), strict=True):
+        xd, yd = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
+        x, y = xd, yd
+        for _ in range(20):
+            r2 = x * x + y * y
+            radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+            dx = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+            dy = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+            x, y = (xd - dx) / radial, (yd - dy) / radial
+        out.append((x * z, y * z, z))
+    return out
+
+
+@pytest.mark.parametrize("function", [undistorted_by_opencv, twenty_rounds_of_division])
+def test_right_deprojects_in_other_styles_are_not_blamed(function) -> None:
+    verdict = EXERCISES["pinhole.deproject"].judge(function)
+    assert verdict.kind == "right", verdict
+
+
+def test_the_counterexample_of_the_design() -> None:
+    """The smallest case that shows p1 and p2 swapped, with OpenCV's numbers."""
+    (mistake,) = [m for m in PROJECT.mistakes if m.name == "p1_p2_swapped"]
+    verdict = PROJECT.judge(PROJECT.model(mistake))
+    assert verdict.headline == "project: your p1 and p2 are swapped. 7 of 10 cases agree."
+    K, dist = np.array([[447.0, 0, 424], [0, 447, 240], [0, 0, 1]]), np.array([0, 0, 1e-3, 5e-4, 0])
+    pixel = cv2.projectPoints(np.array([[0.3, -0.2, 0.9]]), np.zeros(3), np.zeros(3), K, dist)[0]
+    assert "({:.3f}, {:.3f})".format(*pixel.ravel()) == "(573.019, 140.749)"
+    assert "expected (573.019, 140.749), yours (573.138, 140.658) px" in verdict.lines[0]
+
+
+def test_unknown_names() -> None:
+    with pytest.raises(ValueError, match=r"pinhole\.project"):
+        lessons.check("pinhole.projection", right)
+    with pytest.raises(ValueError, match=r"pinhole\.pitch"):
+        lessons.checkpoint("pitch")
+    with pytest.raises(ValueError, match="pinhole"):
+        lessons.evidence("optics")
+
+
+# --- checkpoints ---
+
+
+@pytest.mark.parametrize("checkpoint", CHECKPOINTS.values(), ids=CHECKPOINTS.keys())
+def test_every_answer_says_why(checkpoint) -> None:
+    if isinstance(checkpoint, Choice):
+        letters = checkpoint.lettered()
+        assert sum(o.right for o in checkpoint.options) == 1
+        for letter, option in letters.items():
+            verdict = checkpoint.answer(letter)
+            assert verdict.kind == ("right" if option.right else "wrong")
+            assert option.why in verdict.lines
+        right_one = next(k for k, o in letters.items() if o.right)
+        text = repr(checkpoint.answer(right_one.lower()))
+        assert all(o.why in text for o in checkpoint.options)
+    else:
+        assert checkpoint.answer(checkpoint.value).kind == "right"
+        for classic in checkpoint.classics:
+            assert not checkpoint._close(classic.value, checkpoint.value)
+            assert checkpoint.answer(classic.value).lines[0] == classic.why
+        assert checkpoint.answer(checkpoint.value * 1.7).lines[0] == checkpoint.hint
+
+
+PITCH = CHECKPOINTS["pinhole.pitch"]
+RANGE = CHECKPOINTS["pinhole.range"]
+
+
+@pytest.mark.parametrize("given", [2000, "2000", " 2000 px", "2e3", "2000,0", "2000.0px", 2005])
+def test_ways_to_type_a_number(given) -> None:
+    assert PITCH.judge(given).kind == "right"
+
+
+@pytest.mark.parametrize("given", ["", "two thousand", "nan", "inf", None, "20 00", [2000]])
+def test_what_is_no_number_is_not_an_attempt(given) -> None:
+    assert PITCH.answer(given).kind == "not attempted"
+    assert progress.read() == {}
+
+
+def test_a_letter_that_is_none() -> None:
+    assert CHECKPOINTS["pinhole.half_size"].answer("E").kind == "not attempted"
+    assert CHECKPOINTS["pinhole.half_size"].answer(2).kind == "not attempted"
+
+
+def test_the_numbers_of_the_checkpoints() -> None:
+    """Computed here another way: similar triangles and Pythagoras."""
+    assert PITCH.value == pytest.approx(0.010 / 5e-6)
+    assert CHECKPOINTS["pinhole.same_size"].value == pytest.approx(0.45 * 25 / 60)
+    K = np.array([[447.0, 0, 424], [0, 447, 240], [0, 0, 1]])
+    ray = np.linalg.solve(K, [0, 240, 1]) * 0.45
+    assert RANGE.value == pytest.approx(np.linalg.norm(ray))
+
+
+def test_the_widget_commits() -> None:
+    panel = _panel(CHECKPOINTS["pinhole.half_size"])
+    field, button, said = panel.children
+    button.click()
+    assert "Choose or type" in said.value
+    field.value = "A"
+    button.click()
+    assert "not this one" in said.value
+    field.value = "C"
+    button.click()
+    assert "right" in said.value
+    kinds = [a["kind"] for a in progress.read()["pinhole.half_size"]]
+    assert kinds == ["wrong", "right"]
+
+
+def test_what_a_cell_stores_is_the_same_every_time() -> None:
+    for checkpoint in CHECKPOINTS.values():
+        first, second = checkpoint._repr_mimebundle_(), checkpoint._repr_mimebundle_()
+        for mime in ("text/plain", "text/html"):
+            assert first[mime] == second[mime]
+
+
+# --- progress and evidence ---
+
+
+def test_attempts_are_kept_in_order(own_results: Path) -> None:
+    PITCH.answer(500)
+    PITCH.answer(2000)
+    lessons.check("pinhole.project", right)
+    kept = json.loads((own_results / "progress.json").read_text())
+    assert [a["kind"] for a in kept["pinhole.pitch"]] == ["wrong", "right"]
+    rows = dict(lessons.evidence("pinhole").rows())
+    assert "pitch: right at try 2" in " ".join(rows.values())
+    assert "project: right; deproject: not answered yet" in " ".join(rows.values())
+
+
+def test_a_damaged_record_is_set_aside(own_results: Path) -> None:
+    (own_results / "progress.json").write_text("{half")
+    PITCH.answer(2000)
+    assert len(progress.read()["pinhole.pitch"]) == 1
+    assert (own_results / "progress.damaged.json").read_text() == "{half"
+
+
+def test_a_record_that_cannot_be_written_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("COURSEKIT_RESULTS", str(tmp_path / "file" / "inside"))
+    verdict = PITCH.answer(2000)
+    assert verdict.kind == "right"
+    assert "progress is not saved" in verdict.lines[-1]
+
+
+def test_evidence_covers_every_checkpoint_and_exercise() -> None:
+    named = {n for o in lessons.evidence("pinhole").objectives for n in o.names}
+    assert named == {n for n in (*CHECKPOINTS, *EXERCISES) if n.startswith("pinhole.")}
+
+
+def test_html_is_escaped() -> None:
+    verdict = Verdict("x", "wrong", "<b>", ("`a<b` and *so*",))
+    html = verdict._repr_html_()
+    assert "&lt;b&gt;" in html
+    assert "<code>a&lt;b</code> and <em>so</em>" in html

@@ -1,0 +1,104 @@
+"""The hand-over files: what goes in comes out, and nothing half-written or damaged passes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from coursekit import results
+from coursekit.results import Quantity
+
+CAMERA = SimpleNamespace(source="simulated", name="Simulated D435")
+
+
+@pytest.fixture(autouse=True)
+def own_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("COURSEKIT_RESULTS", str(tmp_path / "results"))
+    return tmp_path / "results"
+
+
+def test_round_trip(own_results: Path) -> None:
+    quantities = {
+        "fx": Quantity(612.4, "px", 0.9, "bias", "from 28 views"),
+        "sigma_d": Quantity(float(np.float64(0.08)), "px", None, "noise"),
+    }
+    path = results.save("01_pinhole", CAMERA, quantities)
+    assert path == own_results / "01_pinhole.json"
+    loaded = results.load("01_pinhole")
+    assert loaded.quantities == quantities
+    assert loaded.source == "simulated"
+    assert loaded.camera == "Simulated D435"
+    assert loaded.versions["numpy"] == np.__version__
+    assert loaded.date.endswith("+00:00")
+    assert [p.name for p in own_results.iterdir()] == ["01_pinhole.json"]  # nothing left over
+
+
+@pytest.mark.parametrize(
+    ("fields", "name"),
+    [
+        ({"value": float("nan")}, "value"),
+        ({"value": "3"}, "value"),
+        ({"value": None}, "value"),
+        ({"sigma": -1.0}, "sigma"),
+        ({"sigma": float("inf")}, "sigma"),
+        ({"unit": ""}, "unit"),
+        ({"kind": "random"}, "kind"),
+    ],
+)
+def test_bad_quantities(fields: dict, name: str) -> None:
+    with pytest.raises(ValueError, match=f"^{name}: "):
+        Quantity(**{"value": 1.0, "unit": "px"} | fields)
+
+
+@pytest.mark.parametrize("lesson", ["", "../escape", "a/b", "01 pinhole", ".hidden"])
+def test_bad_lesson_names(lesson: str) -> None:
+    with pytest.raises(ValueError, match=r"^lesson: "):
+        results.save(lesson, CAMERA, {})
+
+
+def test_only_quantities_are_saved(own_results: Path) -> None:
+    with pytest.raises(ValueError, match=r"^quantities: fx is a float"):
+        results.save("01_pinhole", CAMERA, {"fx": 612.4})
+    assert not own_results.exists()
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda text: text[: len(text) // 2],
+        lambda text: "",
+        lambda text: "[]",
+        lambda text: "\x00",
+        lambda text: text.replace('"format": 1', '"format": 99'),
+        lambda text: text.replace('"value": 1.0', '"value": null'),
+        lambda text: text.replace('"unit"', '"units"'),
+        lambda text: text.replace('"simulated"', '"invented"'),
+        lambda text: text.replace('"quantities"', '"quantity"'),
+    ],
+)
+def test_damaged_files_are_named(damage) -> None:
+    path = results.save("01_pinhole", CAMERA, {"fx": Quantity(1.0, "px")})
+    path.write_text(damage(path.read_text()))
+    with pytest.raises(ValueError, match=r"01_pinhole\.json"):
+        results.load("01_pinhole")
+
+
+def test_a_missing_file_is_a_missing_file() -> None:
+    with pytest.raises(FileNotFoundError):
+        results.load("01_pinhole")
+
+
+def test_a_failed_write_leaves_the_old_file(own_results: Path) -> None:
+    path = results.save("01_pinhole", CAMERA, {"fx": Quantity(1.0, "px")})
+    before = path.read_text()
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        results.write_json(path, {"x": float("nan")})
+    with pytest.raises(TypeError):
+        results.write_json(path, {"x": object()})
+    assert path.read_text() == before
+    assert len(list(own_results.iterdir())) == 1
+    assert json.loads(before)["quantities"]["fx"]["value"] == 1.0
