@@ -51,7 +51,7 @@ class SimulatedCamera(Camera):
         self._seed, self._advice, self._closed, self._given = seed, advice, False, 0
 
     def __repr__(self) -> str:
-        return f"{self.name}, seed {self._seed}: no real camera in use. {self._advice}"
+        return f"{self.name}, seed {self._seed}: no real camera in use.\n{self._advice}"
 
     def lock(self) -> str:
         """Nothing to do: returns one sentence that says so."""
