@@ -144,11 +144,11 @@ def test_lock_says_why_there_is_nothing_to_lock(camera):
     ] in sentence
 
 
-def test_description_is_one_line(camera):
+def test_description(camera):
     assert (
         repr(camera)
         == {
-            "simulated": "Simulated D435, seed 7: no real camera in use. Plug in a RealSense and "
+            "simulated": "Simulated D435, seed 7: no real camera in use.\nPlug in a RealSense and "
             'run this cell again, or name a recording: ck.open_camera("file.bag")',
             "recorded": "Simulated D435 (recording tabletop.db3): depth 848x480, colour 640x480, "
             "baseline 50.2 mm, depth unit 1 mm",

@@ -285,7 +285,7 @@ def test_without_the_library_auto_is_simulated_and_says_why(no_library):
     camera = open_camera()
     assert camera.source == "simulated"
     assert repr(camera).startswith(
-        "Simulated D435, seed 7: no real camera in use. The reason: pyrealsense2 is not "
+        "Simulated D435, seed 7: no real camera in use.\nThe reason: pyrealsense2 is not "
         "installed, so neither a RealSense nor a recording can be opened"
     )
     assert "requirements-camera.txt" in repr(camera)
