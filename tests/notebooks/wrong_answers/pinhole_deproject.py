@@ -185,7 +185,7 @@ def two_rounds_are_too_few(pixels, depth, K, dist=None):
     return np.column_stack([x * depth, y * depth, depth])
 
 
-@wrong(None, "vectorised")
+@wrong(None, "vectorised", kind="raised")
 def depth_times_columns(pixels, depth, K, dist=None):
     x, y = _straight(*_seen(pixels, K), dist)
     return np.column_stack([x, y, np.ones_like(x)]) * depth
