@@ -422,6 +422,7 @@ def address_when_ready(child: subprocess.Popen, runtime: Path) -> str:
 def jupyter_command(arguments: list[str]) -> list[str]:
     options = ["--no-browser", "--log-level=ERROR", "--LabApp.log_level=ERROR"]
     options += [f"--ServerApp.root_dir={ROOT}", f"--LabApp.default_url=/{FIRST_PAGE}"]
+    options += ["--KernelManager.transport_encryption=auto"]  # "disabled" warns on the terminal
     options += ["--ServerApp.answer_yes=True"]  # to "Shut down this server?" after Ctrl-C
     if hasattr(os, "geteuid") and os.geteuid() == 0:
         options.append("--allow-root")

@@ -58,8 +58,14 @@ def test_the_cases_separate_every_two_models(exercise: Exercise) -> None:
         for name, model in models
     ]
     for (name_a, a), (name_b, b) in itertools.combinations(answers, 2):
-        gap = max(np.abs(x - y).max() for x, y in zip(a, b, strict=True))
+        gap = max(_gap(x, y) for x, y in zip(a, b, strict=True))
         assert name_a == name_b or gap > 20 * exercise.tolerance, (name_a, name_b, gap)
+
+
+def _gap(x: np.ndarray, y: np.ndarray) -> float:
+    """The largest difference; NaN equals NaN and is infinitely far from every number."""
+    same = (x == y) | (np.isnan(x) & np.isnan(y))
+    return float(np.where(same, 0.0, np.nan_to_num(np.abs(x - y), nan=np.inf)).max())
 
 
 @each_exercise
@@ -285,12 +291,35 @@ PITCH = CHECKPOINTS["pinhole.pitch"]
 RANGE = CHECKPOINTS["pinhole.range"]
 
 
-@pytest.mark.parametrize("given", [2000, "2000", " 2000 px", "2e3", "2000,0", "2000.0px", 2005])
+@pytest.mark.parametrize(
+    "given", [2000, "2000", " 2000 px", "2e3", "2000,0", "2000.0px", 2005, "2 000"]
+)
 def test_ways_to_type_a_number(given) -> None:
     assert PITCH.judge(given).kind == "right"
 
 
-@pytest.mark.parametrize("given", ["", "two thousand", "nan", "inf", None, "20 00", [2000]])
+@pytest.mark.parametrize(
+    ("given", "right"),
+    [("187.5 mm", True), ("18.75cm", True), ("0,1875 m", True), ("45 cm", False)],
+)
+def test_units_of_length_are_converted(given: str, right: bool) -> None:
+    assert (CHECKPOINTS["pinhole.same_size"].judge(given).kind == "right") == right
+
+
+def test_right_digits_in_another_unit_are_no_attempt() -> None:
+    verdict = CHECKPOINTS["pinhole.same_size"].answer(187.5)
+    assert verdict.kind == "not attempted"
+    assert "wanted in m" in verdict.headline
+
+
+def test_the_first_mistake_to_look_at_shows_in_the_case() -> None:
+    """Principal point and tangential terms: the first case has no coefficients to blame."""
+    chosen = {m.name: m for m in PROJECT.mistakes}
+    model = PROJECT.model(chosen["tangential_missing"], chosen["principal_point_forgotten"])
+    assert PROJECT.judge(model).named == "several, first principal_point_forgotten"
+
+
+@pytest.mark.parametrize("given", ["", "two", "nan", "inf", None, "20 00", [2000], "2,000"])
 def test_what_is_no_number_is_not_an_attempt(given) -> None:
     assert PITCH.answer(given).kind == "not attempted"
     assert progress.read() == {}

@@ -71,7 +71,7 @@ def test_displacement_is_opencvs() -> None:
     assert size[0, 0] == pytest.approx(np.hypot(*bent), abs=1e-9)
     edge, corner = pinhole.edge_and_corner(size)
     assert (round(edge, 1), round(corner, 1)) == (33.7, 51.6)
-    assert "33.7 px at the edges, 51.6 px in the corners" in FIGURES["displacement"].alt
+    assert "33.7 px at an edge, 51.6 px in a corner" in FIGURES["displacement"].alt
 
 
 def test_brown_conrady_is_worth_what_the_lesson_says() -> None:
@@ -115,6 +115,17 @@ def test_drag_draws_its_start_and_follows_a_slider() -> None:
     assert image.value != before
     bundle, _ = drag._repr_mimebundle_()
     assert bundle["text/plain"] == pinhole.similar_triangles(2, 1).alt
+
+
+def test_a_slider_starts_where_it_says_and_has_round_steps() -> None:
+    drag = plots.drag(
+        pinhole.similar_triangles, focal_length_mm=(1, 4, 1.93), depth_m=(0.35, 1.2, 0.45)
+    )
+    focal, depth, _ = drag.widget().children
+    assert (focal.value, depth.value) == (1.93, 0.45)
+    assert (focal.step, depth.step) == (0.01, 0.01)
+    depth.value = 0.5
+    assert depth.value == 0.5
 
 
 @pytest.mark.parametrize("slider", [(1, 2), (2, 1, 1.5), (1, 2, 3), (1, 1, 1)])

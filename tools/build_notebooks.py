@@ -276,7 +276,7 @@ def _of_exercises(notebook: Notebook) -> Iterator[str]:
 
 def find(names: list[str]) -> list[Path]:
     """The notebooks of these names, or all; ValueError for a name that does not exist."""
-    every = {path.stem: path for path in sorted(NOTEBOOKS.glob("*.ipynb"))}
+    every = {path.stem: path for path in sorted(NOTEBOOKS.glob("[0-9]*.ipynb"))}
     if not every:
         raise ValueError(f"there are no notebooks in {NOTEBOOKS}")
     wanted = [Path(name).stem for name in names] or list(every)

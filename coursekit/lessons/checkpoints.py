@@ -7,6 +7,7 @@ kernel; a test keeps both texts equal. An answer is committed by clicking, or by
 
 from __future__ import annotations
 
+import html
 import math
 import re
 from dataclasses import dataclass
@@ -61,13 +62,21 @@ class Checkpoint:
     def __repr__(self) -> str:
         return f'Checkpoint: commit your answer with ck.checkpoint("{self.name}").answer(...)'
 
+    def explanation(self) -> Verdict:
+        """The verdict on the right answer, which says why every other one is wrong."""
+        raise NotImplementedError
+
     def _repr_mimebundle_(self, **kwargs: Any) -> dict[str, Any]:
-        call = f'ck.checkpoint("{self.name}").answer({self.example})'
         widget: dict[str, Any] = _panel(self)._repr_mimebundle_(**kwargs)
-        return widget | {
-            "text/plain": repr(self),
-            "text/html": f"<em>Run this cell to answer here, or call <code>{call}</code>.</em>",
-        }
+        return widget | {"text/plain": repr(self), "text/html": self._without_kernel()}
+
+    def _without_kernel(self) -> str:
+        call = f'ck.checkpoint("{self.name}").answer({self.example})'
+        return (
+            f"<em>Run this cell to answer here, or call <code>{call}</code>.</em>"
+            "<details><summary>Reading without a kernel? Decide first, then open the answer."
+            f"</summary>{self.explanation()._repr_html_()}</details>"
+        )
 
 
 @dataclass(frozen=True, repr=False)
@@ -95,6 +104,9 @@ class Choice(Checkpoint):
         others = [f"{k}, {o.text}: {o.why}" for k, o in options.items() if not o.right]
         headline = f"{letter}, {chosen.text}: right."
         return Verdict(self.name, "right", headline, (chosen.why, *others))
+
+    def explanation(self) -> Verdict:
+        return self.judge(next(k for k, o in self.lettered().items() if o.right))
 
     @property
     def example(self) -> str:
@@ -124,7 +136,7 @@ class Number(Checkpoint):
         """The verdict on a number, or on text such as "2.4" or "2,4 mm"."""
         number = _read_number(given, self.unit)
         if number is None:
-            say = f"Type a number in {self.unit}, such as 2.4; got {given!r}."
+            say = f"Type a number in {self.unit}, such as 2.4 or 2000; got {given!r}."
             return Verdict(self.name, "not attempted", say)
         said = f"{number:g} {self.unit}"
         if self._close(number, self.value):
@@ -136,11 +148,17 @@ class Number(Checkpoint):
                 return Verdict(
                     self.name, "wrong", f"{said}: not this.", lines, named=f"{classic.value:g}"
                 )
+        if any(self._close(number * factor, self.value) for factor in (1e-3, 1e3)):
+            say = f"The digits are right. The answer is wanted in {self.unit}."
+            return Verdict(self.name, "not attempted", say)
         lines = (self.hint, "Think again, and try another number.")
         return Verdict(self.name, "wrong", f"{said}: not this.", lines)
 
     def _close(self, number: float, value: float) -> bool:
         return math.isclose(number, value, rel_tol=self.tolerance, abs_tol=1e-12)
+
+    def explanation(self) -> Verdict:
+        return self.judge(self.value)
 
     @property
     def example(self) -> str:
@@ -152,16 +170,28 @@ class Number(Checkpoint):
         return ipywidgets.Text(placeholder=f"a number in {self.unit}")
 
 
+LENGTHS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+
+
 def _read_number(given: Any, unit: str) -> float | None:
-    """The number in the student's answer, or None; a decimal comma and the unit are accepted."""
-    text = str(given).strip().removesuffix(unit).strip().replace("\N{MINUS SIGN}", "-")
-    if re.fullmatch(r"[+-]?\d+,\d+", text):
-        text = text.replace(",", ".")
+    """The number in the student's answer, in `unit`, or None for what is no number or unclear.
+
+    A decimal comma, spaces between digits and a unit (of length, if `unit` is one) are accepted.
+    "2,000" is not: it is two to some readers and two thousand to others.
+    """
+    text = str(given).strip().replace("\N{MINUS SIGN}", "-")
+    match = re.fullmatch(r"([-+\d.,\s]+(?:[eE][-+]?\d+)?)\s*([a-zA-Zµ]*)", text)
+    if match is None:
+        return None
+    digits, given_unit = re.sub(r"(?<=\d)\s(?=\d{3}\b)", "", match[1]).strip(), match[2] or unit
+    if re.fullmatch(r"[-+]?\d+,\d+", digits) and not re.fullmatch(r"[-+]?\d{1,3},000", digits):
+        digits = digits.replace(",", ".")
+    factor = 1.0 if given_unit == unit else LENGTHS.get(given_unit, 0.0) / LENGTHS.get(unit, 1.0)
     try:
-        number = float(text)
+        number = float(digits) * factor
     except ValueError:
         return None
-    return number if math.isfinite(number) else None
+    return number if math.isfinite(number) and factor else None
 
 
 def _panel(checkpoint: Checkpoint) -> Any:
@@ -170,7 +200,7 @@ def _panel(checkpoint: Checkpoint) -> Any:
 
     field = checkpoint.input_widget()
     button = ipywidgets.Button(description="Commit", tooltip="Commit this answer")
-    said = ipywidgets.HTML()
+    said = ipywidgets.HTML(_earlier(checkpoint.name))
 
     def commit(_: Any) -> None:
         if field.value in (None, ""):
@@ -180,3 +210,12 @@ def _panel(checkpoint: Checkpoint) -> Any:
 
     button.on_click(commit)
     return ipywidgets.VBox([field, button, said])
+
+
+def _earlier(name: str) -> str:
+    """What the student did here before, for the widget only: stored outputs never show it."""
+    attempts = progress.read().get(name, [])
+    if not attempts:
+        return ""
+    last = attempts[-1]
+    return f"<em>Your last answer here: {html.escape(last['answer'])}, {last['kind']}.</em>"

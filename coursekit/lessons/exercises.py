@@ -44,10 +44,12 @@ class Mistake:
 class Exercise:
     """A function the learner writes, and all that is known about getting it wrong.
 
-    build(steps) returns the model that uses these steps; `describe(args)` and `show(row)` put a
-    case and one row of a result into words. Cases go from small to large: the first one that
-    fails is shown; the first `per_row` arguments have one row a point. Results agree within
-    `tolerance` (in `unit`) or 1e-6 of their size.
+    build(steps) returns the model that uses these steps. Cases go from small to large, and the
+    first one that fails is shown: `describe(args)` and `show(row)` put it into words. Where a
+    result has rows and the first `per_row` arguments have the same, one row of them is shown;
+    otherwise (a result that is one number, say) the whole case. Results agree within `tolerance`
+    (in `unit`) or 1e-9 of their size, and NaN with NaN. Where `nan_answers`, NaN is an answer
+    like any other; otherwise a wrong model that comes to NaN or infinity has overflowed.
     """
 
     name: str
@@ -59,6 +61,7 @@ class Exercise:
     tolerance: float
     describe: Callable[[tuple[Any, ...]], str]
     show: Callable[[np.ndarray], str]
+    nan_answers: bool = False
     mistakes: list[Mistake] = field(default_factory=list)
 
     @property
@@ -91,7 +94,7 @@ class Exercise:
         if not callable(function):
             return self._say("not attempted", f"got a {type(function).__name__}, not a function.")
         runs = [_run(function, args) for args in self.cases]
-        expected = [_run(self.model(), args).value for args in self.cases]
+        expected = [np.asarray(_run(self.model(), args).value, float) for args in self.cases]
         unfinished = self._unfinished(runs)
         if unfinished:
             return unfinished
@@ -122,18 +125,20 @@ class Exercise:
     def _compare(self, runs: list[Run], expected: list[np.ndarray]) -> Verdict:
         values = [v for r in runs if (v := _as_numbers(r.value)) is not None]
         changed = any(r.changed_input for r in runs)
-        transposed = all(
-            v.shape == e.T.shape and v.shape != e.shape
+        turned = [
+            v.shape == e.T.shape
             for v, e in zip(values, expected, strict=True)
-            if e.shape[0] != e.shape[1]
-        )
+            if e.shape != e.T.shape
+        ]
+        transposed = bool(turned) and all(turned)
         if transposed:
             values = [
                 v.T if v.shape == e.T.shape else v for v, e in zip(values, expected, strict=True)
             ]
         for value, want, args in zip(values, expected, self.cases, strict=True):
             if value.shape != want.shape:
-                text = f"wrong shape: it returns {value.shape}, and {want.shape} is wanted."
+                got, wanted = _shape(value), _shape(want)
+                text = f"wrong shape: it returns {got}, and {wanted} is wanted."
                 return self._say("wrong", text, self._given(args))
         agree = [self._agrees(v, e) for v, e in zip(values, expected, strict=True)]
         formal = []
@@ -174,7 +179,8 @@ class Exercise:
         for mistakes in self._combinations():
             if self._explains(mistakes, values):
                 if len(mistakes) > 1:
-                    return self._several(mistakes[0], (count, evidence))
+                    seen = self._seen_in(first, mistakes, expected[first])
+                    return self._several(seen, (count, evidence))
                 (mistake,) = mistakes
                 return self._say(
                     "wrong", f"{mistake.says}. {count}", evidence, mistake.ask, named=mistake.name
@@ -186,6 +192,14 @@ class Exercise:
             "No single mistake that this check knows gives these numbers. Work this "
             "case by hand, one step at a time, and compare.",
         )
+
+    def _seen_in(self, case: int, mistakes: tuple[Mistake, ...], want: np.ndarray) -> Mistake:
+        """The first of several mistakes that by itself shows in this case."""
+        for mistake in mistakes:
+            value = _as_numbers(_run(self.model(mistake), self.cases[case]).value)
+            if value is None or value.shape != want.shape or not self._agrees(value, want):
+                return mistake
+        return mistakes[0]
 
     def _several(self, first: Mistake, lines: tuple[str, ...]) -> Verdict:
         return self._say(
@@ -213,7 +227,7 @@ class Exercise:
         model, compared = self.model(*mistakes), False
         for value, args in zip(values, self.cases, strict=True):
             wrong = _as_numbers(_run(model, args).value)
-            if wrong is None or not np.isfinite(wrong).all():
+            if wrong is None or not (self.nan_answers or np.isfinite(wrong).all()):
                 continue
             if not self._agrees(value, wrong):
                 return False
@@ -221,22 +235,23 @@ class Exercise:
         return compared
 
     def _agrees(self, value: np.ndarray, want: np.ndarray) -> bool:
-        return np.allclose(value, want, rtol=1e-6, atol=self.tolerance)
+        return np.allclose(value, want, rtol=1e-9, atol=self.tolerance, equal_nan=True)
 
     def _evidence(self, index: int, value: np.ndarray, want: np.ndarray) -> str:
-        """The row of the first failing case that is furthest off, with its input."""
-        with np.errstate(all="ignore"):
-            off = np.nan_to_num(np.abs(value - want).max(axis=1), nan=np.inf)
-        row = int(off.argmax())
+        """The first failing case, or its row that is furthest off, with its input."""
         args = self.cases[index]
-        single = tuple(a[row : row + 1] for a in args[: self.per_row]) + args[self.per_row :]
+        if want.ndim and self.per_row:
+            with np.errstate(all="ignore"):
+                off = np.abs(value - want).reshape(len(want), -1).max(axis=1)
+            row = int(np.nan_to_num(off, nan=np.inf).argmax())
+            args = tuple(a[row : row + 1] for a in args[: self.per_row]) + args[self.per_row :]
+            value, want = value[row], want[row]
         return (
-            f"{self._given(single)} expected {self.show(want[row])}, "
-            f"yours {self.show(value[row])} {self.unit}."
+            f"{self._given(args)} expected {self.show(want)}, yours {self.show(value)} {self.unit}."
         )
 
     def _given(self, args: tuple[Any, ...]) -> str:
-        return self.describe(args) + ":"
+        return f"The case: {self.describe(args)}."
 
     def _say(self, kind: Any, text: str, *lines: str, named: str | None = None) -> Verdict:
         return Verdict(self.name, kind, f"{self.function}: {text}", lines, named)
@@ -246,14 +261,14 @@ IN_PLACE = Mistake(
     "in_place",
     "",
     "your function changes the array it is given",
-    "Whoever calls it loses their points. Which line writes into an argument?",
+    "Whoever calls it loses the original. Which line writes into an argument?",
     lambda: None,
 )
 TRANSPOSED = Mistake(
     "transposed",
     "",
     "your result is transposed: one column a point, and one row a point is wanted",
-    "What does `np.stack` do with `axis=1`?",
+    "Print the shape of what you return. Which axis counts the points?",
     lambda: None,
 )
 
@@ -277,7 +292,7 @@ def _run(function: Callable[..., Any], args: tuple[Any, ...]) -> Run:
     except (Exception, SystemExit) as error:  # whatever a learner's code does, the check goes on
         return Run(None, error, _what_was_raised(error, function))
     changed = any(
-        isinstance(a, np.ndarray) and not np.array_equal(a, b)
+        isinstance(a, np.ndarray) and not np.array_equal(a, b, equal_nan=True)
         for a, b in zip(args, own, strict=True)
     )
     return Run(value, changed_input=changed)
@@ -296,6 +311,10 @@ def _what_was_raised(error: BaseException, function: Callable[..., Any]) -> str:
         return said
     source = linecache.getline(own[-1].filename, own[-1].lineno or 0).strip()
     return f"{said} at `{source}`" if source else said
+
+
+def _shape(array: np.ndarray) -> str:
+    return f"an array of shape {array.shape}" if array.ndim else "one number"
 
 
 def _as_numbers(value: Any) -> np.ndarray | None:

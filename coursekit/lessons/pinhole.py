@@ -48,8 +48,9 @@ def _to_pixels(x: Array, y: Array, w: Any, K: Array) -> Any:
     return K[0, 0] * x + K[0, 2] * w, K[1, 1] * y + K[1, 2] * w
 
 
-def _image(x: Array, y: Array, bend: Step, to_pixels: Step) -> Any:
-    return to_pixels(*bend(x, y))
+def _image(points: Array, normalise: Step, bend: Step, to_pixels: Step) -> Any:
+    x, y, w = normalise(points)
+    return to_pixels(*bend(x, y), w)
 
 
 def _columns(u: Array, v: Array) -> Array:
@@ -58,15 +59,13 @@ def _columns(u: Array, v: Array) -> Array:
 
 def _build_project(steps: Mapping[str, Step]) -> Model:
     def project(points: Array, K: Array, dist: Array | None = None) -> Any:
-        x, y, w = steps["normalise"](points)
-
         def bend(x: Array, y: Array) -> Any:
             return (x, y) if dist is None else steps["bend"](x, y, *steps["read"](*dist))
 
-        def to_pixels(x: Array, y: Array) -> Any:
+        def to_pixels(x: Array, y: Array, w: Any) -> Any:
             return steps["to_pixels"](x, y, w, K)
 
-        return steps["columns"](*steps["image"](x, y, bend, to_pixels))
+        return steps["columns"](*steps["image"](points, steps["normalise"], bend, to_pixels))
 
     return project
 
@@ -137,6 +136,16 @@ def homogeneous_without_division(points: Array) -> Any:
     return points[:, 0], points[:, 1], points[:, 2]
 
 
+@PROJECT.mistake(
+    "normalise",
+    "X and Y are divided by the length of the ray instead of by Z",
+    "All points of a wall that faces the camera have the same Z. Do yours get the same divisor?",
+)
+def divided_by_range(points: Array) -> Any:
+    length = np.linalg.norm(points, axis=1)
+    return points[:, 0] / length, points[:, 1] / length, 1.0
+
+
 _UP = ("your y axis points up", "In which row is a point below the optical axis?")
 
 
@@ -158,6 +167,34 @@ def y_up_after_distortion(x: Array, y: Array, w: Any, K: Array) -> Any:
 )
 def fx_fy_swapped(x: Array, y: Array, w: Any, K: Array) -> Any:
     return K[1, 1] * x + K[0, 2] * w, K[0, 0] * y + K[1, 2] * w
+
+
+@PROJECT.mistake(
+    "to_pixels",
+    "fx is used for both axes",
+    "K has four numbers in it. Does your function use them all?",
+)
+def fx_for_both(x: Array, y: Array, w: Any, K: Array) -> Any:
+    return K[0, 0] * x + K[0, 2] * w, K[0, 0] * y + K[1, 2] * w
+
+
+@PROJECT.mistake(
+    "to_pixels",
+    "the principal point is added before the multiplication by fx and fy",
+    "A point on the optical axis has x = y = 0. On which pixel must it land?",
+)
+def centre_before_scale(x: Array, y: Array, w: Any, K: Array) -> Any:
+    return K[0, 0] * (x + K[0, 2] * w), K[1, 1] * (y + K[1, 2] * w)
+
+
+@PROJECT.mistake(
+    "to_pixels",
+    "K is multiplied from the wrong side",
+    "The equation says K times a column. Your points are rows: what has to be transposed?",
+)
+def K_transposed(x: Array, y: Array, w: Any, K: Array) -> Any:
+    third = K[0, 2] * x + K[1, 2] * y + w
+    return K[0, 0] * x / third, K[1, 1] * y / third
 
 
 @PROJECT.mistake(
@@ -291,26 +328,40 @@ def r_for_r2(x: Array, y: Array, k1: float, k2: float, p1: float, p2: float, k3:
     )
 
 
-@PROJECT.mistake("image", "the distortion is ignored", "What does your function do with `dist`?")
-def distortion_ignored(x: Array, y: Array, bend: Step, to_pixels: Step) -> Any:
-    return to_pixels(x, y)
+@PROJECT.mistake(
+    "image",
+    "the pinhole part is right, and the distortion is ignored",
+    "That is the core of the exercise. What could your function do with `dist`?",
+)
+def distortion_ignored(points: Array, normalise: Step, bend: Step, to_pixels: Step) -> Any:
+    return to_pixels(*normalise(points))
+
+
+@PROJECT.mistake(
+    "image",
+    "the distortion is applied before the division by Z",
+    "r² has no unit. What unit does yours have?",
+)
+def bent_before_division(points: Array, normalise: Step, bend: Step, to_pixels: Step) -> Any:
+    x, y = bend(points[:, 0], points[:, 1])
+    return to_pixels(x / points[:, 2], y / points[:, 2], 1.0)
 
 
 _IN_PIXELS = (
     "the distortion is applied in pixels",
-    "The polynomial wants x = X/Z, which is about 0.3 near the edge. How large is your r²?",
+    "The polynomial wants x = X/Z, which is 1 at 45 degrees off the axis. How large is your r²?",
 )
 
 
 @PROJECT.mistake("image", *_IN_PIXELS, name="distortion_in_pixels")
-def distortion_of_uv(x: Array, y: Array, bend: Step, to_pixels: Step) -> Any:
-    return bend(*to_pixels(x, y))
+def distortion_of_uv(points: Array, normalise: Step, bend: Step, to_pixels: Step) -> Any:
+    return bend(*to_pixels(*normalise(points)))
 
 
 @PROJECT.mistake("image", *_IN_PIXELS, name="distortion_in_pixels")
-def distortion_of_centred_uv(x: Array, y: Array, bend: Step, to_pixels: Step) -> Any:
-    cx, cy = to_pixels(0.0, 0.0)
-    u, v = to_pixels(x, y)
+def distortion_of_centred_uv(points: Array, normalise: Step, bend: Step, to_pixels: Step) -> Any:
+    cx, cy = to_pixels(0.0, 0.0, 1.0)
+    u, v = to_pixels(*normalise(points))
     u, v = bend(u - cx, v - cy)
     return u + cx, v + cy
 
@@ -364,12 +415,17 @@ def _to_normalised(pixels: Array, K: Array) -> Any:
     return (pixels[:, 0] - K[0, 2]) / K[0, 0], (pixels[:, 1] - K[1, 2]) / K[1, 1]
 
 
-def _unbend(x: Array, y: Array, dist: Array) -> Any:
-    xd, yd = x, y
-    for _ in range(100):
-        bent_x, bent_y = _bend(x, y, *dist)
-        x, y = x + xd - bent_x, y + yd - bent_y
-    return x, y
+def _iterate(rounds: int) -> Step:
+    """The fixed-point iteration, so many rounds of it."""
+
+    def unbend(x: Array, y: Array, *dist: float) -> Any:
+        xd, yd = x, y
+        for _ in range(rounds):
+            bent_x, bent_y = _bend(x, y, *dist)
+            x, y = x + xd - bent_x, y + yd - bent_y
+        return x, y
+
+    return unbend
 
 
 def _scale(x: Array, y: Array, depth: Array) -> Any:
@@ -384,7 +440,7 @@ def _build_deproject(steps: Mapping[str, Step]) -> Model:
     def deproject(pixels: Array, depth: Array, K: Array, dist: Array | None = None) -> Any:
         x, y = steps["to_normalised"](pixels, K)
         if dist is not None:
-            x, y = steps["unbend"](x, y, dist)
+            x, y = steps["unbend"](x, y, *steps["read"](*dist))
         return steps["points"](*steps["scale"](x, y, depth))
 
     return deproject
@@ -401,12 +457,18 @@ _PIXEL = np.array([[600.0, 140.0]])
 _PIXELS = np.array([[600.0, 140.0], [52.5, 310.2], [400.1, 20.8], [210.3, 199.9]])
 _DEPTHS = np.array([0.90, 0.55, 0.62, 0.48])
 
+# A wide lens (data/lenses.toml): here an iteration must be taken to its end.
+WIDE_K = np.array([[336.602, 0.0, 305.563], [0.0, 336.319, 237.203], [0.0, 0.0, 1.0]])
+WIDE = np.array([-0.29998, 0.07393, 0.00170, -0.00079, 0.0])
+_CORNER = np.array([[60.0, 50.0]])
+
 DEPROJECT = Exercise(
     name="pinhole.deproject",
     build=_build_deproject,
     steps={
         "to_normalised": _to_normalised,
-        "unbend": _unbend,
+        "read": _read,
+        "unbend": _iterate(100),
         "scale": _scale,
         "points": _points,
     },
@@ -417,6 +479,7 @@ DEPROJECT = Exercise(
         (_PIXEL, _DEPTHS[:1], LESSON_K, np.array([0.1, 0.0, 0.0, 0.0, 0.0])),
         (_PIXEL, _DEPTHS[:1], LESSON_K, np.array([0.0, 0.0, 0.0010, 0.0005, 0.0])),
         (_PIXELS, _DEPTHS, GENERIC_K, MIXED),
+        (_CORNER, _DEPTHS[:1], WIDE_K, WIDE),
     ],
     per_row=2,
     unit="m",
@@ -500,8 +563,12 @@ def not_scaled(x: Array, y: Array, depth: Array) -> Any:
     return x, y, depth
 
 
-@DEPROJECT.mistake("unbend", "the distortion is ignored", "What does your function do with `dist`?")
-def coefficients_ignored(x: Array, y: Array, dist: Array) -> Any:
+@DEPROJECT.mistake(
+    "unbend",
+    "the pinhole part is right, and the distortion is ignored",
+    "That is the core of the exercise. What could your function do with `dist`?",
+)
+def coefficients_ignored(x: Array, y: Array, *dist: float) -> Any:
     return x, y
 
 
@@ -510,7 +577,7 @@ def coefficients_ignored(x: Array, y: Array, dist: Array) -> Any:
     "the distortion is applied once more instead of being inverted",
     "Project your answer. Do you come back to the pixel that you started from?",
 )
-def distorted_again(x: Array, y: Array, dist: Array) -> Any:
+def distorted_again(x: Array, y: Array, *dist: float) -> Any:
     return _bend(x, y, *dist)
 
 
@@ -521,13 +588,12 @@ _ONE_STEP = (
 
 
 @DEPROJECT.mistake("unbend", *_ONE_STEP, name="one_step")
-def one_step(x: Array, y: Array, dist: Array) -> Any:
-    bent_x, bent_y = _bend(x, y, *dist)
-    return 2 * x - bent_x, 2 * y - bent_y
+def one_step(x: Array, y: Array, *dist: float) -> Any:
+    return _iterate(1)(x, y, *dist)
 
 
 @DEPROJECT.mistake("unbend", *_ONE_STEP, name="one_step")
-def one_division(x: Array, y: Array, dist: Array) -> Any:
+def one_division(x: Array, y: Array, *dist: float) -> Any:
     k1, k2, p1, p2, k3 = dist
     r2 = x * x + y * y
     radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
@@ -537,6 +603,60 @@ def one_division(x: Array, y: Array, dist: Array) -> Any:
     )
 
 
+def _overwritten(rounds: int) -> Step:
+    """The iteration when xd and x are one array, which `x += ...` changes."""
+
+    def unbend(x: Array, y: Array, *dist: float) -> Any:
+        for _ in range(rounds):
+            bent_x, bent_y = _bend(x, y, *dist)
+            x, y = 2 * x - bent_x, 2 * y - bent_y
+        return x, y
+
+    return unbend
+
+
+for _rounds in (2, 3, 4, 5, 6, 7, 8):
+    DEPROJECT.mistake(
+        "unbend",
+        "the iteration stops too early",
+        "Print how much x changes in the last round. When may you stop?",
+        name="too_few_rounds",
+    )(_iterate(_rounds))
+
+for _rounds in (2, 3, 4, 5, 10, 15, 20, 25, 30, 40, 50, 100):
+    DEPROJECT.mistake(
+        "unbend",
+        "the iteration overwrites the point it is looking for",
+        "After `x = xd` both names stand for one array, and `x += ...` changes that array.",
+        name="target_overwritten",
+    )(_overwritten(_rounds))
+
+
+@DEPROJECT.mistake("read", "your p1 and p2 are swapped", "Which of the two multiplies r² + 2x²?",
+                   name="p1_p2_swapped")  # fmt: skip
+def p1_p2_swapped_back(k1: float, k2: float, p1: float, p2: float, k3: float) -> Any:
+    return k1, k2, p2, p1, k3
+
+
+@DEPROJECT.mistake(
+    "read",
+    "the coefficients are read as (k1, k2, k3, p1, p2)",
+    "OpenCV added k3 when the other four were already there. At which end?",
+    name="k3_before_p1",
+)
+def k3_before_p1_back(k1: float, k2: float, p1: float, p2: float, k3: float) -> Any:
+    return k1, k2, p2, k3, p1
+
+
+@DEPROJECT.mistake(
+    "scale",
+    "the depth is forgotten: Z is 1 everywhere",
+    "Your points lie on a plane at 1 m. What says how far along its ray each of them is?",
+)
+def depth_forgotten(x: Array, y: Array, depth: Array) -> Any:
+    return x, y, np.ones_like(depth)
+
+
 EXERCISES = [PROJECT, DEPROJECT]
 
 # --- checkpoints ---
@@ -544,8 +664,8 @@ EXERCISES = [PROJECT, DEPROJECT]
 CHECKPOINTS = [
     Choice(
         name="pinhole.twice_as_far",
-        question="A point is 30 px right of the principal point. It moves straight away from the "
-        "camera, along Z, to twice its depth. Where is its image now?",
+        question="The image of a point is 30 px right of the optical axis. The point moves "
+        "straight away from the camera, along Z, to twice its depth. Where is its image now?",
         options=(
             Option(
                 "30 px right of it",
@@ -554,7 +674,7 @@ CHECKPOINTS = [
             ),
             Option(
                 "15 px right of it",
-                "u - cx = fx X / Z: X stays, Z doubles, the offset halves. That is why distant "
+                "x = f X / Z: X stays, Z doubles, the offset halves. That is why distant "
                 "things look small and why one pixel covers more of them.",
                 right=True,
             ),
@@ -574,8 +694,8 @@ CHECKPOINTS = [
         "The sensor is replaced by one with 5 µm pixels. What is fx now, in px?",
         value=2000.0,
         unit="px",
-        why="fx = f / pitch = 0.010 m / 0.000005 m. The lens has not changed, and neither has the "
-        "field of view of each millimetre of sensor; the ruler that measures f has.",
+        why="fx = f / pitch = 10 mm / 0.005 mm per px. The lens has not changed; the ruler that "
+        "measures its focal length has become twice as fine.",
         hint="fx is the focal length measured in pixels: f divided by the pixel pitch.",
         classics=(
             Classic(1000.0, "The lens is the same, but fx counts *pixels*, and those are smaller."),
@@ -629,8 +749,8 @@ CHECKPOINTS = [
     ),
     Choice(
         name="pinhole.exact_centre",
-        question="A calibration of a 640x480 camera returns the principal point (319.5, 239.5), "
-        "exact to the last digit. What do you conclude?",
+        question="A calibration program returns the principal point (319.5, 239.5) px for a "
+        "640x480 camera, exact to the last digit. What do you conclude?",
         options=(
             Option(
                 "an excellent lens",
@@ -638,15 +758,15 @@ CHECKPOINTS = [
                 "cameras in this course are 0.4 to 23 px off centre.",
             ),
             Option(
-                "nothing was estimated: that is the image centre, held fixed",
+                "nothing was estimated: that is the image centre, put in by hand",
                 "(640 - 1) / 2 = 319.5 is the centre when (0, 0) is the centre of the first pixel. "
                 "A number that was *measured* has digits that nobody would choose.",
                 right=True,
             ),
             Option(
-                "the image was rectified",
-                "Rectified streams have a principal point of their own, and it is as crooked as "
-                "any: this camera's depth stream is an example.",
+                "the camera had already straightened the image",
+                "Straightened (*rectified*) images have a principal point of their own, and it is "
+                "as crooked as any: the depth stream above is one.",
             ),
             Option(
                 "the calibration is half a pixel off: the centre is (320, 240)",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -33,19 +34,19 @@ class Draggable:
         """Sliders above an image that is drawn again at every step of a drag."""
         import ipywidgets
 
-        fields = {
-            name: ipywidgets.FloatSlider(
+        fields = {}
+        for name, (low, high, start) in self.sliders.items():
+            step = 10.0 ** math.floor(math.log10((high - low) / 50))
+            fields[name] = ipywidgets.FloatSlider(
                 value=start,
-                min=low,
-                max=high,
-                step=(high - low) / 100,
+                min=start - step * math.floor((start - low) / step),  # a slider counts from here
+                max=start + step * math.floor((high - start) / step),
+                step=step,
                 description=label(name),
-                readout_format=".3g",
+                readout_format=f".{max(0, -round(math.log10(step)))}f",
                 style={"description_width": "11em"},
                 layout=ipywidgets.Layout(width="32em"),
             )
-            for name, (low, high, start) in self.sliders.items()
-        }
         first = self.start()
         image = ipywidgets.Image(value=first.png(), format="png")
         image.layout.max_width = "100%"

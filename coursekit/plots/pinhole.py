@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.colors import LogNorm
 
 from coursekit import geometry
 from coursekit.geometry import Intrinsics
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     from coursekit.cameras import Frame
     from coursekit.simulation.scenes import Box
 
+DISPLACEMENT_PX = 0.1, 120.0  # the colour scale of `displacement`
+SLICE_M = 0.015  # half the height of the slice in `point_cloud`
 POINT_X_M = 0.10  # how far right of the axis the point of `similar_triangles` is
 
 
@@ -24,12 +27,12 @@ def similar_triangles(focal_length_mm: float = 1.93, depth_m: float = 0.45) -> L
     """The two similar triangles seen from above, and the spot on the sensor.
 
     focal_length_mm: lens to image plane, mm. depth_m: Z of a point 100 mm right of the axis, m.
-    The image plane is drawn 40 times too far from the pinhole, or nobody would see it.
+    The image plane is drawn 80 times too far from the pinhole, or nobody would see it.
     """
     x_mm = focal_length_mm * POINT_X_M / depth_m
     fig = figure(9.0, 3.8)
     above, sensor = fig.subplots(1, 2, width_ratios=[2.4, 1])
-    _triangles(above, 0.040 * focal_length_mm, depth_m)
+    _triangles(above, 0.080 * focal_length_mm, depth_m)
     sensor.axhline(0, color=COLORS["faint"], lw=1)
     sensor.axvline(0, color=COLORS["faint"], lw=1)
     sensor.plot([x_mm], [0], "o", color=COLORS["measured"], ms=10)
@@ -51,15 +54,16 @@ def _triangles(ax: Any, plane_m: float, depth_m: float) -> None:
     ax.fill([0, depth_m, depth_m], [0, 0, POINT_X_M], color=COLORS["depth"], alpha=0.25)
     ax.fill([0, plane_m, plane_m], [0, 0, inner], color=COLORS["measured"], alpha=0.5)
     ax.plot([0, depth_m], [0, POINT_X_M], color=COLORS["model"])
-    ax.plot([plane_m, plane_m], [-0.16, 0.16], color=COLORS["ink"], lw=1.5)
+    ax.plot([plane_m, plane_m], [-0.13, 0.13], color=COLORS["ink"], lw=1.5)
     ax.plot([depth_m], [POINT_X_M], "o", color=COLORS["truth"], ms=9)
-    ax.plot([plane_m], [inner], "o", color=COLORS["measured"], ms=9)
+    ax.plot([plane_m], [inner], "o", color=COLORS["measured"], ms=7)
     ax.plot([0], [0], "o", color=COLORS["ink"])
-    ax.text(-0.03, 0.012, "pinhole", ha="right")
-    ax.text(plane_m + 0.02, -0.155, "image plane\n(40 times too far out)")
+    ax.text(-0.02, -0.012, "pinhole", ha="right")
+    ax.text(plane_m + 0.01, -0.115, "image plane\n(80 times too far out)")
     point = f"P: X = {1000 * POINT_X_M:.0f} mm"
-    ax.text(depth_m, POINT_X_M + 0.015, point, ha="center", color=COLORS["truth"])
-    ax.set(xlim=(-0.3, 2.1), ylim=(-0.18, 0.18), xlabel="Z (m)", ylabel="X (m)")
+    ax.text(depth_m, POINT_X_M + 0.025, point, ha="center", color=COLORS["truth"])
+    # Seen from above with Z to the right, the camera's right hand is towards the bottom.
+    ax.set(xlim=(-0.2, 1.3), ylim=(0.15, -0.15), xlabel="Z (m)", ylabel="X (m), to the right")
     ax.set_title("from above: two triangles with the same angle")
 
 
@@ -92,13 +96,13 @@ def entries_of_K(scene: tuple[Box, ...], camera: Intrinsics, **moved: float) -> 
     changed = Intrinsics.from_dict(camera.to_dict() | moved)
     fig = figure(8.0, 4.8)
     ax = fig.subplots()
-    for intrinsics, color, name in (
-        (camera, COLORS["model"], "K of the camera"),
-        (changed, COLORS["measured"], "your K"),
+    for intrinsics, color, style, name in (
+        (camera, COLORS["model"], "-", "K of the camera"),
+        (changed, COLORS["measured"], "--", "your K"),
     ):
         for line in _edges(scene):
-            ax.plot(*geometry.project(line, intrinsics.K).T, color=color, lw=1.5)
-        ax.plot([], [], color=color, label=name)
+            ax.plot(*geometry.project(line, intrinsics.K).T, style, color=color, lw=1.5)
+        ax.plot([], [], style, color=color, label=name)
         ax.plot(intrinsics.cx, intrinsics.cy, "+", color=color, ms=14, mew=2)
     ax.plot([], [], "+", color=COLORS["ink"], ms=12, label="principal point")
     _image_axes(ax, camera)
@@ -161,6 +165,7 @@ def same_pixel(near_m: float, near_size_m: float, far_m: float, K: NDArray[Any])
         ax.plot([0, reach], [0, sign * far_size / 2 * reach / far_m], color=COLORS["model"], lw=1.5)
     ax.plot(0, 0, "o", color=COLORS["ink"])
     ax.set(xlabel="Z (m)", ylabel="X (m)", title=f"both are {pixels:.1f} px wide in the image")
+    ax.invert_yaxis()  # from above, the camera's right hand is towards the bottom
     fig.legend(loc="outside lower center", ncols=2)
     fig.alt = (
         f"Two objects between the same two rays: {1000 * near_size_m:.0f} mm wide at {near_m:.4g} m"
@@ -170,28 +175,32 @@ def same_pixel(near_m: float, near_size_m: float, far_m: float, K: NDArray[Any])
 
 
 def displacement(lenses: Mapping[str, Intrinsics]) -> LessonFigure:
-    """How far distortion moves each pixel, in px, one map a lens; arrows not to scale."""
+    """How far distortion moves each pixel, in px, one map a lens, all to one scale."""
     columns = 2
     rows = -(-len(lenses) // columns)
-    fig = figure(8.5, 3.3 * rows)
+    fig = figure(8.5, 3.1 * rows)
     axes = np.atleast_1d(fig.subplots(rows, columns)).ravel()
     texts = []
     for ax, (name, lens) in zip(axes, lenses.items(), strict=False):
         shift, size = displacement_px(lens)
-        shown = ax.imshow(size, extent=(-0.5, lens.width - 0.5, lens.height - 0.5, -0.5))
-        fig.colorbar(shown, ax=ax, label="px", shrink=0.8)
+        shown = ax.imshow(
+            np.maximum(size, DISPLACEMENT_PX[0]),
+            extent=(-0.5, lens.width - 0.5, lens.height - 0.5, -0.5),
+            norm=LogNorm(*DISPLACEMENT_PX),
+        )
         step = lens.width // 9
-        grid = geometry.pixel_grid(*lens.size)[step // 2 :: step, step // 2 :: step]
-        arrows = shift[step // 2 :: step, step // 2 :: step]
-        ax.quiver(*np.moveaxis(grid, -1, 0), *np.moveaxis(arrows, -1, 0),
-                  angles="xy", color="white", width=0.004)  # fmt: skip
+        some = slice(step // 2, None, step)
+        grid, arrows = geometry.pixel_grid(*lens.size)[some, some], shift[some, some]
+        ax.quiver(*np.moveaxis(grid, -1, 0), *np.moveaxis(arrows, -1, 0), angles="xy",
+                  scale_units="xy", scale=1, color="white", width=0.005)  # fmt: skip
         edge, corner = edge_and_corner(size)
-        said = f"{edge:.1f} px at the edges, {corner:.1f} px in the corners"
-        ax.set_title(f"{name}\nedges {edge:.1f} px, corners {corner:.1f} px", fontsize=10)
+        ax.set_title(f"{name}\nedge {edge:.1f} px, corner {corner:.1f} px", fontsize=10)
         _image_axes(ax, lens)
-        texts.append(f"{name}, {said}")
+        texts.append(f"{name}, {edge:.1f} px at an edge, {corner:.1f} px in a corner")
     for ax in axes[len(lenses) :]:
         ax.set_visible(False)
+    bar = fig.colorbar(shown, ax=list(axes), label="displacement (px)", shrink=0.6)
+    bar.set_ticks([0.1, 1, 10, 100], labels=["0.1", "1", "10", "100"])
     fig.alt = "Maps of the displacement by distortion: " + "; ".join(texts) + "."
     return fig
 
@@ -205,7 +214,7 @@ def displacement_px(lens: Intrinsics) -> tuple[NDArray[np.float64], NDArray[np.f
 
 
 def edge_and_corner(size: NDArray[np.float64]) -> tuple[float, float]:
-    """The largest displacement at the middle of an edge, and in a corner, px."""
+    """The largest displacement at the middle of the four edges, and in the four corners, px."""
     height, width = size.shape
     edge = max(
         size[height // 2, 0], size[height // 2, -1], size[0, width // 2], size[-1, width // 2]
@@ -234,36 +243,41 @@ def frame(shot: Frame) -> LessonFigure:
     return fig
 
 
-def point_cloud(
-    points: NDArray[np.float32], colors: NDArray[np.uint8] | None = None
-) -> LessonFigure:
-    """A point cloud (H, W, 3) in m, from beside the camera and from above; NaN points are left out.
+def point_cloud(points: NDArray[np.float32]) -> LessonFigure:
+    """A point cloud (H, W, 3) in m: from beside the camera, and a slice of it from above.
 
-    colors (H, W, 3): RGB of each point; without it, colour is depth.
+    Points are coloured by depth; NaN points are left out. The slice holds the points at most
+    SLICE_M above or below the optical axis.
     """
-    seen = np.isfinite(points).all(axis=-1)
-    some = np.random.default_rng(0).permutation(int(seen.sum()))[:30_000]  # a stride makes moiré
-    cloud = points[seen][some]
-    look: dict[str, Any] = {"s": 2, "linewidths": 0}
-    look["c"] = cloud[:, 2] if colors is None else colors[seen][some] / 255
-    fig = figure(9.0, 3.8)
+    cloud = points[np.isfinite(points).all(axis=-1)]
+    some = np.random.default_rng(0).permutation(len(cloud))[:30_000]  # a stride makes moiré
+    fig = figure(9.0, 4.2)
     fig.set_layout_engine("none")  # the 3-D axes reserve far more room than they use
-    solid: Any = fig.add_axes((0.0, 0.0, 0.5, 0.98), projection="3d")
-    solid.scatter(cloud[:, 0], cloud[:, 2], -cloud[:, 1], depthshade=False, **look)
-    solid.set(xlabel="X (m)", ylabel="Z (m)", zlabel="-Y (m)")
-    solid.locator_params(nbins=4)
-    solid.locator_params(axis="y", nbins=2)
-    solid.view_init(elev=18, azim=-70)
-    solid.set_box_aspect(np.maximum(np.ptp(cloud[:, [0, 2, 1]], axis=0), 0.05), zoom=0.85)
-    above = fig.add_axes((0.6, 0.15, 0.38, 0.7))
-    above.scatter(cloud[:, 0], cloud[:, 2], **look)
-    above.set(xlabel="X (m)", ylabel="Z (m)", title="from above", aspect="equal")
+    _solid(fig.add_axes((0.0, 0.0, 0.48, 0.94), projection="3d"), cloud[some])
+    above = fig.add_axes((0.57, 0.14, 0.41, 0.74))
+    flat = cloud[np.abs(cloud[:, 1]) < SLICE_M]
+    above.scatter(flat[:, 0], flat[:, 2], s=3, c=flat[:, 2], linewidths=0)
+    above.plot(0, 0, "v", color=COLORS["ink"], ms=9)
+    above.annotate("camera", (0, 0), (8, 4), textcoords="offset points")
+    above.set(xlabel="X (m)", ylabel="Z (m)", aspect="equal", ylim=(-0.05, None))
+    above.set_title(f"from above, |Y| < {1000 * SLICE_M:.0f} mm")
     low, high = cloud.min(axis=0), cloud.max(axis=0)
     fig.alt = (
-        f"Point cloud of {int(seen.sum())} points, X from {low[0]:.2f} to {high[0]:.2f} m, "
-        f"Z from {low[2]:.2f} to {high[2]:.2f} m, from beside the camera and from above."
+        f"Point cloud of {len(cloud)} points, X from {low[0]:.2f} to {high[0]:.2f} m, Z from "
+        f"{low[2]:.2f} to {high[2]:.2f} m, and a slice of {len(flat)} points from above."
     )
     return fig
+
+
+def _solid(ax: Any, cloud: NDArray[np.float32]) -> None:
+    ax.scatter(cloud[:, 0], cloud[:, 2], -cloud[:, 1], s=2, c=cloud[:, 2], linewidths=0,
+               depthshade=False)  # fmt: skip
+    ax.set(xlabel="X (m)", zlabel="-Y (m)", title="from beside the camera")
+    ax.set_ylabel("Z (m)", labelpad=12)
+    ax.locator_params(nbins=4)
+    ax.locator_params(axis="y", nbins=2)
+    ax.view_init(elev=18, azim=-70)
+    ax.set_box_aspect(np.maximum(np.ptp(cloud[:, [0, 2, 1]], axis=0), 0.05), zoom=0.85)
 
 
 def _image_axes(ax: Any, camera: Intrinsics) -> None:

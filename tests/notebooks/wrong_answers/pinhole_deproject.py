@@ -177,7 +177,7 @@ def y_up_and_along_the_ray(pixels, depth, K, dist=None):
     return np.column_stack([x * scale, y * scale, scale])
 
 
-@wrong(None, "vectorised")
+@wrong("too_few_rounds", "vectorised")
 def two_rounds_are_too_few(pixels, depth, K, dist=None):
     x, y = seen = np.array(_seen(pixels, K))
     for _ in range(0 if dist is None else 2):
@@ -195,3 +195,40 @@ def depth_times_columns(pixels, depth, K, dist=None):
 def K_times_columns(pixels, depth, K, dist=None):
     rays = np.linalg.inv(K) @ np.column_stack([pixels, np.ones(len(pixels))])
     return rays * depth[:, None]
+
+
+@wrong("target_overwritten", "in-place sums")
+def twenty_rounds_on_one_array(pixels, depth, K, dist=None):
+    xd, yd = (np.array(a) for a in _seen(pixels, K))
+    x, y = xd, yd
+    for _ in range(0 if dist is None else 20):
+        bent_x, bent_y = _bent(x, y, dist)
+        x += xd - bent_x
+        y += yd - bent_y
+    return np.column_stack([x * depth, y * depth, depth])
+
+
+@wrong("p1_p2_swapped", "vectorised")
+def tangential_coefficients_swapped(pixels, depth, K, dist=None):
+    swapped = None if dist is None else dist[[0, 1, 3, 2, 4]]
+    x, y = _straight(*_seen(pixels, K), swapped)
+    return np.column_stack([x * depth, y * depth, depth])
+
+
+@wrong("k3_before_p1", "loop over lists")
+def radial_coefficients_first(pixels, depth, K, dist=None):
+    out = []
+    for pixel, z in zip(pixels, depth, strict=True):
+        if dist is not None:
+            k1, k2, k3, p1, p2 = dist
+            x, y = _straight(*_seen(pixel[None], K), np.array([k1, k2, p1, p2, k3]))
+        else:
+            x, y = _seen(pixel[None], K)
+        out.append([x[0] * z, y[0] * z, z])
+    return out
+
+
+@wrong("depth_forgotten", "vectorised")
+def rays_only(pixels, depth, K, dist=None):
+    x, y = _straight(*_seen(pixels, K), dist)
+    return np.column_stack([x, y, np.ones_like(x)])

@@ -342,3 +342,48 @@ def none_unpacked(points, K, dist=None):
 def points_not_transposed(points, K, dist=None):
     uvw = K @ points
     return (uvw[:2] / uvw[2]).T
+
+
+@wrong("divided_by_range", "vectorised")
+def divided_by_distance(points, K, dist=None):
+    rays = points / np.linalg.norm(points, axis=1)[:, None]
+    rays[:, 2] = 1
+    return cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, dist)[0][:, 0]
+
+
+@wrong("fx_for_both", "vectorised")
+def one_focal_length(points, K, dist=None):
+    square = K.copy()
+    square[1, 1] = K[0, 0]
+    return cv2.projectPoints(points, np.zeros(3), np.zeros(3), square, dist)[0][:, 0]
+
+
+@wrong("centre_before_scale", "loop over lists")
+def centre_inside_the_bracket(points, K, dist=None):
+    out = []
+    for X, Y, Z in points:
+        ideal = np.array([[X / Z, Y / Z, 1.0]])
+        if dist is not None:
+            bent = cv2.projectPoints(ideal, np.zeros(3), np.zeros(3), np.eye(3), dist)[0].ravel()
+        else:
+            bent = ideal[0, :2]
+        out.append([K[0, 0] * (bent[0] + K[0, 2]), K[1, 1] * (bent[1] + K[1, 2])])
+    return out
+
+
+@wrong("K_transposed", "homogeneous product")
+def points_times_K(points, K, dist=None):
+    rays = points / points[:, 2:]
+    if dist is not None:
+        rays[:, :2] = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), np.eye(3), dist)[0][:, 0]
+    uvw = rays @ K
+    return uvw[:, :2] / uvw[:, 2:]
+
+
+@wrong("bent_before_division", "vectorised")
+def bends_the_metres(points, K, dist=None):
+    flat = np.column_stack([points[:, :2], np.ones(len(points))])
+    if dist is not None:
+        flat = cv2.projectPoints(flat, np.zeros(3), np.zeros(3), np.eye(3), dist)[0][:, 0]
+    xy = flat[:, :2] / points[:, 2:]
+    return xy * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]]
