@@ -9,8 +9,17 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from coursekit import cameras, geometry, lessons, plots, results, simulation, specifications
-    from coursekit.cameras import open_camera
+    from coursekit import (
+        cameras,
+        geometry,
+        lessons,
+        plots,
+        results,
+        simulation,
+        specifications,
+        stereo,
+    )
+    from coursekit.cameras import open_camera, place
     from coursekit.lessons import check, checkpoint, evidence
     from coursekit.plots import drag
 
@@ -23,14 +32,17 @@ __all__ = [
     "geometry",
     "lessons",
     "open_camera",
+    "place",
     "plots",
     "results",
     "simulation",
     "specifications",
+    "stereo",
 ]
 
 _FUNCTIONS = {
     "open_camera": "coursekit.cameras",
+    "place": "coursekit.cameras",
     "check": "coursekit.lessons",
     "checkpoint": "coursekit.lessons",
     "evidence": "coursekit.lessons",

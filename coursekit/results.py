@@ -6,11 +6,12 @@ came from, so that the error budget can say whose numbers it uses.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -18,6 +19,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from coursekit.cameras import Camera
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -99,12 +102,30 @@ def load(lesson: str) -> Result:
         raise ValueError(f"{path.name}: {error}. Run notebook {lesson} again.") from error
 
 
+def save_arrays(lesson: str, **arrays: np.ndarray) -> Path:
+    """Write the raw measurements behind a result to `results/<lesson>.npz`, in one step."""
+    import numpy as np
+
+    path = _path(lesson).with_suffix(".npz")
+    with _whole(path) as part, part.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+    return path
+
+
 def write_json(path: Path, content: Any) -> None:
     """Write JSON to a file beside `path`, then rename it: never half a file."""
+    text = json.dumps(content, indent=1, allow_nan=False) + "\n"
+    with _whole(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+@contextlib.contextmanager
+def _whole(path: Path) -> Iterator[Path]:
+    """A file to write beside `path`, which becomes `path` if all goes well."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        part.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        yield part
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import tomllib
 from dataclasses import dataclass
@@ -19,7 +20,10 @@ DATA = Path(__file__).resolve().parents[1] / "data"
 
 @dataclass(frozen=True)
 class Nominal:
-    """What a data sheet says of a depth camera: fields of view in degrees, lengths in metres."""
+    """What a data sheet says of a depth camera: fields of view in degrees, lengths in metres.
+
+    glass_m: from Z = 0 forward to the front glass, where a tape measure starts.
+    """
 
     depth_hfov_deg: float
     depth_vfov_deg: float
@@ -27,6 +31,7 @@ class Nominal:
     color_vfov_deg: float
     baseline_m: float
     depth_scale_m: float
+    glass_m: float
     source: str
 
     def depth_fx_px(self, width: int = 848) -> float:
@@ -52,9 +57,10 @@ class Unit:
 
 @dataclass(frozen=True, eq=False)
 class Device:
-    """A depth camera: its name, its data sheet and one representative unit."""
+    """A depth camera: its name, whether it projects dots, its data sheet, a representative unit."""
 
     name: str
+    projector: bool
     nominal: Nominal
     unit: Unit
 
@@ -69,6 +75,36 @@ class Lens:
     source: str
 
 
+@dataclass(frozen=True)
+class PublishedNoise:
+    """Depth noise of a real camera as somebody published it: std_mm at distances_m.
+
+    quantity: of what it is the standard deviation; compare like with like.
+    """
+
+    camera: str
+    quantity: str
+    distances_m: tuple[float, ...]
+    std_mm: tuple[float, ...]
+    source: str
+
+
+def published_noise(folder: Path = DATA) -> list[PublishedNoise]:
+    """The published series of depth noise against distance in published_depth_noise.json."""
+    series = json.loads((folder / "published_depth_noise.json").read_text("utf-8"))["series"]
+    return [
+        PublishedNoise(
+            entry["camera"],
+            entry["quantity"],
+            tuple(entry["distances_m"]),
+            tuple(entry["std_mm"]),
+            entry["source"],
+        )
+        for entry in series
+        if "std_mm" in entry
+    ]
+
+
 def device(name: str, folder: Path = DATA) -> Device:
     """The depth camera of this name, e.g. "D435".
 
@@ -77,7 +113,12 @@ def device(name: str, folder: Path = DATA) -> Device:
     """
     table = _entry("device", name, folder / "devices.toml")
     try:
-        return Device(_text(table, "name"), _nominal(table["nominal"]), _unit(table["unit"]))
+        return Device(
+            _text(table, "name"),
+            _flag(table, "projector"),
+            _nominal(table["nominal"]),
+            _unit(table["unit"]),
+        )
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{folder / 'devices.toml'}, [{name}]: {_reason(error)}") from error
 
@@ -155,6 +196,13 @@ def _text(table: dict[str, Any], key: str) -> str:
     value = table[key]
     if not isinstance(value, str) or not value.strip():
         raise ValueError(f"{key}: got {value!r}, want text")
+    return value
+
+
+def _flag(table: dict[str, Any], key: str) -> bool:
+    value = table[key]
+    if not isinstance(value, bool):
+        raise ValueError(f"{key}: got {value!r}, want true or false")
     return value
 
 

@@ -46,8 +46,11 @@ class FakeSensor:
         self.set_calls.append((option, value))
         self.options[option] = value
 
+    def is_option_read_only(self, option: str) -> bool:
+        return False
+
     def get_depth_scale(self) -> float:
-        return float(np.float32(0.001))
+        return float(np.float32(self.options.get("depth_units", 0.001)))
 
 
 class FakeProfile:
@@ -126,7 +129,13 @@ class FakeRealSense:
         self.query_error: str | None = None
         self.depth_sensor = FakeSensor(
             True,
-            {"enable_auto_exposure": 1, "exposure": 33000, "gain": 16, "stereo_baseline": 50.17},
+            {
+                "enable_auto_exposure": 1,
+                "exposure": 33000,
+                "gain": 16,
+                "stereo_baseline": 50.17,
+                "depth_units": 0.001,
+            },
         )
         self.color_sensor = FakeSensor(
             False,
@@ -200,7 +209,12 @@ class _Pipeline:
         number = (rs.given + 1) // 2 if rs.color_late else rs.given
         depth = FakeImage(number, np.full((480, 848), 400 + number % 7, np.uint16))
         color = FakeImage(number, np.full((480, 640, 3), 128, np.uint8))
-        return True, SimpleNamespace(get_depth_frame=lambda: depth, get_color_frame=lambda: color)
+        eyes = [FakeImage(number, np.full((480, 848), 50 * eye, np.uint8)) for eye in (1, 2)]
+        return True, SimpleNamespace(
+            get_depth_frame=lambda: depth,
+            get_color_frame=lambda: color,
+            get_infrared_frame=lambda eye: eyes[eye - 1],
+        )
 
     def stop(self) -> None:
         self._rs.stops += 1

@@ -219,6 +219,116 @@ def test_ctrl_c_while_waiting_for_a_frame(plug_in, capsys):
     assert capsys.readouterr().out == "Stopped after 4 of 100 frames; they are kept.\n"
 
 
+# --- infrared, placing, settings ---
+
+
+def test_infrared_only_if_asked(plug_in):
+    rs = plug_in()
+    with open_camera() as camera:
+        assert camera.frame().infrared is None
+    assert len(rs.enabled) == 3
+    with open_camera(infrared=True) as camera:
+        left, right = camera.frame().infrared
+    assert rs.enabled[-2:] == [("infrared", eye, 848, 480, "y8", 30) for eye in (1, 2)]
+    assert (left.dtype, left.shape, left[0, 0], right[0, 0]) == (np.uint8, (480, 848), 50, 100)
+
+
+@pytest.mark.parametrize(
+    ("name", "instruction"),
+    [
+        ("60 mm block", "Put the 60 mm block on the table, its front face square to the camera, "),
+        ("wall", "Point the camera at a bland wall that fills the image, turned by about 7 degr"),
+        ("mug", "Put the mug "),
+    ],
+)
+def test_placing_tells_the_person_and_waits(plug_in, monkeypatch, capsys, name, instruction):
+    rs = plug_in()
+    asked = []
+    monkeypatch.setattr("builtins.input", lambda prompt: asked.append((prompt, rs.given)) or "")
+    with open_camera() as camera:
+        assert camera.can_place
+        camera.place(name, 0.45)
+        said = capsys.readouterr().out
+        assert said.startswith(instruction)
+        # The data sheet's Z = 0 of a D435 is 4.2 mm behind its glass.
+        assert "446 mm from the camera's front glass by tape measure" in said
+        assert said.count("\n") == 1
+        assert asked == [("Press Enter when it stands there", 30)]
+        assert camera.frame().number == 30 + 30 + 1  # not one from before
+
+
+def test_ctrl_c_while_placing_passes_through(plug_in, monkeypatch):
+    plug_in()
+
+    def interrupted(prompt):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("builtins.input", interrupted)
+    with open_camera() as camera:
+        with pytest.raises(KeyboardInterrupt):
+            camera.place("wall", 1.0)
+        assert camera.frame().number == 31
+
+
+def test_a_bad_distance_is_refused_before_anybody_is_asked(plug_in, monkeypatch):
+    plug_in()
+    monkeypatch.setattr("builtins.input", lambda prompt: pytest.fail("asked"))
+    with open_camera() as camera, pytest.raises(ValueError, match=r"^distance_m: got -1"):
+        camera.place("wall", -1)
+
+
+def test_the_depth_unit_is_set_with_the_camera_stopped(plug_in):
+    rs = plug_in()
+    with open_camera() as camera:
+        assert camera.set(depth_scale_m=1e-4) == "Depth unit set to 0.1 mm."
+        assert (rs.starts, rs.stops) == (2, 1)
+        assert rs.depth_sensor.set_calls == [("depth_units", 1e-4)]
+        assert camera.depth_scale_m == camera.frame().depth_scale_m == 1e-4
+        with pytest.raises(ValueError, match=r"^depth_scale_m: got 1"):
+            camera.set(depth_scale_m=1)
+
+
+def test_light_and_exposure_are_the_persons(plug_in):
+    rs = plug_in()
+    with open_camera() as camera:
+        sentence = camera.set(ambient=0.05, exposure=5.0)
+        assert sentence.startswith("The room's light is yours to change")
+        assert "exposure stays: lock()" in sentence
+        assert camera.set() == "Nothing to change."
+    assert rs.depth_sensor.set_calls == []
+    assert rs.starts == 1
+
+
+def test_a_camera_without_other_units_keeps_its_own(plug_in):
+    rs = plug_in()
+    del rs.depth_sensor.options["depth_units"]
+    with open_camera() as camera:
+        sentence = camera.set(depth_scale_m=1e-4)
+        assert sentence == "Depth unit stays 1 mm: this camera has no other."
+        assert camera.depth_scale_m == 0.001
+
+
+@pytest.mark.parametrize("silently", [False, True])
+def test_a_depth_unit_that_is_refused(plug_in, monkeypatch, silently):
+    rs = plug_in()
+
+    def refuse(option, value):
+        if not silently:
+            raise RuntimeError("hwmon command failed")
+
+    monkeypatch.setattr(rs.depth_sensor, "set_option", refuse)
+    with open_camera() as camera:
+        with pytest.raises(CameraError, match="keeps its depth unit of 1 mm"):
+            camera.set(depth_scale_m=1e-4)
+        assert camera.frame().depth_scale_m == 0.001  # still streaming
+
+
+def test_nobody_knows_a_real_cameras_truth(plug_in):
+    plug_in()
+    with open_camera() as camera, pytest.raises(CameraError, match="nobody knows the true geom"):
+        camera.reveal()
+
+
 # --- lock ---
 
 

@@ -29,7 +29,9 @@ def rs():
 class RandomCamera(Camera):
     """Small frames of seeded random pixels, with generic calibration; ends after `n` of them."""
 
-    def __init__(self, n=10, color=True, baseline_m=0.0501707, scale_m=0.0001, size=(64, 48)):
+    def __init__(
+        self, n=10, color=True, baseline_m=0.0501707, scale_m=0.0001, size=(64, 48), infrared=False
+    ):
         self.name, self.source, self.serial = "Test D405", "simulated", "218622273411"
         k = (0.154, -0.249, 0.0035, -0.0011, 0.0625)
         width, height = size
@@ -44,6 +46,7 @@ class RandomCamera(Camera):
             rotation = [[1, 0, 0], [0, angles[0], -angles[1]], [0, angles[1], angles[0]]]
             self.T_color_depth = make_transform(rotation, [0.0143113, 0.0006023, -0.1234567])
         self.baseline_m, self.depth_scale_m, self.n = baseline_m, scale_m, n
+        self.infrared = infrared
 
     def _stream(self):
         rng = np.random.default_rng(11)
@@ -53,10 +56,13 @@ class RandomCamera(Camera):
             if self.color is not None:
                 shape = (self.color.height, self.color.width, 3)
                 color = rng.integers(0, 256, shape, np.uint8)
+            pair = None
+            if self.infrared:
+                pair = tuple(rng.integers(0, 256, (2, *depth.shape), np.uint8))
             time_s = 1000.0 + number / 30
             yield Frame(
                 depth, color, self.depth_scale_m, time_s, 7 * number, self.depth, self.color,
-                self.T_color_depth,
+                self.T_color_depth, pair,
             )  # fmt: skip
 
     def lock(self):
@@ -108,6 +114,26 @@ def test_round_trip(rs, tmp_path, color):
         else:
             assert theirs.color is None
     assert [entry.name for entry in tmp_path.iterdir()] == ["all.db3"]
+
+
+@pytest.mark.parametrize("color", [True, False])
+def test_infrared_round_trip(rs, tmp_path, color):
+    camera = RandomCamera(n=12, color=color, infrared=True)
+    with open_camera(camera.record(tmp_path / "a.db3", 12, infrared=True)) as played:
+        for _ in range(3):
+            for mine, theirs in zip(camera._stream(), played.frames(12), strict=True):
+                assert theirs.number == mine.number
+                np.testing.assert_array_equal(theirs.depth, mine.depth)
+                np.testing.assert_array_equal(theirs.infrared, mine.infrared)
+                if color:
+                    np.testing.assert_array_equal(theirs.color, mine.color)
+
+
+@pytest.mark.parametrize(("has", "asked"), [(True, False), (False, True)])
+def test_infrared_is_recorded_only_if_there_and_asked_for(rs, tmp_path, has, asked):
+    path = RandomCamera(n=3, infrared=has).record(tmp_path / "a.db3", 3, infrared=asked)
+    with open_camera(path) as played:
+        assert [frame.infrared for frame in played.frames(3)] == [None] * 3
 
 
 @pytest.mark.parametrize("model", ["none", "brown_conrady", "modified_brown_conrady"])

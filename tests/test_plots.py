@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgb
 
 from coursekit import geometry, plots, specifications
 from coursekit.geometry import Intrinsics
-from coursekit.plots import pinhole
+from coursekit.plots import depth_noise, pinhole
 from coursekit.plots.interactive import label
 from coursekit.simulation import tabletop
 
@@ -40,17 +40,21 @@ def all_figures() -> dict[str, plots.LessonFigure]:
 FIGURES = all_figures()
 
 
-@pytest.mark.parametrize("name", FIGURES)
-def test_every_axis_has_a_label_and_every_figure_words(name: str) -> None:
-    fig = FIGURES[name]
+def check_labels_and_words(fig: plots.LessonFigure) -> None:
     assert len(fig.alt) > 40
     bundle, metadata = fig._repr_mimebundle_()
     assert base64.b64decode(bundle["image/png"]).startswith(b"\x89PNG")
     assert metadata["image/png"]["alt"] == bundle["text/plain"] == fig.alt
     for ax in fig.axes:
         if ax.get_visible() and ax.get_label() != "<colorbar>":
-            assert "(" in ax.get_xlabel(), f"{name}: no unit in the x label {ax.get_xlabel()!r}"
-            assert ax.get_ylabel() or not ax.get_yticks().size
+            assert "(" in ax.get_xlabel(), f"no unit in the x label {ax.get_xlabel()!r}"
+            shared = ax.get_shared_y_axes().get_siblings(ax)
+            assert any(a.get_ylabel() for a in shared) or not ax.get_yticks().size
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_every_axis_has_a_label_and_every_figure_words(name: str) -> None:
+    check_labels_and_words(FIGURES[name])
 
 
 def test_similar_triangles_shows_f_x_over_z() -> None:
@@ -153,3 +157,54 @@ def test_colours_can_be_told_apart_without_hue() -> None:
 def test_unknown_entry_of_K() -> None:
     with pytest.raises(ValueError, match="skew"):
         pinhole.entries_of_K(tabletop(0.2), Intrinsics(2, 2, 1, 1, 0, 0), skew=1.0)
+
+
+# --- notebook 02 ---
+
+
+def depth_noise_figures() -> dict[str, plots.LessonFigure]:
+    z = np.geomspace(0.3, 2.0, 20)
+    law = 1000 * z**2 * 0.08 / 21.6
+    image = np.random.default_rng(0).integers(0, 255, (480, 848))
+    costs = np.abs(np.arange(127) - 48.3) * 10.0 + 50
+    return {
+        "technologies": depth_noise.technologies(447.0, 0.050, 0.08),
+        "reciprocal": depth_noise.reciprocal(21.6, 0.8, 0.08),
+        "prices": depth_noise.prices({"D405": (425.0, 0.018), "D435": (431.0, 0.050)}, 0.08),
+        "infrared_pair": depth_noise.infrared_pair(image, image, (424, 240), 48.3, 5),
+        "cost_curve": depth_noise.cost_curve(costs, 48.3),
+        "depth_image": depth_noise.depth_image(np.ones((480, 848)), {"card": (300.0, 200.0)}),
+        "noise_law": depth_noise.noise_law([0.3, 1.0], [0.3, 3.7], [0.01, 0.1],
+                                           (z, law, 0.9 * law, 1.1 * law), {"other": (z, law)}),
+        "averaging": depth_noise.averaging(
+            [1, 2, 4], [1.0, 0.8, 0.7], [0.1, 0.1, 0.2], [1.0, 0.71, 0.5]
+        ),
+    }  # fmt: skip
+
+
+DEPTH_NOISE_FIGURES = depth_noise_figures()
+
+
+@pytest.mark.parametrize("name", DEPTH_NOISE_FIGURES)
+def test_depth_noise_figures_have_labels_and_words(name: str) -> None:
+    check_labels_and_words(DEPTH_NOISE_FIGURES[name])
+
+
+def test_technologies_at_one_and_two_metres() -> None:
+    """Claims D2 and D10: 3.6 and 14.3 mm for stereo, Z^2 for both triangulating cameras."""
+    assert (
+        "active stereo 3.6 mm at 1 m and 14.3 mm at 2 m" in DEPTH_NOISE_FIGURES["technologies"].alt
+    )
+    stereo, light, flight = (
+        line.get_ydata() for line in DEPTH_NOISE_FIGURES["technologies"].axes[0].lines
+    )
+    ratio = (depth_noise.RANGE_M[-1] / depth_noise.RANGE_M[0]) ** 2
+    assert stereo[-1] / stereo[0] == pytest.approx(ratio)
+    assert light[-1] / light[0] == pytest.approx(ratio)
+    assert flight.min() == flight.max() == 17.0
+
+
+def test_reciprocal_is_the_derivative() -> None:
+    z, fb, sigma = 0.8, 21.6, 0.08
+    slope = (fb / (fb / z - 1e-6) - fb / (fb / z + 1e-6)) / 2e-6
+    assert f"{1000 * slope * sigma:.2f} mm" in depth_noise.reciprocal(fb, z, sigma).alt

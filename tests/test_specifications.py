@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from coursekit.geometry import project
-from coursekit.specifications import DATA, device, device_names, lens, lens_names
+from coursekit.specifications import DATA, device, device_names, lens, lens_names, published_noise
 
 REAL = os.environ.get("COURSEKIT_REAL_DATA")
 needs_real = pytest.mark.skipif(not REAL, reason="COURSEKIT_REAL_DATA is not set")
@@ -50,6 +50,65 @@ def test_the_848_crop_follows_the_rule_that_published_units_follow():
         assert predicted[1:] == pytest.approx(large[1:], abs=tolerance)
 
 
+@pytest.mark.parametrize(
+    ("name", "baseline_m", "scale_m", "nearest_mm", "projector"),
+    [
+        ("D405", 0.018, 0.0001, 70, False),
+        ("D415", 0.055, 0.001, 310, True),
+        ("D435", 0.050, 0.001, 195, True),
+        ("D455", 0.095, 0.001, None, True),
+    ],
+)
+def test_devices_agree_with_their_data_sheets(name, baseline_m, scale_m, nearest_mm, projector):
+    """The sheets' least distances at 848x480, as far as found, are 14-15 % above f B / 126."""
+    sheet, unit = device(name).nominal, device(name).unit
+    assert device(name).name == f"Intel RealSense {name}"
+    assert device(name).projector is projector
+    assert (sheet.baseline_m, sheet.depth_scale_m) == (baseline_m, scale_m)
+    assert unit.baseline_m == pytest.approx(baseline_m, rel=0.01)
+    assert unit.depth_scale_m == scale_m
+    assert unit.depth.size == (848, 480)
+    assert unit.color.size == (640, 480)
+    assert unit.depth.dist is None
+    assert abs(unit.depth.hfov_deg - sheet.depth_hfov_deg) < 3.5
+    assert 0.001 < sheet.glass_m < 0.005
+    if nearest_mm:
+        nearest = 1000 * unit.depth.fx * unit.baseline_m / 126
+        assert nearest_mm / nearest == pytest.approx(1.145, abs=0.01)
+
+
+def test_the_d405_sees_colour_with_its_left_imager():
+    unit, published = device("D405").unit, lens("d405_color").intrinsics
+    np.testing.assert_array_equal(unit.T_color_depth, np.eye(4))
+    assert unit.color.coeffs == published.coeffs
+    assert unit.color.dist is not None
+    # 640x480 is the middle of 768x480, which is the 1280x800 imager scaled by 0.6.
+    ends = np.array([[0.0, 240.0], [640.0, 240.0]])
+    larger = (ends - (320, 240)) / 0.6 + (640, 360)
+    rays = [
+        (points - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+        for points, camera in ((ends, unit.color), (larger, published))
+    ]
+    np.testing.assert_allclose(rays[0], rays[1], atol=1e-6)
+
+
+def test_units_derived_from_larger_images():
+    """The D415's depth from librealsense issue 1430, its colour from issue 5658."""
+    depth, color = device("D415").unit.depth, device("D415").unit.color
+    assert depth.fx == depth.fy == pytest.approx(940.924011 * 848 / 1280, abs=1e-5)
+    assert (depth.cx, depth.cy) == pytest.approx(
+        (636.445312 * 848 / 1280, (359.391479 - 360) * 848 / 1280 + 240), abs=1e-5
+    )
+    assert (color.fx, color.cy) == pytest.approx((925.769 / 1.5, 376.119 / 1.5), abs=1e-3)
+
+
+def test_the_d455_follows_the_rule_of_the_d435():
+    depth, ratio = device("D455").unit.depth, (848 / 1280) / (480 / 800)
+    assert depth.fx == pytest.approx(387.543 * ratio, abs=1e-3)
+    assert depth.cx - 424 == pytest.approx((324.224 - 320) * ratio, abs=1e-3)
+    assert depth.cy - 240 == pytest.approx((237.357 - 240) * ratio, abs=1e-3)
+
+
 @pytest.mark.real
 @needs_real
 def test_d435_unit_is_the_recorded_one():
@@ -73,7 +132,7 @@ def test_opencv_left_is_the_published_calibration():
 
 
 def test_every_entry_loads_and_has_a_source():
-    assert set(device_names()) >= {"D435"}
+    assert set(device_names()) == {"D405", "D415", "D435", "D455"}
     assert set(lens_names()) >= {"opencv_left", "moveit_camera", "d405_color", "duckiebot_wide"}
     for name in lens_names():
         entry = lens(name)
@@ -125,6 +184,9 @@ def test_unknown_names_list_the_known_ones():
         ("depth_hfov_deg = 87.0", "depth_fov = 87.0", "depth_fov"),
         ('source = "Colour stream of the same recording"\n', "", "'source' is missing"),
         ("[D435]\n", "[D435\n", "not TOML"),
+        ("projector = true\n", "", r"\[D435\]: 'projector' is missing"),
+        ("projector = true\n", "projector = 1\n", "projector: got 1, want true or false"),
+        ("glass_m = 0.0042", "glass_m = 0", "glass_m: got 0"),
     ],
 )
 def test_a_broken_file_is_named(tmp_path, old, new, message):
@@ -144,3 +206,14 @@ def test_a_missing_file_or_coefficient_is_named(tmp_path):
     (tmp_path / "lenses.toml").write_text(text.replace("coeffs = [", "coeffs = [0.0, ", 1))
     with pytest.raises(ValueError, match=r"\[opencv_left\]: coeffs"):
         lens("opencv_left", tmp_path)
+
+
+def test_published_noise_implies_the_published_exponents() -> None:
+    """The window means of a D435 grow with Z^2.6; the pixel model gives 0.045-0.15 px."""
+    means, pixels = published_noise()
+    assert "mean of a 100x100 px window" in means.quantity
+    slope, _ = np.polyfit(np.log(means.distances_m), np.log(means.std_mm), 1)
+    assert slope == pytest.approx(2.6, abs=0.1)
+    z, std = np.array(pixels.distances_m), np.array(pixels.std_mm) / 1000
+    assert std == pytest.approx(0.000611 + 0.003587 * (z - 0.3515) ** 2, abs=1e-5)
+    assert std * 21.5 / z**2 == pytest.approx([0.147, 0.083, 0.045, 0.055, 0.061], abs=0.003)

@@ -6,30 +6,37 @@ import os
 from pathlib import Path
 
 from coursekit.cameras import conventions
-from coursekit.cameras.camera import Camera, CameraError, Frame, Frames
+from coursekit.cameras.camera import Camera, CameraError, Frame, Frames, place
 
-__all__ = ["Camera", "CameraError", "Frame", "Frames", "conventions", "open_camera"]
+__all__ = ["Camera", "CameraError", "Frame", "Frames", "conventions", "open_camera", "place"]
 
 VARIABLE = "COURSEKIT_CAMERA"
-WANTED = 'want "auto", "simulated", a serial number, or the path of a .db3 or .bag recording'
+WANTED = (
+    'want "auto", "simulated", a serial number, the path of a .db3 or .bag recording, '
+    "or a folder of them"
+)
 
 
-def open_camera(which: str | os.PathLike[str] = "auto") -> Camera:
+def open_camera(which: str | os.PathLike[str] = "auto", infrared: bool = False) -> Camera:
     """The camera that `which` names, open and ready.
 
-    which: "simulated"; the path of a .db3 or .bag recording; the serial number (digits) of a
-    RealSense; or "auto", which is what the environment variable COURSEKIT_CAMERA names, else the
-    first RealSense on USB, else the simulated camera. Raises ValueError when it is none of these,
-    and CameraError with what to do when the camera or file does not open: a RealSense that is
-    plugged in but does not work is never replaced silently.
+    which: "simulated"; the path of a .db3 or .bag recording, or of a folder that
+    `Camera.record_set` wrote; the serial number (digits) of a RealSense; or "auto", which is what
+    the environment variable COURSEKIT_CAMERA names, else the first RealSense on USB, else the
+    simulated camera. infrared: whether a live camera is to give its two infrared images with each
+    frame; the others give them when they have them. Raises ValueError when `which` is none of
+    these, and CameraError with what to do when the camera or file does not open: a RealSense that
+    is plugged in but does not work is never replaced silently.
     """
     if isinstance(which, str) and which == "auto":
         named = os.environ.get(VARIABLE, "auto")
-        return _connected_or_simulated() if named == "auto" else _open(named, VARIABLE)
-    return _open(which, "which")
+        if named == "auto":
+            return _connected_or_simulated(infrared)
+        return _open(named, VARIABLE, infrared)
+    return _open(which, "which", infrared)
 
 
-def _open(which: str | os.PathLike[str], argument: str) -> Camera:
+def _open(which: str | os.PathLike[str], argument: str, infrared: bool) -> Camera:
     if isinstance(which, os.PathLike):
         return _recording(os.fspath(which))
     if not isinstance(which, str):
@@ -37,23 +44,23 @@ def _open(which: str | os.PathLike[str], argument: str) -> Camera:
     if which == "simulated":
         return _simulated()
     if which.isdecimal():
-        return _live(which)
-    if Path(which).suffix or "/" in which or os.sep in which:
+        return _live(which, infrared)
+    if Path(which).suffix or "/" in which or os.sep in which or (which and Path(which).is_dir()):
         return _recording(which)
     raise ValueError(f"{argument}: got {which!r}, {WANTED}")
 
 
-def _connected_or_simulated() -> Camera:
+def _connected_or_simulated(infrared: bool) -> Camera:
     from coursekit.cameras.librealsense import LibraryMissing, connected_realsenses
 
     try:
         serials = connected_realsenses()
     except LibraryMissing as missing:
         return _simulated(f"The reason: {missing}.")
-    return _live(min(serials)) if serials else _simulated()
+    return _live(min(serials), infrared) if serials else _simulated()
 
 
-def _live(serial: str) -> Camera:
+def _live(serial: str, infrared: bool) -> Camera:
     from coursekit.cameras.librealsense import connected_realsenses
     from coursekit.cameras.realsense import RealSense
 
@@ -64,13 +71,15 @@ def _live(serial: str) -> Camera:
             f"there is no RealSense with serial number {serial} on USB; "
             + (f"there is {found}: open that one" if found else "there is none: plug it in")
         )
-    return RealSense(serial=serial)
+    return RealSense(serial=serial, infrared=infrared)
 
 
-def _recording(path: str) -> Camera:
+def _recording(name: str) -> Camera:
     from coursekit.cameras.realsense import RealSense
+    from coursekit.cameras.recorded_set import RecordedSet
 
-    return RealSense(path=Path(path).expanduser())
+    path = Path(name).expanduser()
+    return RecordedSet(path) if path.is_dir() else RealSense(path=path)
 
 
 def _simulated(advice: str | None = None) -> Camera:

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from coursekit.cameras.simulated import HiddenTruth
+
 STILL_FRAMES = 5  # this many frames in a row must look like the one before them
 STILL_BLOCK = 4  # px; averaging blocks leaves motion and a quarter of the noise
 STILL_FACTOR = 1.5  # times the change that noise alone makes
@@ -35,10 +37,12 @@ class CameraError(RuntimeError):
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One depth image and the colour image taken with it.
+    """One depth image and the images taken with it.
 
     depth (H, W) uint16: counts of `depth_scale_m` metres, 0 invalid. color (h, w, 3) uint8 RGB or
-    None. time_s: the camera's clock. T_color_depth (4, 4): depth frame to colour frame.
+    None. time_s: the camera's clock. T_color_depth (4, 4): depth frame to colour frame. infrared:
+    what the depth was matched from, left and right, each (H, W) uint8 and with the pixels of the
+    depth image on the left; None where the camera does not give it.
     """
 
     depth: NDArray[np.uint16]
@@ -49,6 +53,7 @@ class Frame:
     depth_intrinsics: Intrinsics
     color_intrinsics: Intrinsics | None = None
     T_color_depth: NDArray[np.float64] | None = None
+    infrared: tuple[NDArray[np.uint8], NDArray[np.uint8]] | None = None
 
     @property
     def depth_m(self) -> NDArray[np.float32]:
@@ -112,6 +117,7 @@ class Camera(ABC):
 
     depth_scale_m: metres per depth count. baseline_m: between the two infrared cameras, metres,
     None where a recording does not say. T_color_depth (4, 4): depth frame to colour frame.
+    can_place: whether `place` brings the scene that it is asked for.
     """
 
     name: str
@@ -122,6 +128,7 @@ class Camera(ABC):
     baseline_m: float | None
     depth_scale_m: float
     T_color_depth: NDArray[np.float64] | None
+    can_place: bool = False
 
     @abstractmethod
     def _stream(self) -> Generator[Frame, None, None]:
@@ -134,6 +141,61 @@ class Camera(ABC):
     @abstractmethod
     def close(self) -> None:
         """Let go of the device or file; a second call does nothing."""
+
+    def place(self, name: str, distance_m: float) -> None:
+        """Bring the thing called `name` before the camera: "60 mm block", "wall" or "artefacts".
+
+        distance_m: Z of its front, m. The simulated camera moves its scene, a live one says what to
+        put where and waits for Enter, a recorded set turns to the file. A single recording shows
+        what it shows: it prints one line that says so, and `can_place` is False.
+        Raises ValueError for a bad distance, or for a name that the simulated camera does not know,
+        and CameraError for what a recorded set does not hold (the message lists what it does).
+        """
+        check_distance(distance_m)
+        print(f"{self.name}: a recording cannot be rearranged, it shows what it shows.")
+
+    def set(
+        self,
+        ambient: float | None = None,
+        exposure: float | Literal["auto"] | None = None,
+        depth_scale_m: float | None = None,
+    ) -> str:
+        """Change what is not None, and return a sentence of what was done.
+
+        ambient: the simulated room's infrared light, where 1 is as bright as a projected dot's peak
+        on a surface at 1 m. exposure: ms, or "auto". depth_scale_m: metres per depth count; a
+        RealSense changes nothing else, and this only where the device offers it. A recording cannot
+        be changed. Raises ValueError for a figure out of range, and CameraError.
+        """
+        return "A recording cannot be changed: light, exposure and units are as recorded."
+
+    def reveal(self) -> HiddenTruth:
+        """What the simulated camera really is, to be looked at last; CameraError for any other."""
+        raise CameraError(
+            f"nobody knows the true geometry of the {self.name}: only a camera that "
+            'open_camera("simulated") opened can reveal it'
+        )
+
+    def record_set(
+        self,
+        folder: str | os.PathLike[str],
+        name: str,
+        distances_m: Sequence[float],
+        n: int,
+        overwrite: bool = False,
+        infrared: bool = False,
+    ) -> Path:
+        """Place `name` at each distance, record n frames of each, and return the folder.
+
+        infrared as for `record`. `open_camera(folder)` opens the set. The folder is made if need
+        be; a set in it is added to. What is recorded when Ctrl-C or the camera stops it stays.
+        Raises ValueError for bad arguments (a scene that the set holds is kept unless `overwrite`),
+        and CameraError.
+        """
+        from coursekit.cameras.recorded_set import write_set
+
+        check_count("n", n)
+        return write_set(folder, self, name, distances_m, n, overwrite, infrared)
 
     def frames(self, n: int = 1, progress: bool = True) -> Frames:
         """The next n frames; of a recording always its first n.
@@ -160,17 +222,24 @@ class Camera(ABC):
         """The next frame; of a recording its first."""
         return self.frames(1)[0]
 
-    def record(self, path: str | os.PathLike[str], n: int, overwrite: bool = False) -> Path:
+    def record(
+        self,
+        path: str | os.PathLike[str],
+        n: int,
+        overwrite: bool = False,
+        infrared: bool = False,
+    ) -> Path:
         """Record n frames to a .db3 file that `open_camera` plays back, and return its path.
 
-        Nothing is kept in memory. When the camera fails or Ctrl-C stops it, the file holds the
-        frames so far. Raises ValueError for a bad n or path (an existing file is kept unless
-        `overwrite`), and CameraError.
+        infrared: the infrared images too, where the camera gives them; a file of noisy ones is two
+        to three times as large. Nothing is kept in memory. When the camera fails or Ctrl-C stops
+        it, the file holds the frames so far. Raises ValueError for a bad n or path (an existing
+        file is kept unless `overwrite`), and CameraError.
         """
         from coursekit.cameras.recording import write_recording
 
         check_count("n", n)
-        return write_recording(path, self, self._take(n, progress=True), overwrite)
+        return write_recording(path, self, self._take(n, progress=True), overwrite, infrared)
 
     def frame_when_still(self, timeout_s: float = 30.0) -> Frame:
         """The first frame that the five frames before it agree with: the scene stands still.
@@ -223,6 +292,29 @@ class Camera(ABC):
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+
+@contextlib.contextmanager
+def place(camera: Camera, name: str, distance_m: float) -> Iterator[Camera]:
+    """`camera.place(name, distance_m)` as the head of a `with` block, which is given the camera."""
+    camera.place(name, distance_m)
+    yield camera
+
+
+def check_distance(distance_m: object) -> None:
+    """ValueError unless `distance_m` is a positive, finite number."""
+    number = isinstance(distance_m, (int, float, np.number)) and not isinstance(distance_m, bool)
+    if not number or not 0 < distance_m < np.inf:  # type: ignore[operator]
+        raise ValueError(f"distance_m: got {distance_m!r}, want a positive number of metres")
+
+
+def check_depth_scale(depth_scale_m: object) -> None:
+    """ValueError unless `depth_scale_m` is a number that a D4xx takes, 0.000001 to 0.01 m."""
+    number = isinstance(depth_scale_m, (float, np.floating))
+    if not number or not 1e-6 <= depth_scale_m <= 0.01:  # type: ignore[operator]
+        raise ValueError(
+            f"depth_scale_m: got {depth_scale_m!r}, want metres per count from 0.000001 to 0.01"
+        )
 
 
 def check_count(name: str, value: object) -> None:

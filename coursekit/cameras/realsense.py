@@ -10,11 +10,18 @@ import time
 import weakref
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from coursekit.cameras.camera import Camera, CameraError, Frame
+from coursekit import specifications
+from coursekit.cameras.camera import (
+    Camera,
+    CameraError,
+    Frame,
+    check_depth_scale,
+    check_distance,
+)
 from coursekit.cameras.librealsense import device_info, load_librealsense, start_problem
 from coursekit.cameras.recording import check_recording, depth_frame_numbers
 from coursekit.geometry import Intrinsics, make_transform
@@ -30,23 +37,33 @@ SILENCE_S = 5.0  # without a frame for so long, the camera is gone
 
 UNPLUGGED = "is it still plugged in? Plug it in again, directly and with its own cable, and reopen"
 
+PLACING = {
+    "60 mm block": "Put the 60 mm block on the table, its front face square to the camera,",
+    "wall": "Point the camera at a bland wall that fills the image, turned by about 7 degrees,",
+    "artefacts": "Look down on a table with something dark, shiny, tall and small on it and a "
+    "finger near the camera, the middle of the image",
+}
+
 _live_cameras: weakref.WeakValueDictionary[str, RealSense] = weakref.WeakValueDictionary()
 
 
 class RealSense(Camera):
     """A RealSense on USB (by serial number) or a recording (by path) in librealsense's hands.
 
-    Raises LibraryMissing without pyrealsense2, and CameraError for a camera or file that does not
-    open. All attributes are what the device or the recording reports about itself.
+    infrared: whether a live camera is to give both infrared images too; a recording gives them if
+    it holds them. Raises LibraryMissing without pyrealsense2, and CameraError for a camera or file
+    that does not open. All attributes are what the device or recording reports about itself.
     """
 
-    def __init__(self, serial: str | None = None, path: Path | None = None) -> None:
+    def __init__(
+        self, serial: str | None = None, path: Path | None = None, infrared: bool = False
+    ) -> None:
         if (serial is None) == (path is None):
             raise ValueError("serial, path: got both or neither, want exactly one")
         self._rs = load_librealsense()
-        self._path, self._pipeline = path, None
+        self._path, self._pipeline, self._infrared = path, None, infrared
         self._what = f"the RealSense {serial}"
-        self.source, self.serial = "live", serial or ""
+        self.source, self.serial, self.can_place = "live", serial or "", path is None
         if path is not None:
             self._what = f"the recording {path.name}"
             self.source = "recorded"
@@ -96,10 +113,12 @@ class RealSense(Camera):
         config.enable_device(self.serial)
         config.enable_stream(rs.stream.depth, *DEPTH_SIZE, rs.format.z16, FRAMES_PER_S)
         config.enable_stream(rs.stream.color, *COLOR_SIZE, rs.format.rgb8, FRAMES_PER_S)
+        for eye in (1, 2) if self._infrared else ():
+            config.enable_stream(rs.stream.infrared, eye, *DEPTH_SIZE, rs.format.y8, FRAMES_PER_S)
         return config
 
     def _playback_config(self, pipeline: Any) -> Any:
-        """Depth and colour of the file, whatever else it holds, as fast as they are asked for."""
+        """Depth, colour and the infrared pair of the file, as fast as they are asked for."""
         rs, wrapper = self._rs, self._rs.pipeline_wrapper(pipeline)
 
         def from_file() -> Any:
@@ -108,18 +127,29 @@ class RealSense(Camera):
             return config
 
         everything = from_file().resolve(wrapper)
-        streams = {profile.stream_type() for profile in everything.get_streams()}
+        profiles = everything.get_streams()
+        streams = {profile.stream_type() for profile in profiles}
         if rs.stream.depth not in streams:
             raise CameraError(f"{self._what} holds no depth images: record depth and colour")
         config = from_file()
         for stream in streams & {rs.stream.depth, rs.stream.color}:
             config.enable_stream(stream)
+        self._infrared = self._has_pair(profiles)
+        for eye in (1, 2) if self._infrared else ():
+            config.enable_stream(rs.stream.infrared, eye)
         # Both before the start, or images are lost: at the recorded pace those that are not fetched
         # in time, and the first ones while the sensors are started one after the other.
         playback = config.resolve(wrapper).get_device().as_playback()
         playback.set_real_time(False)
         playback.pause()
         return config
+
+    def _has_pair(self, profiles: Any) -> bool:
+        """Whether there are a left and a right infrared stream of grey pixels."""
+        rs = self._rs
+        eyes = {p.stream_index() for p in profiles if p.stream_type() == rs.stream.infrared
+                and p.format() == rs.format.y8}  # fmt: skip
+        return eyes >= {1, 2}
 
     def close(self) -> None:
         """Stop the camera, or close the file; a second call does nothing."""
@@ -172,18 +202,20 @@ class RealSense(Camera):
         # a live camera gives matching images, and repeats one when the other is late.
         choose = functools.partial(min, key=_time_apart) if self._path else next
         frame = None
-        for _, pairs in itertools.groupby(self._pairs(), key=_identity):
-            frame = self._frame(*choose(pairs))
+        for _, groups in itertools.groupby(self._groups(), key=_identity):
+            frame = self._frame(choose(groups))
             yield frame
         self._check_end(frame)
 
-    def _pairs(self) -> Iterator[tuple[Any, Any]]:
-        """(depth, colour or None) as librealsense groups them, until a recording ends."""
+    def _groups(self) -> Iterator[_Group]:
+        """The images as librealsense groups them, until a recording ends."""
         playback = None if self._path is None else self._profile.get_device().as_playback()
         while (frameset := self._next_frameset(playback)) is not None:
             depth, color = frameset.get_depth_frame(), frameset.get_color_frame()
+            eyes = (1, 2) if self._infrared else ()
             if depth:
-                yield depth, color or None
+                infrared = tuple(frameset.get_infrared_frame(eye) or None for eye in eyes)
+                yield _Group(depth, color or None, infrared)
 
     def _check_end(self, last: Frame | None) -> None:
         """CameraError unless a playback that ended has given all depth images of its file.
@@ -222,7 +254,8 @@ class RealSense(Camera):
             ended = playback and playback.current_status() == rs.playback_status.stopped
         raise CameraError(f"no frame came from {self._what} for {SILENCE_S:g} s: {UNPLUGGED}")
 
-    def _frame(self, depth: Any, color: Any) -> Frame:
+    def _frame(self, group: _Group) -> Frame:
+        depth, color, infrared = group
         return Frame(
             depth=np.array(depth.get_data(), dtype=np.uint16),
             color=self._to_rgb(np.asarray(color.get_data())) if color and self._to_rgb else None,
@@ -232,11 +265,80 @@ class RealSense(Camera):
             depth_intrinsics=self.depth,
             color_intrinsics=self.color,
             T_color_depth=self.T_color_depth,
+            infrared=_pixels(infrared),
         )
 
     def _skip(self, n: int) -> None:
         for _ in itertools.islice(self._stream(), n):
             pass
+
+    # --- placing and settings ------------------------------------------------------------------
+
+    def place(self, name: str, distance_m: float) -> None:
+        if self._path is not None:
+            super().place(name, distance_m)
+            return
+        check_distance(distance_m)
+        what = PLACING.get(name, f"Put the {name}")
+        glass_m = next(
+            (
+                device.nominal.glass_m
+                for device in map(specifications.device, specifications.device_names())
+                if device.name in self.name
+            ),
+            0.0,
+        )
+        print(
+            f"{what} {1000 * (distance_m - glass_m):.0f} mm from the camera's front glass by tape "
+            f"measure: Z = {distance_m:.3f} m begins {1000 * glass_m:.1f} mm behind the glass."
+        )
+        input("Press Enter when it stands there")
+        self._skip(WARM_UP_FRAMES)  # those from before, and until automatic exposure has settled
+
+    def set(
+        self,
+        ambient: float | None = None,
+        exposure: float | Literal["auto"] | None = None,
+        depth_scale_m: float | None = None,
+    ) -> str:
+        if self._path is not None:
+            return super().set(ambient, exposure, depth_scale_m)
+        said = []
+        if ambient is not None:
+            said.append("the room's light is yours to change: draw the curtains, turn on a lamp")
+        if exposure is not None:
+            said.append("exposure stays: lock() fixes it where automatic exposure has put it")
+        if depth_scale_m is not None:
+            check_depth_scale(depth_scale_m)
+            said.append(self._set_depth_scale(depth_scale_m))
+        sentence = "; ".join(said or ["nothing to change"])
+        return sentence[0].upper() + sentence[1:] + "."
+
+    def _set_depth_scale(self, depth_scale_m: float) -> str:
+        """Set the depth unit with the camera stopped, as some firmware wants, and start again."""
+        if self._pipeline is None:
+            raise CameraError(f"{self._what} is closed: open it again with open_camera()")
+        option, sensor = (
+            self._rs.option.depth_units,
+            self._profile.get_device().first_depth_sensor(),
+        )
+        if not sensor.supports(option) or sensor.is_option_read_only(option):
+            return f"depth unit stays {1000 * self.depth_scale_m:g} mm: this camera has no other"
+        self.close()
+        try:
+            sensor.set_option(option, depth_scale_m)
+            refused = None
+        except RuntimeError as error:
+            refused = error
+        self._start()
+        self._query()
+        self._skip(WARM_UP_FRAMES)
+        if refused or not np.isclose(self.depth_scale_m, depth_scale_m, rtol=1e-3):
+            raise CameraError(
+                f"{self._what} keeps its depth unit of {1000 * self.depth_scale_m:g} mm"
+                + (f" (librealsense says: {refused})" if refused else "")
+            ) from refused
+        return f"depth unit set to {1000 * self.depth_scale_m:g} mm"
 
     # --- exposure ------------------------------------------------------------------------------
 
@@ -282,7 +384,7 @@ class RealSense(Camera):
     def _depth_exposure(self, sensor: Any) -> tuple[float, float]:
         """Exposure (us) and gain of the newest depth image, which automatic exposure chose."""
         rs, option = self._rs, self._rs.option
-        depth, _ = next(self._pairs())
+        depth = next(self._groups()).depth
         return tuple(
             depth.get_frame_metadata(value)
             if depth.supports_frame_metadata(value)
@@ -297,13 +399,31 @@ class RealSense(Camera):
 # --- images ------------------------------------------------------------------------------------
 
 
-def _identity(pair: tuple[Any, Any]) -> tuple[int, float]:
-    return pair[0].get_frame_number(), pair[0].get_timestamp()
+class _Group(NamedTuple):
+    """librealsense's images of one moment; infrared: none, or left and right, None if missing."""
+
+    depth: Any
+    color: Any
+    infrared: tuple[Any, ...]
 
 
-def _time_apart(pair: tuple[Any, Any]) -> float:
-    depth, color = pair
-    return abs(depth.get_timestamp() - color.get_timestamp()) if color else np.inf
+def _identity(group: _Group) -> tuple[int, float]:
+    return group.depth.get_frame_number(), group.depth.get_timestamp()
+
+
+def _time_apart(group: _Group) -> float:
+    """How far the images are apart in all, ms; infinitely far without one of them."""
+    others = group.color, *group.infrared
+    moment = group.depth.get_timestamp()
+    return sum(abs(moment - image.get_timestamp()) if image else np.inf for image in others)
+
+
+def _pixels(infrared: tuple[Any, ...]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]] | None:
+    """Left and right (H, W), None unless both are there."""
+    if not infrared or not all(infrared):
+        return None
+    left, right = (np.array(image.get_data(), dtype=np.uint8) for image in infrared)
+    return left, right
 
 
 def _rgb_converter(form: str) -> Callable[[NDArray[Any]], NDArray[np.uint8]]:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 FILE_STARTS = {".db3": b"SQLite format 3\0", ".bag": b"#ROSBAG V2.0\n"}
 FRAMES_PER_S = 30
+EYES = ("left", "right")
 
 
 # --- reading -----------------------------------------------------------------------------------
@@ -86,13 +87,18 @@ def _database(path: Path, mode: str = "ro") -> Iterator[sqlite3.Connection]:
 
 
 def write_recording(
-    path: str | os.PathLike[str], camera: Camera, frames: Iterator[Frame], overwrite: bool = False
+    path: str | os.PathLike[str],
+    camera: Camera,
+    frames: Iterator[Frame],
+    overwrite: bool = False,
+    infrared: bool = False,
 ) -> Path:
     """Write a camera's frames to a .db3 file as they come, and return its path.
 
-    The file appears under its name when it is complete. When Ctrl-C or the camera ends `frames`
-    early it holds those so far: Ctrl-C then prints one line, the CameraError is raised again with
-    the file's name. Raises ValueError for a bad path.
+    infrared: whether to write the infrared images too if the first frame has them. The file
+    appears under its name when it is complete. When Ctrl-C or the camera ends `frames` early it
+    holds those so far: Ctrl-C then prints one line, the CameraError is raised again with the
+    file's name. Raises ValueError for a bad path.
     """
     target = _check_target(path, overwrite)
     rs = load_librealsense()
@@ -100,22 +106,32 @@ def write_recording(
     interrupted, given = False, 0
     with tempfile.TemporaryDirectory(prefix=".recording-", dir=target.parent) as folder:
         unfinished = Path(folder) / "recording.db3"
-        with contextlib.closing(_Writer(rs, unfinished, camera)) as writer:
-            try:
-                for frame in frames:
-                    given += 1
-                    writer.add(frame)
-            except KeyboardInterrupt:
-                interrupted = True
-            except CameraError as error:
-                problem = error
-        _restore_order(unfinished)
+        writer: _Writer | None = None
+        try:
+            for frame in frames:
+                if writer is None:  # playback would wait for the images of a stream that has none
+                    pair = infrared and frame.infrared is not None
+                    writer = _Writer(rs, unfinished, camera, pair)
+                given += 1
+                writer.add(frame)
+        except KeyboardInterrupt:
+            interrupted = True
+        except CameraError as error:
+            problem = error
+        finally:
+            if writer is not None:
+                writer.close()
+        if writer is not None:
+            _restore_order(unfinished)
         if interrupted or problem:
             given = len(depth_frame_numbers(unfinished)) if given else 0
-        if given == 0 and interrupted:
-            raise KeyboardInterrupt
-        if given == 0 and problem:
-            raise problem
+        if given == 0:
+            raise (
+                KeyboardInterrupt()
+                if interrupted
+                else problem
+                or CameraError(f"no frame came from the {camera.name}: nothing written")
+            )
         _publish(unfinished, target, given)
     if problem:
         raise CameraError(f"{problem} (its {given} frames so far are in {target})") from problem
@@ -172,7 +188,7 @@ def _publish(unfinished: Path, target: Path, given: int) -> None:
 class _Writer:
     """librealsense's recorder, fed frame by frame through a software device."""
 
-    def __init__(self, rs: ModuleType, path: Path, camera: Camera) -> None:
+    def __init__(self, rs: ModuleType, path: Path, camera: Camera, infrared: bool = False) -> None:
         self._rs = rs
         device = rs.software_device()
         device.register_info(rs.camera_info.name, camera.name)
@@ -185,6 +201,11 @@ class _Writer:
             _video_stream(rs, rs.stream.depth, rs.format.z16, 2, camera.depth)
         )
         self._streams = {"depth": (depth_sensor, depth.as_video_stream_profile())}
+        for eye, name in enumerate(EYES if infrared else (), start=1):
+            stream = _video_stream(rs, rs.stream.infrared, rs.format.y8, 1, camera.depth)
+            stream.index, stream.uid = eye, 1 + eye
+            profile = depth_sensor.add_video_stream(stream)
+            self._streams[name] = (depth_sensor, profile.as_video_stream_profile())
         if camera.color is not None:
             color_sensor = device.add_sensor("RGB Camera")
             color = color_sensor.add_video_stream(
@@ -196,14 +217,17 @@ class _Writer:
         self._sensors = self._recorder.query_sensors()
         self._queue = rs.frame_queue(1)  # the recorder sees only sensors that stream somewhere
         for sensor in self._sensors:
-            sensor.open(sensor.get_stream_profiles()[0])
+            sensor.open(sensor.get_stream_profiles())
             sensor.start(self._queue)
 
     def add(self, frame: Frame) -> None:
-        # Colour first: a Ctrl-C in between leaves a colour image over, which playback ignores,
-        # and not a depth image with the wrong colour.
+        # Depth last: a Ctrl-C in between leaves an image over, which playback ignores, and not a
+        # depth image with the wrong colour.
         if frame.color is not None:
             self._add("color", frame.color, frame)
+        for name, image in zip(EYES, frame.infrared or (), strict=False):
+            if name in self._streams:
+                self._add(name, image, frame)
         self._add("depth", frame.depth, frame)
         self._recorder.pause()  # waits until all is written: else memory grows with each frame
         self._recorder.resume()

@@ -2,73 +2,190 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
-from functools import cached_property
-from typing import TYPE_CHECKING
+import zlib
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from coursekit import specifications
-from coursekit.cameras.camera import Camera, CameraError, Frame
+from coursekit.cameras.camera import (
+    Camera,
+    CameraError,
+    Frame,
+    check_depth_scale,
+    check_distance,
+)
 from coursekit.geometry import invert_transform
-from coursekit.simulation import Scene, render, tabletop
+from coursekit.simulation import Rig, Scene, artefact_scene, render, tabletop, wall_scene
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from coursekit.simulation import View
 
 FRAMES_PER_S = 30
 PLUG_IN = (
     'Plug in a RealSense and run this cell again, or name a recording: ck.open_camera("file.bag")'
 )
+SCENES: dict[str, Callable[[float], Scene]] = {
+    "60 mm block": tabletop,
+    "wall": wall_scene,
+    "artefacts": artefact_scene,
+}
+
+# How far a unit is from what it reports. The vendor allows 2 % of depth error at 2 m; with these a
+# D435 is 2-5 mm off at 0.45 m, as people find (data/published_depth_noise.json).
+BASELINE_ERROR = (0.004, 0.010)  # least and largest, of the baseline, either sign
+OFFSET_PX = 0.10  # std
+DRIFT_PX, DRIFT_TIME_S = 0.008, 3.0  # a wall at 0.5 m then varies as published ones do
+
+
+@dataclass(frozen=True)
+class HiddenTruth:
+    """What a simulated camera really is, and does not report.
+
+    baseline_m: the true one. reported_baseline_m: the one its depth is computed with.
+    disparity_offset_px: by which disparities come out too large. drift_px, drift_time_s: standard
+    deviation and correlation time of a slow change of that offset.
+    """
+
+    baseline_m: float
+    reported_baseline_m: float
+    disparity_offset_px: float
+    drift_px: float
+    drift_time_s: float
+
+    @property
+    def scale_error(self) -> float:
+        """By which part all depths come out too large (negative: too small) for the baseline."""
+        return self.reported_baseline_m / self.baseline_m - 1.0
+
+    def __repr__(self) -> str:
+        return (
+            f"true baseline {1000 * self.baseline_m:.3f} mm, reported "
+            f"{1000 * self.reported_baseline_m:.3f} mm: depth scale error "
+            f"{100 * self.scale_error:+.2f} %\n"
+            f"disparity offset {self.disparity_offset_px:+.3f} px, drifting by "
+            f"{self.drift_px:.3f} px with a correlation time of {self.drift_time_s:g} s"
+        )
 
 
 class SimulatedCamera(Camera):
     """A stand-in for one unit of a real camera model, looking at a block on a table.
 
-    The geometry is exact and depth is rounded to the device's unit, but there is **no noise**, no
-    hole and no flying pixel: all frames of a scene are equal but for number and time, so nothing
-    about depth noise can be learned from it. `seed` names the camera and changes no image.
-    device: a name of data/devices.toml. scene: in the depth camera's frame. advice: the last
-    sentence of the description. Raises ValueError for an unknown device or a bad seed.
+    Two infrared images are rendered and exposed, and depth is what a block matcher makes of them:
+    see `simulation.active_stereo`. The colour image has no noise.
+
+    device: a name of data/devices.toml. seed: names the unit, so its hidden truth, its pattern of
+    speckle and its noise. scene: in the depth camera's frame. ambient, exposure, depth_scale_m: see
+    `set`; None for the device's own depth unit. advice: the last sentence of the description.
+    Raises ValueError for an unknown device and a bad figure.
+
+    The same calls give the same bytes. `place` and `set` start a stream of random numbers that is
+    named by seed, scene, distance, ambient light and exposure, and the drift somewhere of its own,
+    so a cell that places and captures gives the same numbers when it is run again, other distances
+    are independent, and another depth unit rounds the same images. Captures without a new `place`
+    go on in the stream. Clock and frame numbers never go back.
     """
+
+    can_place = True
 
     def __init__(
         self,
         device: str = "D435",
         seed: int = 7,
         scene: Scene | None = None,
+        ambient: float = 0.01,
+        exposure: float | Literal["auto"] = "auto",
+        depth_scale_m: float | None = None,
         advice: str = PLUG_IN,
     ) -> None:
         if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
             raise ValueError(f"seed: got {seed!r}, want a whole number of at least 0")
-        unit = specifications.device(device).unit
+        profile = specifications.device(device)
+        unit = profile.unit
         self.name, self.source, self.serial = f"Simulated {device}", "simulated", f"seed-{seed}"
         self.depth = unit.depth
-        self.color = self._color = unit.color
+        self.color = unit.color
         self.baseline_m, self.depth_scale_m = unit.baseline_m, unit.depth_scale_m
-        self.T_color_depth = self._T_color_depth = unit.T_color_depth
-        self.scene = tabletop() if scene is None else scene
-        self._seed, self._advice, self._closed, self._given = seed, advice, False, 0
+        self.T_color_depth = unit.T_color_depth
+        self._device, self._projector = device, profile.projector
+        self._seed, self._advice, self._closed = int(seed), advice, False
+        self._truth = _hidden_truth(self._seed, unit.baseline_m)
+        self._given = 0
+        self._place_name, self._distance_m = ("60 mm block", 0.45) if scene is None else ("", 0.0)
+        self.scene = _scene(self._place_name, self._distance_m) if scene is None else scene
+        self._view: View | None = None
+        self._ambient, self._exposure = ambient, exposure
+        self.set(ambient, exposure, depth_scale_m)
 
     def __repr__(self) -> str:
         return f"{self.name}, seed {self._seed}: no real camera in use.\n{self._advice}"
 
+    # --- the scene, the light, the truth -------------------------------------------------------
+
+    def place(self, name: str, distance_m: float) -> None:
+        check_distance(distance_m)
+        if name not in SCENES:
+            raise ValueError(f"name: got {name!r}, want one of {', '.join(SCENES)}")
+        scene = _scene(name, float(distance_m))
+        if scene is not self.scene:
+            self.scene, self._view = scene, None
+        self._place_name, self._distance_m = name, float(distance_m)
+        self._start_afresh()
+
+    def set(
+        self,
+        ambient: float | None = None,
+        exposure: float | Literal["auto"] | None = None,
+        depth_scale_m: float | None = None,
+    ) -> str:
+        if depth_scale_m is not None:
+            check_depth_scale(depth_scale_m)
+        self._rig = self._rig_with(
+            self._ambient if ambient is None else ambient,
+            self._exposure if exposure is None else exposure,
+        )
+        self._ambient, self._exposure = self._rig.ambient, self._rig.exposure
+        if depth_scale_m is not None:
+            self.depth_scale_m = float(depth_scale_m)
+        self._view = None
+        self._start_afresh()
+        shutter = self._exposure if self._exposure == "auto" else f"{self._exposure:.3g} ms"
+        return (
+            f"Ambient infrared {self._ambient:g}, exposure {shutter}, "
+            f"depth unit {1000 * self.depth_scale_m:g} mm."
+        )
+
     def lock(self) -> str:
-        """Nothing to do: returns one sentence that says so."""
-        return "There is nothing to lock: the simulated camera has fixed exposure and focus."
+        """Fix the exposure at what it is now, as on a real camera; one sentence that says so."""
+        self._check_open()
+        exposure_ms = self._look().exposure_ms
+        self.set(exposure=exposure_ms)
+        return f"Locked infrared exposure at {exposure_ms:.3g} ms; focus and colour are fixed."
+
+    def reveal(self) -> HiddenTruth:
+        return self._truth
 
     def close(self) -> None:
         """End this camera; a second call does nothing."""
         self._closed = True
 
+    # --- frames --------------------------------------------------------------------------------
+
     def _stream(self) -> Generator[Frame, None, None]:
-        if self._closed:
-            raise CameraError(f"the {self.name} is closed: open it again with open_camera()")
+        self._check_open()
         while not self._closed:
-            depth, color = self._images
+            view = self._look()
+            color = _color_image(self.scene, self._device)
             self._given += 1
+            self._since_placed_s += 1 / FRAMES_PER_S
+            shot = view.frame(self._rng, self._drift_from_s + self._since_placed_s)
             yield Frame(
-                depth.copy(),
+                view.depth(shot, self.depth_scale_m),
                 color.copy(),
                 self.depth_scale_m,
                 self._given / FRAMES_PER_S,
@@ -76,14 +193,58 @@ class SimulatedCamera(Camera):
                 self.depth,
                 self.color,
                 self.T_color_depth,
+                (shot.left, shot.right),
             )
 
-    @cached_property
-    def _images(self) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
-        """Depth (H, W) in counts and colour (h, w, 3) of the scene, each from its own eye."""
-        exact = render(self.scene, self.depth).depth_m
-        counts = np.rint(exact / self.depth_scale_m)
-        in_range = counts <= np.iinfo(np.uint16).max
-        depth = np.where(in_range, counts, 0).astype(np.uint16)
-        color = render(self.scene, self._color, invert_transform(self._T_color_depth)).color
-        return depth, color
+    def _check_open(self) -> None:
+        if self._closed:
+            raise CameraError(f"the {self.name} is closed: open it again with open_camera()")
+
+    def _rig_with(self, ambient: float, exposure: float | Literal["auto"]) -> Rig:
+        truth = self._truth
+        return Rig(
+            self.depth,
+            truth.reported_baseline_m,
+            projector=self._projector,
+            baseline_error=truth.baseline_m / truth.reported_baseline_m - 1.0,
+            disparity_offset_px=truth.disparity_offset_px,
+            drift_px=truth.drift_px,
+            drift_time_s=truth.drift_time_s,
+            ambient=ambient,
+            exposure=exposure,
+            seed=self._seed,
+        )
+
+    def _start_afresh(self) -> None:
+        """Start the named stream of random numbers, and the drift at a moment that it names."""
+        name = f"{self._place_name} {self._distance_m:.6f} {self._ambient:.6g} {self._exposure}"
+        self._rng = np.random.default_rng([self._seed, zlib.crc32(name.encode())])
+        self._drift_from_s = self._rng.uniform(0.0, 1000.0 * DRIFT_TIME_S)
+        self._since_placed_s = 0.0
+
+    def _look(self) -> View:
+        if self._view is None:
+            self._view = self._rig.look_at(self.scene)
+        return self._view
+
+
+@lru_cache(maxsize=32)
+def _scene(name: str, distance_m: float) -> Scene:
+    """The scene of this name; the same object each time, so that it is rendered once."""
+    return SCENES[name](distance_m)
+
+
+@lru_cache(maxsize=4)
+def _color_image(scene: Scene, device: str) -> NDArray[np.uint8]:
+    """The colour image (h, w, 3) of a scene, without noise."""
+    unit = specifications.device(device).unit
+    return render(scene, unit.color, invert_transform(unit.T_color_depth)).color
+
+
+def _hidden_truth(seed: int, baseline_m: float) -> HiddenTruth:
+    rng = np.random.default_rng([seed, zlib.crc32(b"hidden truth")])
+    error = rng.choice([-1.0, 1.0]) * rng.uniform(*BASELINE_ERROR)
+    offset_px = OFFSET_PX * rng.standard_normal()
+    return HiddenTruth(
+        baseline_m * (1.0 + error), baseline_m, float(offset_px), DRIFT_PX, DRIFT_TIME_S
+    )

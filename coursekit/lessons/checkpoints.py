@@ -218,4 +218,4 @@ def _earlier(name: str) -> str:
     if not attempts:
         return ""
     last = attempts[-1]
-    return f"<em>Your last answer here: {html.escape(last['answer'])}, {last['kind']}.</em>"
+    return f"<em>You have answered this one before ({html.escape(last['kind'])}).</em>"

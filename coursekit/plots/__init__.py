@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from coursekit.plots import pinhole
+from coursekit.plots import depth_noise, pinhole
 from coursekit.plots.interactive import drag
 from coursekit.plots.style import COLORS, LessonFigure, figure
 
-__all__ = ["COLORS", "LessonFigure", "drag", "figure", "pinhole"]
+__all__ = ["COLORS", "LessonFigure", "depth_noise", "drag", "figure", "pinhole"]

@@ -228,7 +228,7 @@ def frame(shot: Frame) -> LessonFigure:
     fig = figure(4.6 * images, 3.3)
     axes = np.atleast_1d(fig.subplots(1, images))
     depth = np.where(shot.depth_m > 0, shot.depth_m, np.nan)
-    shown = axes[0].imshow(depth)
+    shown = axes[0].imshow(depth, vmin=np.nanquantile(depth, 0.01), vmax=_far(depth))
     fig.colorbar(shown, ax=axes[0], label="depth Z (m)", shrink=0.8)
     axes[0].set(title="depth (white: no depth)", xlabel="u (px)", ylabel="v (px)")
     if shot.color is not None:
@@ -236,20 +236,26 @@ def frame(shot: Frame) -> LessonFigure:
         axes[1].set(title="colour", xlabel="u (px)", ylabel="v (px)")
     height, width = depth.shape
     fig.alt = (
-        f"Depth image of {width} by {height} pixels from {np.nanmin(depth):.3f} to "
-        f"{np.nanmax(depth):.3f} m, {np.isnan(depth).mean():.1%} of it without depth"
+        f"Depth image of {width} by {height} pixels, half of them nearer than "
+        f"{np.nanmedian(depth):.2f} m, {np.isnan(depth).mean():.0%} of it without depth"
         + ("." if shot.color is None else ", and the colour image beside it.")
     )
     return fig
 
 
+def _far(depth_m: NDArray[Any]) -> float:
+    """Where the scene ends, m: false matches may lie far behind it."""
+    return 1.1 * float(np.nanquantile(depth_m, 0.97))
+
+
 def point_cloud(points: NDArray[np.float32]) -> LessonFigure:
     """A point cloud (H, W, 3) in m: from beside the camera, and a slice of it from above.
 
-    Points are coloured by depth; NaN points are left out. The slice holds the points at most
+    Points are coloured by depth; NaN points and the few far beyond all others (false matches) are
+    left out. The slice holds the points at most
     SLICE_M above or below the optical axis.
     """
-    cloud = points[np.isfinite(points).all(axis=-1)]
+    cloud = points[points[..., 2] <= _far(points[..., 2])]
     some = np.random.default_rng(0).permutation(len(cloud))[:30_000]  # a stride makes moiré
     fig = figure(9.0, 4.2)
     fig.set_layout_engine("none")  # the 3-D axes reserve far more room than they use

@@ -7,6 +7,7 @@ import io
 from typing import Any
 
 import matplotlib as mpl
+from cycler import cycler
 from matplotlib.figure import Figure
 
 # Okabe-Ito, distinguishable with any colour vision; the same thing has the same colour everywhere.
@@ -33,6 +34,7 @@ mpl.rcParams.update(
         "lines.linewidth": 2,
         "legend.frameon": False,
         "image.cmap": DEPTH_COLORMAP,
+        "axes.prop_cycle": cycler(color=["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9"]),
     }
 )
 

@@ -48,17 +48,19 @@ def render(
     """
     from coursekit.simulation import raycast  # numba takes half a second to import
 
-    _check(scene, intrinsics)
-    boxes = _box_table(scene, T_scene_camera)
+    check_scene(scene)
+    if not isinstance(intrinsics, Intrinsics):
+        raise ValueError(f"intrinsics: got {type(intrinsics).__name__}, want Intrinsics")
+    boxes = box_table(scene, T_scene_camera)
     width, height = intrinsics.size
     depth, index = np.empty((height, width)), np.empty((height, width), np.int16)
-    raycast.render_depth(boxes, _rays(intrinsics, pixel_grid(width, height)), depth, index)
+    raycast.render_depth(boxes, rays(intrinsics, pixel_grid(width, height)), depth, index)
     color = np.empty((height, width, 3), np.uint8)
     raycast.render_color(
         boxes,
         np.array([box.color for box in scene]).reshape(-1, 3),
         np.array([TEXTURES.index(box.texture) for box in scene], np.int64),
-        _rays(intrinsics, pixel_grid(width + 1, height + 1) - 0.5),
+        rays(intrinsics, pixel_grid(width + 1, height + 1) - 0.5),
         LAMP_M,
         1.0 / intrinsics.fx,
         color,
@@ -66,13 +68,16 @@ def render(
     return RenderResult(depth, index, color)
 
 
-def _rays(intrinsics: Intrinsics, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+def rays(intrinsics: Intrinsics, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
     """The points at Z = 1 m behind pixels (H, W, 2): (H, W, 3), NaN where there is none."""
     return deproject(pixels, np.ones(pixels.shape[:2]), intrinsics.K, intrinsics.dist)
 
 
-def _box_table(scene: Scene, T_scene_camera: ArrayLike | None) -> NDArray[np.float64]:
-    """The boxes as `raycast` wants them, (N, 15), in the camera frame."""
+def box_table(scene: Scene, T_scene_camera: ArrayLike | None) -> NDArray[np.float64]:
+    """The boxes as `raycast` wants them, (N, 15), in the camera frame.
+
+    Raises ValueError for a camera inside a box.
+    """
     T = check_transform("T_scene_camera", np.eye(4) if T_scene_camera is None else T_scene_camera)
     if T.shape != (4, 4):
         raise ValueError(f"T_scene_camera: got shape {T.shape}, want one (4, 4) transform")
@@ -86,8 +91,7 @@ def _box_table(scene: Scene, T_scene_camera: ArrayLike | None) -> NDArray[np.flo
     return boxes
 
 
-def _check(scene: Scene, intrinsics: Intrinsics) -> None:
+def check_scene(scene: Scene) -> None:
+    """Raises ValueError for anything but a tuple or list of Box."""
     if not isinstance(scene, (tuple, list)) or not all(isinstance(box, Box) for box in scene):
         raise ValueError(f"scene: got {scene!r}, want a tuple of Box, e.g. tabletop()")
-    if not isinstance(intrinsics, Intrinsics):
-        raise ValueError(f"intrinsics: got {type(intrinsics).__name__}, want Intrinsics")

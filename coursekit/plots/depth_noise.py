@@ -1,0 +1,222 @@
+"""Figures of notebook 02."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from coursekit.plots.style import COLORS, LessonFigure, figure
+
+RANGE_M = np.linspace(0.25, 3.0, 200)
+MARKERS = ("o", "s", "^", "D", "v")
+
+
+def technologies(fx: float, baseline_m: float, sigma_d_px: float) -> LessonFigure:
+    """Random depth error against distance of the three ways to make Z, mm.
+
+    Active stereo: the law, for this camera. Structured light: Khoshelham and Elberink (2012),
+    1.425e-5 Z^2 in cm, for the first Kinect. Time of flight: the maker's limit for the Azure
+    Kinect, a standard deviation of at most 17 mm at any range; typical values are far below.
+    """
+    fig = figure(8.0, 4.2)
+    ax = fig.subplots()
+    stereo = 1000 * RANGE_M**2 * sigma_d_px / (fx * baseline_m)
+    light = 10 * 1.425e-5 * (100 * RANGE_M) ** 2
+    ax.plot(RANGE_M, stereo, color=COLORS["model"], label="active stereo (this camera, the law)")
+    ax.plot(RANGE_M, light, color=COLORS["cube"], ls="--", label="structured light (Kinect v1)")
+    ax.plot(RANGE_M, np.full_like(RANGE_M, 17.0), color=COLORS["color"], ls=":",
+            label="time of flight (Azure Kinect, upper limit)")  # fmt: skip
+    ax.set(xlabel="distance Z (m)", ylabel="std of depth (mm)", ylim=(0, None))
+    ax.legend()
+    fig.alt = (
+        f"Random depth error against distance: active stereo {_at(stereo, 1):.1f} mm at 1 m and "
+        f"{_at(stereo, 2):.1f} mm at 2 m, structured light {_at(light, 1):.1f} and "
+        f"{_at(light, 2):.1f} mm; time of flight stays under a constant limit of 17 mm."
+    )
+    return fig
+
+
+def _at(values: NDArray[Any], distance_m: float) -> float:
+    return float(np.interp(distance_m, RANGE_M, values))
+
+
+def reciprocal(fx_baseline: float, distance_m: float, sigma_d_px: float) -> LessonFigure:
+    """Z = f B / d with one band of disparity noise, and what it becomes in depth.
+
+    fx_baseline: f B in px m. sigma_d_px: drawn ten times too large, or nobody would see it.
+    """
+    d = np.linspace(5, 130, 400)
+    at = fx_baseline / distance_m
+    wide = 10 * sigma_d_px
+    low, high = fx_baseline / (at + wide), fx_baseline / max(at - wide, 1.0)
+    sigma_mm = 1000 * distance_m**2 * sigma_d_px / fx_baseline
+    fig = figure(8.0, 4.2)
+    ax = fig.subplots()
+    ax.plot(d, fx_baseline / d, color=COLORS["model"])
+    ax.axvspan(at - wide, at + wide, color=COLORS["depth"], alpha=0.5)
+    ax.axhspan(low, high, color=COLORS["measured"], alpha=0.35)
+    ax.plot(at, distance_m, "o", color=COLORS["ink"])
+    ax.set(xlim=(0, 130), ylim=(0, 2.6), xlabel="disparity d (px)", ylabel="depth Z (m)")
+    ax.set_title(
+        f"d = {at:.1f} px, Z = {distance_m:.2f} m: {sigma_d_px:.2f} px become {sigma_mm:.2f} mm"
+    )
+    fig.alt = (
+        f"The hyperbola Z = f B / d with f B = {fx_baseline:.2f} px m. At Z = {distance_m:.2f} m a "
+        f"disparity noise of {sigma_d_px:.2f} px becomes a depth noise of {sigma_mm:.2f} mm; the "
+        "bands are drawn ten times too wide."
+    )
+    return fig
+
+
+def prices(devices: Mapping[str, tuple[float, float]], sigma_d_px: float) -> LessonFigure:
+    """The law for several cameras, each (fx in px, baseline in m), on logarithmic axes."""
+    fig = figure(8.0, 4.4)
+    ax = fig.subplots()
+    texts = []
+    for style, (name, (fx, baseline_m)) in zip(
+        ("-", "--", "-.", ":"), devices.items(), strict=False
+    ):
+        sigma = 1000 * RANGE_M**2 * sigma_d_px / (fx * baseline_m)
+        ax.plot(RANGE_M, sigma, style, label=name)
+        texts.append(f"{name} {_at(sigma, 0.45):.2f} mm")
+    ax.axvspan(0.4, 0.6, color=COLORS["faint"], alpha=0.4, label="over a tabletop")
+    ax.set(xscale="log", yscale="log", xlabel="distance Z (m)", ylabel="std of depth (mm)")
+    _plain_log_ticks(ax, (0.3, 0.5, 1, 2, 3), (0.1, 0.3, 1, 3, 10, 30))
+    ax.legend()
+    fig.alt = f"Depth noise by the law for {sigma_d_px:.2f} px, at 0.45 m: {', '.join(texts)}."
+    return fig
+
+
+def infrared_pair(
+    left: NDArray[Any], right: NDArray[Any], pixel: tuple[int, int], disparity_px: float, half: int
+) -> LessonFigure:
+    """A crop of both infrared images with the window around `pixel` and where it is found."""
+    u, v = pixel
+    fig = figure(9.0, 3.8)
+    axes = fig.subplots(1, 2, sharey=True)
+    for ax, image, centre, name in (
+        (axes[0], left, float(u), "left"),
+        (axes[1], right, u - disparity_px, "right"),
+    ):
+        ax.imshow(image, cmap="gray", vmin=0, vmax=255)
+        for x, color in ((u, COLORS["depth"]), (centre, COLORS["measured"])):
+            box = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * (half + 0.5)
+            ax.plot(x + box[:, 0], v + box[:, 1], color=color, lw=1.5)
+        ax.set(xlim=(u - 110, u + 60), ylim=(v + 60, v - 60), xlabel="u (px)", title=name)
+    axes[0].set_ylabel("v (px)")
+    fig.alt = (
+        f"The infrared pair around pixel ({u}, {v}): the window of the left image is found "
+        f"{disparity_px:.1f} px further left in the right image."
+    )
+    return fig
+
+
+def cost_curve(costs: NDArray[Any], disparity_px: float) -> LessonFigure:
+    """Matching cost against disparity: the whole search, and the neighbourhood of the minimum."""
+    fig = figure(9.0, 3.6)
+    whole, close = fig.subplots(1, 2)
+    d = np.arange(len(costs))
+    whole.plot(d, costs, color=COLORS["model"], lw=1.2)
+    best = int(np.argmin(costs))
+    near = slice(max(0, best - 4), best + 5)
+    close.plot(d[near], costs[near], "o", color=COLORS["model"])
+    _flanks(close, costs, best, disparity_px)
+    for ax in (whole, close):
+        ax.axvline(disparity_px, color=COLORS["measured"], lw=1.5)
+        ax.set(xlabel="disparity d (px)", ylabel="cost (grey levels)")
+    whole.set_title("all candidates")
+    close.set_title(f"around the minimum: d = {disparity_px:.2f} px")
+    fig.alt = (
+        f"Matching cost against disparity: lowest at candidate {best}, and between the candidates "
+        f"the two straight flanks meet at d = {disparity_px:.2f} px."
+    )
+    return fig
+
+
+def _flanks(ax: Any, costs: NDArray[Any], best: int, disparity_px: float) -> None:
+    """The two lines of equal steepness through the three lowest points, which meet at the peak."""
+    before, here, after = costs[best - 1 : best + 2]
+    slope = max(before, after) - here
+    left = before - slope * (disparity_px - (best - 1))
+    for sign in (-1, 1):
+        reach = np.array([disparity_px, disparity_px + 3.0 * sign])
+        ax.plot(reach, left + slope * np.abs(reach - disparity_px), color=COLORS["faint"], lw=1.5)
+
+
+def depth_image(
+    depth_m: NDArray[Any], labels: Mapping[str, tuple[float, float]] | None = None
+) -> LessonFigure:
+    """A depth image, no depth in white, with labels at pixels if there are any."""
+    fig = figure(8.5, 4.6)
+    ax = fig.subplots()
+    shown = ax.imshow(np.where(depth_m > 0, depth_m, np.nan), vmin=0.2, vmax=1.2)
+    fig.colorbar(shown, ax=ax, label="depth Z (m)", shrink=0.8)
+    for name, (u, v) in (labels or {}).items():
+        ax.annotate(name, (u, v), (u, v - 60), ha="center", fontsize=10, fontweight="bold",
+                    bbox={"fc": "white", "ec": COLORS["ink"], "pad": 2},
+                    arrowprops={"arrowstyle": "->", "color": COLORS["ink"]})  # fmt: skip
+    ax.set(xlabel="u (px)", ylabel="v (px)")
+    said = f" Marked: {', '.join(labels)}." if labels else ""
+    fig.alt = f"Depth image, {np.mean(depth_m == 0):.0%} of it without depth.{said}"
+    return fig
+
+
+def noise_law(
+    distances_m: ArrayLike,
+    std_mm: ArrayLike,
+    error_mm: ArrayLike,
+    curve: tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]],
+    extra: Mapping[str, tuple[ArrayLike, ArrayLike]] | None = None,
+) -> LessonFigure:
+    """Measured std of depth with its standard error over a fitted curve (Z, mid, low, high)."""
+    z, mid, low, high = curve
+    fig = figure(8.0, 4.6)
+    ax = fig.subplots()
+    ax.fill_between(z, low, high, color=COLORS["model"], alpha=0.25, label="95 % band of the fit")
+    ax.plot(z, mid, color=COLORS["model"], label="fitted law")
+    ax.errorbar(distances_m, std_mm, 1.96 * np.asarray(error_mm), fmt="o", capsize=3,
+                color=COLORS["measured"], label="measured, with 95 % interval")  # fmt: skip
+    styles = zip(MARKERS[1:], ("truth", "color", "ink"), strict=False)
+    for (marker, color), (name, (x, y)) in zip(styles, (extra or {}).items(), strict=False):
+        ax.plot(x, y, marker=marker, ls=":", color=COLORS[color], mfc="white", label=name)
+    ax.set(xscale="log", yscale="log", xlabel="distance Z (m)", ylabel="standard deviation (mm)")
+    _plain_log_ticks(ax, (0.3, 0.45, 0.6, 1, 1.5, 2, 3), (0.03, 0.1, 0.3, 1, 3, 10, 30))
+    ax.legend()
+    pairs = zip(np.asarray(distances_m), np.asarray(std_mm), strict=True)
+    fig.alt = (
+        "Standard deviation of depth against distance over the fitted law: "
+        + ", ".join(f"{s:.2f} mm at {d:.2f} m" for d, s in pairs)
+        + "."
+    )
+    return fig
+
+
+def averaging(
+    counts: ArrayLike, std_mm: ArrayLike, error_mm: ArrayLike, ideal_mm: ArrayLike
+) -> LessonFigure:
+    """Std of the mean of N frames with its error, over the 1 / sqrt(N) of independent frames."""
+    fig = figure(8.0, 4.2)
+    ax = fig.subplots()
+    ax.plot(counts, ideal_mm, color=COLORS["model"], ls="--", label="independent frames: 1/√N")
+    ax.errorbar(counts, std_mm, 1.96 * np.asarray(error_mm), fmt="o-", capsize=3,
+                color=COLORS["measured"], label="measured, with 95 % interval")  # fmt: skip
+    ax.set(xscale="log", yscale="log", xlabel="N (frames averaged)", ylabel="std of mean (mm)")
+    n, s, i = (np.asarray(a) for a in (counts, std_mm, ideal_mm))
+    _plain_log_ticks(ax, tuple(n), (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2))
+    ax.legend()
+    fig.alt = (
+        f"Std of the mean of N frames: from {s[0]:.3f} mm at N = {n[0]} to {s[-1]:.3f} mm at "
+        f"N = {n[-1]}, where independent frames would give {i[-1]:.3f} mm."
+    )
+    return fig
+
+
+def _plain_log_ticks(ax: Any, x: Sequence[float], y: Sequence[float]) -> None:
+    """Ticks at these numbers, written as numbers, inside the data's range."""
+    for axis, ticks, limits in ((ax.xaxis, x, ax.get_xlim()), (ax.yaxis, y, ax.get_ylim())):
+        inside = [t for t in ticks if limits[0] <= t <= limits[1]]
+        axis.set_ticks(inside, [f"{t:g}" for t in inside])
+        axis.set_ticks([], minor=True)

@@ -1,0 +1,451 @@
+"""Noise, level and holes of a depth stack in a window, and what averaging its frames buys."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from coursekit.stereo.law import unrounded_std
+from coursekit.stereo.stacks import (
+    about_plane,
+    counted,
+    cut,
+    depth_stack,
+    numbers,
+    rms,
+    std_error,
+    std_interval,
+    valid_mean,
+    valid_median,
+)
+
+CORRELATION_PX = 12  # disparities farther apart than the matching window (11 px) are independent
+JUMP_SIGMAS = 8.0  # a sample this far from the rest is a mismatch, not noise
+CHI2_95 = 3.84  # 95 % of chi-squared with one degree of freedom lies below
+SLACK = 0.05  # of 2 log likelihood: a drift that explains no more than this is not assumed
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    Floats = NDArray[np.float64]
+    Bools = NDArray[np.bool_]
+    Interval = tuple[float, float]
+    Window = tuple[int, int, int, int]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class WindowStats:
+    """What a stack of depth images says in one window; lengths in m, NaN where nothing says it.
+
+    depth_m: mean, at the window's centre, of a plane through the time means. depth_error_m: its
+    standard error, from the frames and from patches of the window (the pattern that stays).
+    pixel_std_m: std over time of one pixel, pooled over the window, as measured; pixel_dof: the
+    number of independent squares in it. pixel_std_unrounded_m: the same without the depth unit's
+    rounding. mean_std_m, mean_dof: std over time of the window's mean. spatial_std_m: std over the
+    pixels of one frame about its plane. invalid_fraction: of all samples. jump_fraction: of the
+    valid ones, mismatches far from their pixel's median, left out of everything else.
+    frozen_fraction: pixels that never change. means_m (N,): the window's mean in each frame.
+    """
+
+    n_frames: int
+    n_pixels: int
+    invalid_fraction: float
+    jump_fraction: float
+    frozen_fraction: float
+    depth_m: float
+    depth_error_m: float
+    pixel_std_m: float
+    pixel_dof: float
+    pixel_std_unrounded_m: float
+    mean_std_m: float
+    mean_dof: float
+    spatial_std_m: float
+    means_m: Floats
+    depth_scale_m: float | None = None
+
+    @property
+    def pixel_std_error_m(self) -> float:
+        """Standard error of `pixel_std_m`: std / sqrt(2 dof)."""
+        return std_error(self.pixel_std_m, self.pixel_dof)
+
+    @property
+    def mean_std_error_m(self) -> float:
+        """Standard error of `mean_std_m`: std / sqrt(2 dof)."""
+        return std_error(self.mean_std_m, self.mean_dof)
+
+    @property
+    def pixel_std_interval_m(self) -> Interval:
+        """95 % interval of `pixel_std_m`: dof s^2 / sigma^2 is chi-squared with pixel_dof."""
+        return std_interval(self.pixel_std_m, self.pixel_dof)
+
+    @property
+    def rounding(self) -> str:
+        """What the depth unit does to `pixel_std_m`, in words; empty when it does little."""
+        if self.depth_scale_m is None or math.isnan(self.pixel_std_m):
+            return ""
+        return _rounding_note(self.pixel_std_unrounded_m, self.depth_scale_m, self.frozen_fraction)
+
+    def __repr__(self) -> str:
+        start = f"{self.n_pixels} px, {counted(self.n_frames, 'frame')}"
+        if math.isnan(self.depth_m):
+            return f"{start}: no depth, {self.invalid_fraction:.0%} invalid"
+        text = f"{start}: Z = {1e3 * self.depth_m:.2f} ± {1e3 * self.depth_error_m:.2f} mm, "
+        if math.isnan(self.pixel_std_m):
+            return f"{text}no std over time from {counted(self.n_frames, 'frame')}"
+        low, high = self.pixel_std_interval_m
+        text += (
+            f"std of a pixel {1e3 * self.pixel_std_m:.3f} mm (95 %: {1e3 * low:.3f} to "
+            f"{1e3 * high:.3f}), of the window's mean {1e3 * self.mean_std_m:.3f} mm, "
+            f"{self.invalid_fraction:.1%} invalid"
+        )
+        return f"{text}; {self.rounding}" if self.rounding else text
+
+
+def window_stats(depth: Any, window: Window, depth_scale_m: float | None = None) -> WindowStats:
+    """Noise, level and holes of a depth stack in a window that lies on one smooth surface.
+
+    depth: stack or frames, see the module. window: (left, top, width, height) px.
+    depth_scale_m: m per count; for floats, what they were rounded to, or None.
+
+    Model of `pixel_dof`: Gaussian noise with an unknown covariance over the window's pixels, plus
+    a drift that all pixels share. The covariance's participation ratio (tr C)^2 / tr C^2, unbiased
+    as in Srivastava (2005), counts independent pixels; squared autocorrelations count independent
+    frames; noise and drift add as by Satterthwaite. A drift slower than the stack is not seen.
+    Model of `depth_error_m`: the mean over time with its effective number of frames, and the
+    spread of the plane's residuals over patches of CORRELATION_PX px, in quadrature.
+
+    One frame gives NaN for everything over time; a window without valid pixels NaN for all
+    lengths. Raises ValueError for no frames, a window off the image, or counts without a unit.
+    """
+    stack, step = depth_stack(depth, depth_scale_m)
+    z = cut(stack, window, step)
+    valid = np.isfinite(z)
+    n, height, width = z.shape
+    z, jumps = _without_jumps(z, step)
+    counts = np.isfinite(z).sum(axis=0)
+    mean = valid_mean(z, axis=0)
+    deviation = (z - mean)[:, counts > 1]
+    pixel_std, pixel_dof, drift = _temporal(deviation.reshape(n, -1))
+    mean_std, mean_dof = series_std(drift)
+    residual, level = about_plane(mean)
+    return WindowStats(
+        n_frames=n,
+        n_pixels=height * width,
+        invalid_fraction=1 - float(valid.mean()),
+        jump_fraction=jumps / max(int(valid.sum()), 1),
+        frozen_fraction=_frozen(deviation),
+        depth_m=level,
+        depth_error_m=math.hypot(
+            0.0 if n == 1 else mean_std / math.sqrt(effective_frames(drift[:, None])[0]),
+            _patch_error(residual),
+        ),
+        pixel_std_m=pixel_std,
+        pixel_dof=pixel_dof,
+        pixel_std_unrounded_m=unrounded_std(pixel_std, step),
+        mean_std_m=mean_std,
+        mean_dof=mean_dof,
+        spatial_std_m=rms([about_plane(frame)[0] for frame in z]),
+        means_m=level + drift,
+        depth_scale_m=step,
+    )
+
+
+def _without_jumps(z: Floats, step: float | None) -> tuple[Floats, int]:
+    """The stack (N, h, w) with NaN for mismatches, and their number.
+
+    A mismatch is far from its pixel's median, or this median is far off the window's plane.
+    """
+    middle = valid_median(z)
+    jumps = _far(z - middle, step)
+    for _ in range(2):  # the second plane is free of what the first one throws out
+        off, _level = about_plane(middle)
+        middle = np.where(_far(off, step), np.nan, middle)
+    jumps |= np.isfinite(z) & np.isnan(middle)
+    return np.where(jumps, np.nan, z), int(jumps.sum())
+
+
+def _far(off: Floats, step: float | None) -> Bools:
+    """Which deviations are beyond JUMP_SIGMAS of what is typical; never NaN."""
+    size = np.abs(off)
+    typical = size[np.isfinite(size)]
+    if typical.size == 0:
+        return np.zeros(off.shape, bool)
+    scale = max(1.4826 * np.median(typical), np.percentile(typical, 90) / 1.645, step or 0.0)
+    return size > max(JUMP_SIGMAS * scale, 1e-9)
+
+
+def _temporal(deviation: Floats) -> tuple[float, float, Floats]:
+    """Pooled std of deviations (N, P) from each pixel's mean, its dof, the mean's deviation (N,).
+
+    NaN is invalid. See `window_stats` for the model.
+    """
+    n, pixels = deviation.shape
+    if n < 2 or pixels == 0:
+        return math.nan, 0.0, np.zeros(n) if pixels or n == 1 else np.full(n, np.nan)
+    known = np.isfinite(deviation)
+    complete = deviation[:, known.all(axis=0)]
+    drift = np.nan_to_num(valid_mean(deviation, axis=1))
+    drift -= drift.mean()
+    if complete.shape[1] < 2 or not complete.any():
+        return math.sqrt(float(np.nansum(deviation**2)) / (known.sum() - pixels)), n - 1.0, drift
+    own = complete - complete.mean(axis=1, keepdims=True)
+    # The mean of frames that correlate follows them: it costs tau squares a pixel, not one.
+    tau = _correlation_time(own) if n > 4 else 1.0
+    variance = float(np.nansum(deviation**2)) / (known.sum() - pixels * min(tau, n / 2))
+    common = min(float(drift @ drift) / (n - 1), variance)
+    shares = (variance - common) ** 2 / _pixel_dof(own) + common**2 / series_std(drift)[1]
+    return math.sqrt(variance), variance**2 / shares, drift
+
+
+def _pixel_dof(deviation: Floats) -> float:
+    """The number of independent squares in noise (N, P) that correlates in space and time."""
+    n, pixels = deviation.shape
+    frames = max((n - 1) / _squared_correlation(deviation), 1.0)
+    gram = deviation @ deviation.T  # tr S and tr S^2 of the pixels' covariance S, without forming S
+    trace, square = np.trace(gram), np.square(gram).sum()
+    if trace == 0 or frames < 2:
+        return frames
+    # E tr S^2 = tr C^2 (1 + 1/m) + (tr C)^2 / m for m independent frames (Srivastava, 2005)
+    ratio = (frames - 1) * (frames + 2) / frames**2 / max(square / trace**2 - 1 / frames, 1e-12)
+    return frames * float(np.clip(ratio, 1.0, pixels))
+
+
+def series_std(series: Floats) -> tuple[float, float]:
+    """Std of a series (N,) and the number of independent squares in it."""
+    n = len(series)
+    if n < 2 or not np.isfinite(series).all():
+        return math.nan, 0.0
+    return float(series.std(ddof=1)), max((n - 1) / _squared_correlation(series[:, None]), 1.0)
+
+
+def _squared_correlation(series: Floats) -> float:
+    """1 + 2 sum of rho^2 of series (N, P), up to the first lag with nothing significant left.
+
+    For the variance of a variance it is the squares of autocorrelations that count. P pixels in
+    patches of CORRELATION_PX tell more than one series.
+    """
+    n, pixels = series.shape
+    rho = _autocorrelation(series, max(1, n // 3))
+    noise = 1 / math.sqrt(n * max(1.0, pixels / CORRELATION_PX**2))
+    over = np.flatnonzero(rho < 2 * noise)
+    return 1 + 2 * float(np.square(rho[: over[0] if over.size else None]).sum())
+
+
+def _autocorrelation(series: Floats, lags: int) -> Floats:
+    """Autocorrelation (lags,) at lag 1, 2, ... of series (N, P) of known mean, pooled over P."""
+    n = len(series)
+    power = float(np.square(series).sum()) / n
+    if power == 0 or n < 3:
+        return np.zeros(lags)
+    lagged = [float((series[:-k] * series[k:]).sum()) / (n - k) for k in range(1, lags + 1)]
+    return np.array(lagged) / power
+
+
+def _correlation_time(own: Floats) -> float:
+    """1 + 2 sum of rho, at least 1, of series (N, P) free of the drift that all pixels share.
+
+    Summed up to the lag 2.5 tau (Sokal, 1997): many pixels pin it down, a slow drift would not be
+    seen. The mean was taken from the same frames, which lowers every autocovariance by
+    var / N_eff; that is put back.
+    """
+    n = len(own)
+    raw = _autocorrelation(own, max(1, n // 2))
+    tau = 1.0
+    for _ in range(20):
+        share = min(tau / n, 0.5)
+        sums = np.concatenate([[1.0], 1 + 2 * np.cumsum(raw * (1 - share) + share)])
+        window = int(np.argmax(np.arange(len(sums)) >= 2.5 * np.maximum(sums, 1.0)))
+        tau = max(float(sums[window or -1]), 1e-3)
+    return float(np.clip(tau, 1.0, n))
+
+
+def effective_frames(series: Floats) -> tuple[float, Interval]:
+    """The number of independent frames in series (N, P) of zero mean, and its 95 % interval.
+
+    Model: white noise plus a drift whose correlation falls as r^k, r = exp(-1 / tau), spectrum
+    S(f) = w + a (1 - r^2) / (1 - 2 r cos(2 pi f) + r^2). It is fitted to the periodogram by
+    maximum likelihood: Whittle, Estimation and information in stationary time series, Arkiv för
+    Matematik 2 (1953), 423-434. The frequencies k / N, k > 0, do not see the mean. The number is
+    var(one) / var(mean of N) of the fitted model; the interval holds what the profile likelihood
+    does not reject at 5 % (2 log ratio below CHI2_95). Of the models within SLACK of the best the
+    largest number is taken, or most white series would be given a drift.
+    Assumes a stationary, Gaussian series and tau from 1 to N frames: a slower drift is not seen,
+    frames that correlate negatively count as independent. The periodograms of P pixels are
+    averaged and count as one series, since pixels share the drift. Weak drifts leave the interval
+    wide and the number, within it, too large more often than too small.
+    A constant series or fewer than 5 frames say nothing: N, from 1 to N.
+    """
+    n = len(series)
+    power = np.square(np.abs(np.fft.rfft(series, axis=0)[1:])).mean(axis=1)
+    if n < 5 or not power.sum() > 0:
+        return float(n), (1.0, float(n))
+    models = _drift_models(n)
+    binned = np.add.reduceat(models.weights * power / power.mean(), models.starts)
+    deviance = models.log_spectra + 2 * models.weights.sum() * np.log(models.inverse @ binned)
+    profile = deviance.min(axis=0)
+    best = int(np.argmax(profile <= profile.min() + SLACK))
+    inside = np.flatnonzero(profile < profile.min() + CHI2_95)
+    last = len(profile) - 1  # the interval's ends lie between two numbers: take the outer ones
+    low, high = models.effective[[min(inside[-1] + 1, last), max(inside[0] - 1, 0)]]
+    return float(models.effective[best]), (float(low), float(high))
+
+
+class _DriftModels(NamedTuple):
+    """Models of `effective_frames` for N frames: T correlation times, E numbers of frames.
+
+    effective (E,): from N down. inverse (T, E, B): 1 / spectrum, of unit variance, in B bins of
+    frequencies; the variance has a closed form. log_spectra (T, E): twice the sum of its log, inf
+    where no share of the drift gives this number. weights (K,): of the ordinates; starts (B,):
+    their bins.
+    """
+
+    effective: Floats
+    inverse: Floats
+    log_spectra: Floats
+    weights: Floats
+    starts: NDArray[np.int64]
+
+
+@lru_cache(maxsize=8)
+def _drift_models(n: int) -> _DriftModels:
+    k = np.arange(1, n // 2 + 1)
+    weights = np.where(2 * k == n, 0.5, 1.0)  # the highest ordinate has one square, not two
+    starts = np.unique(np.geomspace(1, len(k) + 1, 1024).astype(np.int64))[:-1] - 1
+    sizes = np.add.reduceat(weights, starts)
+    lags = np.arange(1, n)
+    effective = np.geomspace(n, 1, 100)
+    inverse, log_spectra = [], []
+    for r in np.exp(-1 / np.geomspace(1, n, 40)):
+        drift = (1 - r**2) / (1 - 2 * r * np.cos(2 * np.pi * k / n) + r**2)
+        drift = np.add.reduceat(weights * drift, starts) / sizes
+        tau = 1 + 2 * float(((1 - lags / n) * r**lags).sum())
+        share = (n / effective - 1) / (tau - 1)  # of the drift in the variance: a / (w + a)
+        spectrum = 1 + np.minimum(share, 1.0)[:, None] * (drift - 1)
+        inverse.append(1 / spectrum)
+        log_spectra.append(np.where(share <= 1, 2 * np.log(spectrum) @ sizes, np.inf))
+    return _DriftModels(effective, np.array(inverse), np.array(log_spectra), weights, starts)
+
+
+def _frozen(deviation: Floats) -> float:
+    """The fraction of pixels (N, P) that have more than one value and never change."""
+    if deviation.shape[0] < 2 or deviation.size == 0:
+        return math.nan
+    return float((np.nanmax(np.abs(deviation), axis=0) < 1e-12).mean())
+
+
+def _patch_error(residual: Floats) -> float:
+    """Standard error of the mean of residuals (h, w) that correlate over CORRELATION_PX px."""
+    known = residual[np.isfinite(residual)]
+    if known.size < 4:
+        return math.nan
+    patches = known.size / CORRELATION_PX**2
+    return float(known.std()) / math.sqrt(max(patches, 1.0))
+
+
+def _rounding_note(std: float, step: float, frozen: float) -> str:
+    if std >= step / 2:
+        return ""
+    return (
+        f"the depth unit of {1e3 * step:g} mm hides it: {frozen:.0%} of the pixels never change, "
+        f"before rounding it was {1e3 * std:.3f} mm if true depths lie anywhere between two steps"
+    )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class AveragingCurve:
+    """What averaging N frames buys.
+
+    counts (K,): N = 1, 2, 4, ... std_m (K,): std over time of the mean of N frames; errors_m (K,):
+    their standard errors. ideal_m (K,): std_m[0] / sqrt(N), for independent frames. n_frames: all
+    there are. effective_frames: how many independent ones they are worth, and its interval.
+    gain: how much quieter the mean of all frames is than one; sqrt(n_frames) at best.
+    spatial_m (K,): RMS over the pixels about a plane of a mean of N frames, and floor_m, where it
+    ends: the pattern that every frame repeats. Both None for a series without pixels.
+    """
+
+    counts: NDArray[np.int64]
+    std_m: Floats
+    errors_m: Floats
+    ideal_m: Floats
+    n_frames: int
+    effective_frames: float
+    effective_frames_interval: Interval
+    gain: float
+    spatial_m: Floats | None
+    floor_m: float | None
+
+    def __repr__(self) -> str:
+        low, high = self.effective_frames_interval
+        text = (
+            f"{self.n_frames} frames are worth {self.effective_frames:.0f} independent ones "
+            f"(95 %: {low:.0f} to {high:.0f}): their mean is {self.gain:.1f} times quieter than "
+            f"one frame ({math.sqrt(self.n_frames):.1f} if they were independent)"
+        )
+        if self.floor_m is None:
+            return text
+        return f"{text}, and {1e3 * self.floor_m:.3f} mm do not average away"
+
+
+def averaging_curve(series_m: ArrayLike) -> AveragingCurve:
+    """The std of the mean of N frames against N.
+
+    series_m: (N,) values of one pixel or of a window's mean, or (N, h, w) depths of a window on a
+    smooth surface, m, NaN invalid (pixels not valid in every frame are left out).
+
+    Model: white noise plus a drift that is correlated over 1 to N frames; `effective_frames` says
+    how the number of independent ones follows. Its interval is as wide as one series makes it:
+    pixels share the drift, so more of them do not narrow it.
+    Raises ValueError for fewer than 8 frames, where no autocorrelation can be had.
+    """
+    values = numbers("series_m", series_m)
+    n = len(values) if values.ndim else 0
+    if values.ndim not in (1, 3) or n < 8:
+        raise ValueError(f"series_m: got shape {values.shape}, want (N,) or (N, h, w) with N >= 8")
+    if values.ndim == 3:
+        values = np.where(values > 0, values, np.nan)
+    pixels = values.reshape(n, -1)
+    pixels = pixels[:, np.isfinite(pixels).all(axis=0)]
+    if pixels.shape[1] == 0:
+        raise ValueError("series_m: no pixel is valid in every frame")
+    deviation = pixels - pixels.mean(axis=0)
+    sizes = [2**k for k in range(int(math.log2(n // 4)) + 1)]
+    counts = np.array(sizes)
+    std = np.array([_std_of_means(deviation, count) for count in sizes])
+    single = std[0]
+    effective, interval = effective_frames(deviation)
+    spatial = None
+    floor = None
+    if values.ndim == 3:
+        spatial = np.array([rms([about_plane(m)[0] for m in _means(values, c)]) for c in sizes])
+        own = deviation - deviation.mean(axis=1, keepdims=True)  # without the drift all share
+        noise = np.square(own).sum() / own.shape[1] / (n - 1) / (n / _correlation_time(own))
+        floor = math.sqrt(max(rms([about_plane(values.mean(axis=0))[0]]) ** 2 - noise, 0.0))
+    return AveragingCurve(
+        counts=counts,
+        std_m=std,
+        errors_m=std / np.sqrt(2 * (n // counts - 1)),
+        ideal_m=single / np.sqrt(counts),
+        n_frames=n,
+        effective_frames=effective,
+        effective_frames_interval=interval,
+        gain=math.sqrt(effective),
+        spatial_m=spatial,
+        floor_m=floor,
+    )
+
+
+def _means(values: Floats, count: int) -> Floats:
+    """Means of consecutive blocks of `count` frames: (N // count, ...)."""
+    blocks = len(values) // count
+    return values[: blocks * count].reshape(blocks, count, *values.shape[1:]).mean(axis=1)
+
+
+def _std_of_means(deviation: Floats, count: int) -> float:
+    means = _means(deviation, count)
+    return float(
+        math.sqrt(np.square(means - means.mean(axis=0)).sum(axis=0).mean() / (len(means) - 1))
+    )

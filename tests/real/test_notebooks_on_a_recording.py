@@ -1,0 +1,41 @@
+"""The notebooks, cell by cell, on a recording of a real D435 instead of the simulated camera."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import nbformat
+import pytest
+
+from tools import build_notebooks
+
+pytest.importorskip("pyrealsense2", reason="no pyrealsense2 for this platform")
+pytestmark = [
+    pytest.mark.real,
+    pytest.mark.skipif(
+        "COURSEKIT_REAL_DATA" not in os.environ, reason="COURSEKIT_REAL_DATA not set"
+    ),
+]
+PATHS = build_notebooks.find([])
+HONEST = {  # what two frames of one scene cannot give, by cell
+    "02_depth_noise": {
+        "fit": "no law can be fitted",
+        "averaging": "nothing can be said about averaging",
+        "studio-capture": "needs a camera or a set",
+    },
+}
+
+
+@pytest.mark.parametrize("path", PATHS, ids=lambda path: path.stem)
+def test_every_cell_runs_on_the_recording_and_says_what_it_is(path: Path, tmp_path: Path) -> None:
+    bag = Path(os.environ["COURSEKIT_REAL_DATA"], "realsense_d435/single_depth_color_640x480.bag")
+    environment = build_notebooks.kernel_environment(tmp_path) | {"COURSEKIT_CAMERA": str(bag)}
+    notebook = nbformat.read(path, as_version=4)
+    build_notebooks.execute(notebook, path.stem, path.parent, environment)
+    cells = build_notebooks.code_cells(notebook)
+    said = {cell.id: str(cell.outputs) for cell in cells}
+    assert "Intel RealSense D435 (recording single_depth_color_640x480.bag)" in said["setup"]
+    assert [o for cell in cells for o in cell.outputs if o.get("name") == "stderr"] == []
+    for cell, words in HONEST.get(path.stem, {}).items():
+        assert words in said[cell]

@@ -1,0 +1,257 @@
+"""Lesson 02: its exercises name every mistake, and its checkpoints' numbers and texts are right."""
+
+from __future__ import annotations
+
+import math
+from statistics import mean, median
+
+import numpy as np
+import pytest
+from test_lessons import own_results  # noqa: F401
+
+from coursekit import stereo
+from coursekit.lessons.checkpoints import Choice
+from coursekit.lessons.depth_noise import (
+    CHECKPOINTS,
+    DEPTH_NOISE,
+    EXERCISES,
+    IMAGE,
+    OBJECTIVES,
+    ROBUST_DEPTH,
+)
+
+BY_NAME = {c.name.partition(".")[2]: c for c in CHECKPOINTS}
+
+
+# --- depth_noise ---
+
+
+def through_the_slope(Z, fx, baseline, sigma_d):
+    """The noise from a numerical derivative of Z = fx B / d."""
+    d = fx * baseline / np.asarray(Z)
+    step = 1e-5 * d
+    return sigma_d * fx * baseline * (1 / (d - step) - 1 / (d + step)) / (2 * step)
+
+
+def in_float32(Z, fx, baseline, sigma_d):
+    return np.asarray(Z, np.float32) ** 2 * np.float32(sigma_d / (fx * baseline))
+
+
+def in_lists(Z, fx, baseline, sigma_d):
+    if isinstance(Z, float):
+        return Z * Z * sigma_d / fx / baseline
+    return (
+        [in_lists(z, fx, baseline, sigma_d) for z in Z.tolist()]
+        if Z.ndim == 1
+        else [in_lists(row, fx, baseline, sigma_d) for row in Z]
+    )
+
+
+@pytest.mark.parametrize("function", [through_the_slope, in_float32, in_lists, stereo.depth_noise])
+def test_right_noise_laws_in_other_styles_are_not_blamed(function) -> None:
+    verdict = DEPTH_NOISE.judge(function)
+    assert verdict.kind == "right", verdict
+
+
+def test_the_law_gives_the_noise_of_a_noisy_disparity() -> None:
+    """The model against 400,000 disparities with 0.08 px of noise at 1 m: 3.58 mm."""
+    d = np.random.default_rng(0).normal(447 * 0.05 / 1.0, 0.08, 400_000)
+    assert DEPTH_NOISE.model()(1.0, 447, 0.05, 0.08) == pytest.approx((22.35 / d).std(), rel=0.005)
+
+
+def test_the_row_of_an_array_that_is_furthest_off_is_shown() -> None:
+    def farthest_wrong(Z, fx, baseline, sigma_d):
+        return np.where(np.asarray(Z) == 0.45, 9.0, DEPTH_NOISE.model()(Z, fx, baseline, sigma_d))
+
+    verdict = DEPTH_NOISE.judge(farthest_wrong)
+    assert verdict.headline == "depth_noise: not right yet. 3 of 5 cases agree."
+    case = "fx = 431.1 px, baseline = 0.0502 m, sigma_d = 0.08 px, Z = 0.45 m"
+    assert case in verdict.lines[0]
+    assert "xpected 0.0007486, yours 9 m." in verdict.lines[0]
+
+
+# --- robust_depth ---
+
+
+def pixel_by_pixel(depth_m, u, v, half=2, min_valid=5):
+    height, width = depth_m.shape
+    found = [
+        depth_m[row, column]
+        for row in range(height)
+        for column in range(width)
+        if max(abs(row - round(v)), abs(column - round(u))) <= half
+        and 0 < depth_m[row, column] < math.inf
+    ]
+    return median(found) if len(found) >= min_valid else math.nan
+
+
+def by_a_mask(depth_m, u, v, half=2, min_valid=5):
+    rows, columns = np.indices(depth_m.shape)
+    near = (abs(columns - np.rint(u)) <= half) & (abs(rows - np.rint(v)) <= half)
+    depths = np.where(near & np.isfinite(depth_m) & (depth_m > 0), depth_m, np.nan)
+    return np.nanmedian(depths) if np.isfinite(depths).sum() >= min_valid else np.nan
+
+
+def padded(depth_m, u, v, half=2, min_valid=5):
+    around = 20
+    image = np.pad(depth_m, around)
+    row, column = int(np.floor(v + 0.5)) + around, int(np.floor(u + 0.5)) + around
+    patch = image[row - half : row + half + 1, column - half : column + half + 1]
+    valid = patch[np.isfinite(patch) & (patch > 0)]
+    return np.float32(np.median(valid)) if valid.size >= min_valid else float("nan")
+
+
+@pytest.mark.parametrize("function", [pixel_by_pixel, by_a_mask, padded, stereo.robust_depth])
+def test_right_robust_depths_in_other_styles_are_not_blamed(function) -> None:
+    verdict = ROBUST_DEPTH.judge(function)
+    assert verdict.kind == "right", verdict
+
+
+def test_the_model_is_an_independent_ones_everywhere_in_and_around_the_image() -> None:
+    model = ROBUST_DEPTH.model()
+    for u in range(-4, 20):
+        for v in range(-4, 16):
+            for half, min_valid in ((0, 1), (1, 5), (2, 5), (3, 12)):
+                args = (IMAGE, u, v, half, min_valid)
+                np.testing.assert_equal(model(*args), pixel_by_pixel(*args))
+
+
+def of_the_lesson(depth_image_m, u, v, half=2, min_valid=5):
+    patch = depth_image_m[v - half : v + half + 1, u - half : u + half + 1]
+    valid = patch[patch > 0]
+    return float(np.median(valid)) if valid.size else 0.0
+
+
+def test_the_lessons_own_version_makes_four_mistakes_once_it_takes_floats() -> None:
+    """Claim D12: it raises on floats, is empty near the border and trusts a single pixel."""
+    verdict = ROBUST_DEPTH.judge(of_the_lesson)
+    assert (verdict.kind, verdict.named) == ("raised", None)
+    assert "slice indices must be integers" in verdict.headline
+
+    def rounded(depth_m, u, v, half=2, min_valid=5):
+        return of_the_lesson(depth_m, round(u), round(v), half, min_valid)
+
+    assert rounded(IMAGE, 0, 6) == 0.0  # empty: columns -2 to 3 of 16
+    assert rounded(IMAGE, 13, 2, 1) == IMAGE[2, 13]
+    verdict = ROBUST_DEPTH.judge(rounded)
+    assert (verdict.kind, verdict.named) == ("wrong", None)
+
+    names = {"negative_index", "infinity_counted", "min_valid_ignored", "zero_returned"}
+    model = ROBUST_DEPTH.model(*(m for m in ROBUST_DEPTH.mistakes if m.wrong.__name__ in names))
+    for args in ROBUST_DEPTH.cases:
+        assert rounded(*args) == model(*args)
+
+
+def test_windows_are_described_in_words() -> None:
+    descriptions = [ROBUST_DEPTH.describe(args) for args in ROBUST_DEPTH.cases]
+    assert descriptions[0] == "a 3x3 window about (u, v) = (4, 1) px, min_valid = 1 (9 valid)"
+    assert (
+        "a 5x5 window about (u, v) = (0, 6) px, cut off at the left border (11 valid, 4 zero)"
+        in descriptions
+    )
+    assert any("cut off at the bottom and right border" in d for d in descriptions)
+    assert any(d.endswith("all of it off the image") for d in descriptions)
+    assert any("3 infinite" in d for d in descriptions)
+    assert len(set(descriptions)) == len(descriptions)
+
+
+def test_an_example_of_the_verdict() -> None:
+    (wraps,) = [m for m in ROBUST_DEPTH.mistakes if m.wrong.__name__ == "negative_index"]
+    verdict = ROBUST_DEPTH.judge(ROBUST_DEPTH.model(wraps))
+    depths = [z for z in IMAGE[4:9, :3].ravel() if z]
+    assert "cut off at the left border" in verdict.lines[0]
+    assert f"xpected {median(depths):.5f}, yours NaN m." in verdict.lines[0]
+
+
+def nan_for_zero_in_place(depth_m, u, v, half=2, min_valid=5):
+    answer = pixel_by_pixel(depth_m, u, v, half, min_valid)
+    depth_m[depth_m == 0] = np.nan
+    return answer
+
+
+right = ROBUST_DEPTH.model()
+
+
+@pytest.mark.parametrize(
+    ("function", "kind", "says"),
+    [
+        (lambda *args: None, "not attempted", "returns None"),
+        (lambda *args: None if np.isnan(right(*args)) else right(*args), "wrong", "`return`"),
+        (lambda *args: [right(*args)], "wrong", "shape (1,), and one number is wanted"),
+        (lambda *args: np.array(right(*args)), "right", "All 21 cases agree"),
+        (lambda *args: "0.45", "wrong", "a str"),
+        (lambda *args: math.nan, "wrong", "not right yet"),
+        (nan_for_zero_in_place, "wrong", "changes the array it is given. The numbers are right"),
+        (lambda image, u, v: 0.45, "raised", "positional arguments"),
+    ],
+)
+def test_odd_functions(function, kind: str, says: str) -> None:
+    verdict = ROBUST_DEPTH.judge(function)
+    assert verdict.kind == kind
+    assert says in repr(verdict)
+
+
+# --- checkpoints and objectives ---
+
+
+def test_the_numbers_of_the_checkpoints() -> None:
+    """Computed here another way: by disparities, and by search for the limit."""
+    step = 0.0006 * 447 * 0.05 / 0.4**2  # px that make 0.6 mm at 0.4 m
+    d = 447 * 0.05 / 0.8
+    noise = 447 * 0.05 * (1 / (d - step / 2) - 1 / (d + step / 2))
+    assert BY_NAME["twice_as_far"].value == pytest.approx(1000 * noise, rel=1e-4)
+
+    law = DEPTH_NOISE.model()
+    ratio = law(0.4, 447, 0.018, 0.08) / law(0.4, 447, 0.050, 0.08)
+    assert BY_NAME["short_baseline"].value == pytest.approx(ratio)
+    assert BY_NAME["short_baseline"].value == pytest.approx(2.78, abs=0.005)
+    assert 1000 * law(0.4, 447, 0.018, 0.08) == pytest.approx(1.59, abs=0.005)
+
+    limit = BY_NAME["minimum_range"].value
+    left, right = (431.1 * X / limit for X in (0.0, -0.05017))
+    assert left - right == pytest.approx(126)
+    assert limit == pytest.approx(0.172, abs=0.0005)
+    slips = [126 * 0.05017 / 431.1, 126 / 431.1 / 0.05017, 431.1 * 0.05017, 0.05017, 431.1 / 126]
+    slips.append(447 * 0.05 / 126)
+    classics = [c.value for c in BY_NAME["minimum_range"].classics]
+    assert classics == pytest.approx(slips, rel=0.01)
+
+
+def test_what_the_texts_state() -> None:
+    rng = np.random.default_rng(1)
+    # 100 frames of an AR(1) series with correlation 0.5 gain 5.8, independent ones 10
+    noise = rng.normal(size=(40_000, 160))
+    for n in range(1, 160):
+        noise[:, n] = 0.5 * noise[:, n - 1] + math.sqrt(0.75) * noise[:, n]
+    assert 1 / noise[:, 60:].mean(axis=1).std() == pytest.approx(5.8, abs=0.1)
+
+    # the width of a centred 60 mm block at 0.4 m: 0.06 mm, 0.015 mm, and 0.13 mm for its edges
+    u = 447 * np.array([-0.03, 0.03]) / 0.4
+    depth = rng.normal(0.4, 0.573e-3, (20_000, 2, 25))
+
+    def width_mm(u, Z):
+        return 1000 * np.hypot(*((u * Z / 447)[:, 1] - (u * Z / 447)[:, 0], Z[:, 1] - Z[:, 0]))
+
+    assert width_mm(u, depth[:, :, 0]).std() == pytest.approx(0.061, abs=0.002)
+    assert width_mm(u, np.median(depth, axis=2)).std() == pytest.approx(0.015, abs=0.001)
+    jitter = u + rng.normal(0, 0.1, (20_000, 2))
+    assert width_mm(jitter, np.full((20_000, 2), 0.4)).std() == pytest.approx(0.13, abs=0.005)
+    farther = np.median(rng.normal(0.8, 4 * 0.573e-3, (20_000, 2, 25)), axis=2)
+    assert width_mm(u / 2, farther).std() == pytest.approx(2 * 0.015, abs=0.002)  # like Z
+
+    # a baseline that is 10 % too long
+    d = 447 * 0.05 / np.array([0.3, 0.45, 2.0])
+    np.testing.assert_allclose(447 * 0.055 / d, 1.1 * np.array([0.3, 0.45, 2.0]))
+
+
+def test_no_option_is_given_away_by_its_length() -> None:
+    """The right one is not the longest in more than half of the choices."""
+    choices = [c for c in CHECKPOINTS if isinstance(c, Choice)]
+    longest = [max(c.options, key=lambda o: len(o.text)).right for c in choices]
+    assert mean(longest) <= 0.5
+
+
+def test_objectives_cover_every_checkpoint_and_exercise() -> None:
+    named = [n for o in OBJECTIVES for n in o.names]
+    assert sorted(named) == sorted([c.name for c in CHECKPOINTS] + [e.name for e in EXERCISES])
+    assert len(CHECKPOINTS) == 8

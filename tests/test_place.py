@@ -1,0 +1,280 @@
+"""Placing things before a camera, recorded sets, and that a session comes back as it was."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import shutil
+
+import numpy as np
+import pytest
+from fake_realsense import real_library
+
+from coursekit.cameras import CameraError, open_camera, place
+from coursekit.cameras.simulated import SimulatedCamera
+
+BLOCK, DISTANCES_M = "60 mm block", (0.30, 0.45)
+
+
+@pytest.fixture(scope="module")
+def recorded_set(tmp_path_factory):
+    """Four frames of the block at two distances and of a wall, with the infrared images."""
+    real_library()
+    folder = tmp_path_factory.mktemp("sets") / "session"
+    with SimulatedCamera(depth_scale_m=1e-4) as camera:
+        camera.record_set(folder, BLOCK, DISTANCES_M, 4, infrared=True)
+        return camera.record_set(folder, "wall", [1.0], 4)
+
+
+def captures(camera):
+    """What a notebook's sweep takes: the depth images at each distance."""
+    found = []
+    for distance_m in DISTANCES_M:
+        with place(camera, BLOCK, distance_m):
+            found.append(camera.frames(4).depth)
+    return found
+
+
+# --- the simulated camera ---
+
+
+def test_a_cell_that_is_run_again_gives_the_same_numbers():
+    with SimulatedCamera() as camera:
+        first, again = captures(camera), captures(camera)
+        np.testing.assert_array_equal(first, again)
+        goes_on = camera.frames(4).depth
+        assert (goes_on != again[-1]).any()
+    with SimulatedCamera() as another:
+        another.frames(3)
+        np.testing.assert_array_equal(captures(another)[::-1], first[::-1])
+    with SimulatedCamera(seed=8) as other_unit:
+        assert (captures(other_unit)[0] != first[0]).any()
+
+
+def test_the_same_calls_give_the_same_bytes():
+    def session():
+        with SimulatedCamera(seed=3) as camera:
+            frames = [*camera.frames(2)]
+            camera.set(ambient=0.02)
+            frames += camera.frames(2)
+            camera.place("artefacts", 0.5)
+            frames += camera.frames(2)
+        return frames
+
+    for one, other in zip(session(), session(), strict=True):
+        assert (one.number, one.time_s) == (other.number, other.time_s)
+        np.testing.assert_array_equal(one.depth, other.depth)
+        np.testing.assert_array_equal(one.infrared, other.infrared)
+        np.testing.assert_array_equal(one.color, other.color)
+
+
+def test_clock_and_numbers_go_on_when_the_scene_changes():
+    with SimulatedCamera() as camera:
+        camera.frames(2)
+        with place(camera, "wall", 0.7) as given:
+            assert given is camera
+            frame = camera.frame()
+    assert (frame.number, frame.time_s) == (3, pytest.approx(0.1))
+
+
+def test_the_three_scenes():
+    with SimulatedCamera() as camera:
+        names = [
+            {box.name for box in camera.scene}
+            for name in (BLOCK, "wall", "artefacts")
+            if camera.place(name, 0.6) is None
+        ]
+        assert names[0] == {"wall", "table", "60 mm block", "25 mm cube"}
+        assert names[1] == {"wall"}
+        assert names[2] > names[0] | {"dark card", "shiny plate", "finger"}
+        depth = camera.frame().depth
+        assert np.mean(depth[:200, 50:250] == 0) > 0.5  # the finger and its shadow
+        camera.place(BLOCK, 0.6)
+        assert np.median(camera.frame().depth[235:250, 430:445]) == pytest.approx(600, abs=8)
+        camera.place("wall", 0.6)
+        assert np.mean(camera.frame().depth[50:-50, 150:-50] == 0) < 0.02
+
+
+def test_drift_is_independent_from_distance_to_distance():
+    """Each placement starts the drift elsewhere, and the same one at the same place."""
+    with SimulatedCamera() as camera:
+        starts = []
+        for distance_m in (0.30, 0.45, 0.60, 0.45):
+            camera.place(BLOCK, distance_m)
+            starts.append(camera._drift_from_s)
+    assert starts[1] == starts[3]
+    assert len(set(starts)) == 3
+    assert min(abs(a - b) for a, b in itertools.combinations(starts[:3], 2)) > 30  # 10 times 3 s
+
+
+@pytest.mark.parametrize("distance_m", [0, -0.3, float("nan"), float("inf"), True, "0.45", None])
+def test_a_bad_distance_is_refused(distance_m, recorded_set):
+    with SimulatedCamera() as camera, pytest.raises(ValueError, match=r"^distance_m: got"):
+        camera.place(BLOCK, distance_m)
+    with open_camera(recorded_set) as camera, pytest.raises(ValueError, match=r"^distance_m: got"):
+        camera.place(BLOCK, distance_m)
+
+
+def test_an_unknown_thing_is_refused():
+    with SimulatedCamera() as camera:
+        before = camera.scene
+        with pytest.raises(
+            ValueError, match=r"^name: got 'mug', want one of 60 mm block, wall, ar"
+        ):
+            camera.place("mug", 0.4)
+        assert camera.scene is before
+
+
+# --- recorded sets ---
+
+
+def test_a_set_plays_what_the_simulated_camera_gave(recorded_set):
+    """The same notebook cells, equal numbers."""
+    with SimulatedCamera(depth_scale_m=1e-4) as camera, open_camera(recorded_set) as played:
+        np.testing.assert_array_equal(captures(camera), captures(played))
+        with place(camera, BLOCK, 0.30), place(played, BLOCK, 0.30):
+            for one, other in zip(camera.frames(4), played.frames(4), strict=True):
+                np.testing.assert_array_equal(one.infrared, other.infrared)
+                np.testing.assert_array_equal(one.color, other.color)
+        assert (played.source, played.can_place) == ("recorded", True)
+        for name in ("name", "serial", "depth_scale_m"):
+            assert getattr(played, name) == getattr(camera, name)
+        assert played.baseline_m == pytest.approx(camera.baseline_m, abs=1e-9)
+        played.place("wall", 1.0)
+        assert played.frame().infrared is None  # recorded without
+
+
+def test_a_set_says_what_it_holds(recorded_set, monkeypatch):
+    monkeypatch.setenv("COURSEKIT_CAMERA", str(recorded_set))
+    with open_camera() as camera:
+        assert repr(camera) == (
+            "Simulated D435 (recorded set session, now 60 mm block at 0.300 m), which holds "
+            "60 mm block at 0.300, 0.450 m; wall at 1.000 m"
+        )
+        for name, distance_m in ((BLOCK, 0.6), ("wall", 0.45), ("mug", 0.3)):
+            with pytest.raises(CameraError) as caught:
+                camera.place(name, distance_m)
+            assert f"has no {name} at {distance_m:.3f} m: it holds 60 mm block at 0.300, " in str(
+                caught.value
+            )
+        camera.place(BLOCK, 0.45 + 1e-9)
+        assert "now 60 mm block at 0.450 m" in repr(camera)
+        assert "cannot be changed" in camera.lock()
+        assert "cannot be changed" in camera.set(depth_scale_m=1e-4)
+        with pytest.raises(CameraError, match="nobody knows the true geometry"):
+            camera.reveal()
+        camera.close()
+        camera.close()
+        with pytest.raises(CameraError, match="closed"):
+            camera.frame()
+
+
+def test_a_folder_by_its_bare_name(recorded_set, monkeypatch):
+    monkeypatch.chdir(recorded_set.parent)
+    with open_camera(recorded_set.name) as camera:
+        assert camera.name == "Simulated D435"
+
+
+def test_a_scene_that_is_there_is_kept_unless_told(recorded_set, tmp_path):
+    folder = shutil.copytree(recorded_set, tmp_path / "copy")
+    with SimulatedCamera(seed=7) as camera:
+        with pytest.raises(ValueError, match=r"holds 60 mm block at 0\.450 m already"):
+            camera.record_set(folder, BLOCK, [0.6, 0.45], 2)
+        assert not any("0.600" in name for name in os.listdir(folder))
+        camera.record_set(folder, BLOCK, [0.45], 2, overwrite=True)
+    with open_camera(folder) as played:
+        played.place(BLOCK, 0.45)
+        assert len(played.frames(2)) == 2
+        assert played.depth_scale_m == 0.001
+    assert len(json.loads((folder / "index.json").read_text())["scenes"]) == 3
+
+
+def test_one_set_is_of_one_camera(recorded_set, tmp_path):
+    folder = shutil.copytree(recorded_set, tmp_path / "copy")
+    with SimulatedCamera(seed=8) as camera:
+        camera.record_set(folder, BLOCK, [0.6], 1)
+    with open_camera(folder) as played:
+        with pytest.raises(CameraError, match=r"another camera \(seed-8, not seed-7\)"):
+            played.place(BLOCK, 0.6)
+        assert played.frame().depth.any()
+
+
+def test_a_single_recording_says_that_it_cannot_be_rearranged(recorded_set, tmp_path, capsys):
+    with open_camera(recorded_set / "60-mm-block_0.300m.db3") as camera:
+        assert not camera.can_place
+        with place(camera, BLOCK, 0.45):
+            assert len(camera.frames(2)) == 2
+        said = "Simulated D435: a recording cannot be rearranged, it shows what it shows.\n"
+        assert capsys.readouterr() == (said, "")
+        with pytest.raises(CameraError, match="cannot be rearranged, so it makes no set"):
+            camera.record_set(tmp_path / "set", BLOCK, [0.45], 2)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_ctrl_c_keeps_the_scenes_so_far(tmp_path, capsys, monkeypatch):
+    real_library()
+    with SimulatedCamera() as camera:
+        stream = camera._stream
+
+        def interrupted_in_the_second_scene():
+            for count, frame in enumerate(stream()):
+                if camera._distance_m == 0.45 and count == 1:
+                    raise KeyboardInterrupt
+                yield frame
+
+        monkeypatch.setattr(camera, "_stream", interrupted_in_the_second_scene)
+        folder = camera.record_set(tmp_path / "set", BLOCK, [0.30, 0.45, 0.60], 3)
+    assert capsys.readouterr().out.endswith(
+        "holds the 1 frames so far.\nThe set set holds 60 mm block at 0.300, 0.450 m.\n"
+    )
+    with open_camera(folder) as played:
+        assert len(played.frames(3)) == 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"n": 0}, "^n: got 0"),
+        ({"distances_m": [0.3, -1]}, "^distance_m: got -1"),
+        ({"name": "mug"}, "^name: got 'mug'"),
+        ({"folder": "nowhere/set"}, "^folder: .* cannot be made"),
+    ],
+)
+def test_a_bad_set_is_refused(tmp_path, arguments, message):
+    wanted = {"folder": "set", "name": BLOCK, "distances_m": [0.3], "n": 2} | arguments
+    wanted["folder"] = tmp_path / wanted["folder"]
+    with SimulatedCamera() as camera, pytest.raises(ValueError, match=message):
+        camera.record_set(**wanted)
+    assert not list(tmp_path.rglob("*.*"))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{", "not a JSON file"),
+        ("{}", "'scenes'"),
+        ('{"scenes": []}', "it lists no scenes"),
+        ('{"scenes": [{"name": "wall"}]}', "missing"),
+        ('{"scenes": [{"name": "wall", "distance_m": 0, "file": "a.db3"}]}', "distance_m: got 0"),
+        (
+            '{"scenes": [{"name": "wall", "distance_m": 1, "file": "../a.db3"}]}',
+            "want a name in the set's own folder",
+        ),
+    ],
+)
+def test_a_damaged_index_says_so(tmp_path, content, message):
+    (tmp_path / "index.json").write_text(content)
+    with pytest.raises(CameraError, match=rf"index\.json is damaged \(.*{message}"):
+        open_camera(tmp_path)
+
+
+def test_a_folder_without_a_set_and_a_set_without_a_file(recorded_set, tmp_path):
+    with pytest.raises(CameraError, match=r"is a folder: name the \.db3 or \.bag file in it, or a"):
+        open_camera(tmp_path)
+    folder = shutil.copytree(recorded_set, tmp_path / "copy")
+    (folder / "60-mm-block_0.450m.db3").unlink()
+    with open_camera(folder) as camera:
+        with pytest.raises(CameraError, match=r"there is no file .*0\.450m\.db3"):
+            camera.place(BLOCK, 0.45)
+        assert camera.frame().depth.any()  # still the one before
