@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from statistics import mean, median
 
 import numpy as np
@@ -19,6 +20,7 @@ from coursekit.lessons.depth_noise import (
     OBJECTIVES,
     ROBUST_DEPTH,
 )
+from tools import build_notebooks
 
 BY_NAME = {c.name.partition(".")[2]: c for c in CHECKPOINTS}
 
@@ -67,7 +69,20 @@ def test_the_row_of_an_array_that_is_furthest_off_is_shown() -> None:
     assert verdict.headline == "depth_noise: not right yet. 3 of 5 cases agree."
     case = "fx = 431.1 px, baseline = 0.0502 m, sigma_d = 0.08 px, Z = 0.45 m"
     assert case in verdict.lines[0]
-    assert "xpected 0.0007486, yours 9 m." in verdict.lines[0]
+    assert "xpected 0.0007485" in verdict.lines[0]
+    assert verdict.lines[0].endswith("yours 9 m.")
+
+
+@pytest.mark.parametrize("half", [0.5, 1.0])
+def test_a_central_difference_is_shown_with_the_digits_in_which_it_differs(half: float) -> None:
+    def central(Z, fx, baseline, sigma_d):
+        d, step = fx * baseline / np.asarray(Z), half * sigma_d
+        return fx * baseline * (1 / (d - step) - 1 / (d + step)) / (2 * half)
+
+    verdict = DEPTH_NOISE.judge(central)
+    assert verdict.named == "difference"
+    want, got = re.search(r"xpected ([\d., ]+), yours ([\d., ]+) m", verdict.lines[0]).groups()
+    assert want != got
 
 
 # --- robust_depth ---
@@ -191,6 +206,22 @@ def test_odd_functions(function, kind: str, says: str) -> None:
     assert says in repr(verdict)
 
 
+# --- the notebook ---
+
+
+def test_no_printed_line_is_longer_than_a_page() -> None:
+    """JupyterLab breaks lines of more than 107 characters in mid-word."""
+    notebook = build_notebooks.read(build_notebooks.NOTEBOOKS / "02_depth_noise.ipynb")
+    lines = [
+        line
+        for cell in build_notebooks.code_cells(notebook)
+        for output in cell["outputs"]
+        for line in build_notebooks.joined(output.get("text", "")).splitlines()
+    ]
+    assert len(lines) > 50
+    assert [line for line in lines if len(line) > 100] == []
+
+
 # --- checkpoints and objectives ---
 
 
@@ -225,7 +256,12 @@ def test_what_the_texts_state() -> None:
         noise[:, n] = 0.5 * noise[:, n - 1] + math.sqrt(0.75) * noise[:, n]
     assert 1 / noise[:, 60:].mean(axis=1).std() == pytest.approx(5.8, abs=0.1)
 
-    # the width of a centred 60 mm block at 0.4 m: 0.06 mm, 0.015 mm, and 0.13 mm for its edges
+    # the width of a centred 60 mm block at 0.4 m: from one pixel's depth 0.09 mm, like Z; from
+    # the depths of both ends 0.06 mm, with a median of 25 0.015 mm; and 0.13 mm for its edges
+    for distance, want in ((0.4, 0.086), (0.8, 0.172)):
+        n = 447 * 0.06 / distance
+        one = rng.normal(distance, 0.573e-3 * (distance / 0.4) ** 2, 20_000)
+        assert 1000 * (n * one / 447).std() == pytest.approx(want, rel=0.03)
     u = 447 * np.array([-0.03, 0.03]) / 0.4
     depth = rng.normal(0.4, 0.573e-3, (20_000, 2, 25))
 

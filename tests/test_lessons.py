@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import json
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 
 from coursekit import lessons
 from coursekit.lessons import progress
-from coursekit.lessons.checkpoints import Choice, _panel
+from coursekit.lessons.checkpoints import EXAMPLES, Choice, Number, _panel
 from coursekit.lessons.exercises import Exercise, _as_numbers, _run
 from coursekit.lessons.verdict import Verdict
 
@@ -59,7 +60,52 @@ def test_the_cases_separate_every_two_models(exercise: Exercise) -> None:
     ]
     for (name_a, a), (name_b, b) in itertools.combinations(answers, 2):
         gap = max(_gap(x, y) for x, y in zip(a, b, strict=True))
+        # An iteration that stops one round before it is good enough is not far off.
+        far = 1 if name_b == "too_few_rounds" else 20
+        assert name_a == name_b or gap > far * exercise.tolerance, (name_a, name_b, gap)
+
+
+@each_exercise
+def test_the_core_cases_separate_every_two_models(exercise: Exercise) -> None:
+    """Those that are wrong there, so that a core attempt is called by its own mistake."""
+    if exercise.core is None:
+        return
+    core = [args for args in exercise.cases if exercise._is_core(args)]
+    assert 0 < len(core) < len(exercise.cases)
+    models = [("right", exercise.model())] + [
+        (m.name, exercise.model(m)) for m in exercise.mistakes
+    ]
+    answers = [(n, [_as_numbers(_run(model, args).value) for args in core]) for n, model in models]
+    right = answers[0][1]
+    wrong = [
+        (n, a)
+        for n, a in answers
+        if any(not exercise._agrees(x, y) for x, y in zip(a, right, strict=True))
+    ]
+    assert len(wrong) > 10
+    for (name_a, a), (name_b, b) in itertools.combinations([answers[0], *wrong], 2):
+        gap = max(_gap(x, y) for x, y in zip(a, b, strict=True))
         assert name_a == name_b or gap > 20 * exercise.tolerance, (name_a, name_b, gap)
+
+
+@each_exercise
+def test_one_core_mistake_is_one_mistake(exercise: Exercise) -> None:
+    """An attempt that leaves the rest alone is judged, and counted, on the core cases only."""
+    if exercise.core is None:
+        return
+    count = sum(exercise._is_core(args) for args in exercise.cases)
+    for mistake in exercise.mistakes:
+        model = exercise.model(mistake)
+        verdict = exercise.judge(lambda *args, model=model: model(*exercise.core.of(args)))
+        if mistake.step in ("read", "bend", "unbend"):
+            assert (verdict.kind, verdict.named) == ("core right", None)
+            assert f"all {count} cases without distortion agree" in verdict.headline
+        elif verdict.kind != "core right":  # bent before the division: the core does not show it
+            assert (verdict.kind, verdict.named) == ("wrong", mistake.name)
+            assert f"of the {count} cases without distortion agree." in verdict.headline
+            assert verdict.headline.endswith("(`dist` can wait.)")
+            assert "coefficients" not in verdict.lines[0]
+            assert mistake.ask in verdict.lines
 
 
 def _gap(x: np.ndarray, y: np.ndarray) -> float:
@@ -72,7 +118,7 @@ def _gap(x: np.ndarray, y: np.ndarray) -> float:
 def test_two_mistakes_are_called_more_than_one(exercise: Exercise) -> None:
     """Unless a single one gives the very same numbers (one hides the other, say): then that one."""
     steps = list(exercise.steps)
-    for a, b in itertools.permutations(exercise.mistakes, 2):
+    for a, b in itertools.permutations([m for m in exercise.mistakes if not m.alone], 2):
         if steps.index(a.step) >= steps.index(b.step):
             continue
         pair = exercise.model(a, b)
@@ -161,6 +207,39 @@ def half_none(points, K, dist=None):
     return right(points, K) if dist is None else None
 
 
+def half_unready(points, K, dist=None):
+    if dist is not None:
+        raise NotImplementedError
+    return right(points, K)
+
+
+def core_only(points, K, dist=None):
+    return right(points, K)
+
+
+def core_in_place(points, K, dist=None):
+    points /= points[:, 2:]
+    return right(points, K)
+
+
+def none_in_one_core_case(points, K, dist=None):
+    return right(points, K) if len(points) == 1 else None
+
+
+CORE_RIGHT = (
+    "project: the core is right: all 4 cases without distortion agree. "
+    "Deeper: the other 6 use `dist`."
+)
+TRANSPOSED_CORE = (
+    "project: your result is transposed: one column a point, and one row a point is wanted. "
+    "The numbers are right. (`dist` can wait.)"
+)
+IN_PLACE_CORE = (
+    "project: your function changes the array it is given. The numbers are right. "
+    "(`dist` can wait.)"
+)
+
+
 @pytest.mark.parametrize(
     ("function", "kind", "says"),
     [
@@ -171,7 +250,14 @@ def half_none(points, K, dist=None):
         (raises_late, "raised", "return right(points, K) @ np.eye(7)"),
         (exits, "raised", "SystemExit"),
         (recursion, "raised", "RecursionError"),
-        (half_none, "wrong", "is a `return` missing"),
+        (half_none, "core right", CORE_RIGHT),
+        (half_unready, "core right", CORE_RIGHT),
+        (core_only, "core right", CORE_RIGHT),
+        (lambda *args: core_only(*args).T, "wrong", TRANSPOSED_CORE),
+        (core_in_place, "wrong", IN_PLACE_CORE),
+        (lambda *args: core_only(*args)[:, ::-1].T, "wrong", "more than one mistake"),
+        (lambda *args: np.c_[core_only(*args), [0] * len(args[0])], "wrong", "wrong shape"),
+        (none_in_one_core_case, "wrong", "is a `return` missing"),
         (lambda *args: "pixels", "wrong", "a str"),
         (lambda *args: {1: 2}, "wrong", "a dict"),
         (lambda *args: [[1, 2], [3]], "wrong", "a list"),
@@ -269,6 +355,28 @@ def test_the_counterexample_of_the_design() -> None:
     assert "expected (573.019, 140.749), yours (573.138, 140.658) px" in verdict.lines[0]
 
 
+def test_a_core_mistake_is_told_with_its_own_count() -> None:
+    verdict = PROJECT.judge(lambda points, K, dist=None: right(points * [1, -1, 1], K))
+    assert verdict.headline == (
+        "project: your y axis points up. 0 of the 4 cases without distortion agree. "
+        "(`dist` can wait.)"
+    )
+    assert verdict.named == "y_up"
+
+
+def test_an_unknown_mistake_in_the_core_is_counted_there_too() -> None:
+    verdict = PROJECT.judge(lambda points, K, dist=None: right(points, K) + 0.1)
+    assert "not right yet. 0 of the 4 cases without distortion agree." in verdict.headline
+    assert verdict.named is None
+
+
+def test_without_a_core_nothing_can_wait() -> None:
+    whole = dataclasses.replace(PROJECT, core=None)
+    verdict = whole.judge(core_only)
+    assert verdict.kind == "wrong"
+    assert "4 of 10 cases agree." in verdict.headline
+
+
 def test_unknown_names() -> None:
     with pytest.raises(ValueError, match=r"pinhole\.project"):
         lessons.check("pinhole.projection", right)
@@ -333,7 +441,23 @@ def test_the_first_mistake_to_look_at_shows_in_the_case() -> None:
     assert PROJECT.judge(model).named == "several, first principal_point_forgotten"
 
 
-@pytest.mark.parametrize("given", ["", "two", "nan", "inf", None, "20 00", [2000], "2,000"])
+@pytest.mark.parametrize("given", ["2,000", "2,000 px"])
+def test_a_number_with_two_readings_is_the_one_that_is_known(given) -> None:
+    assert PITCH.judge(given).kind == "right"
+    assert PITCH.judge(given.replace("2", "1")).named == "1000"
+    assert PITCH.judge(given.replace("2", "3")).kind == "not attempted"
+
+
+def test_no_message_tells_a_number() -> None:
+    """Neither asking again nor the example of a number gives an answer away."""
+    for checkpoint in CHECKPOINTS.values():
+        if isinstance(checkpoint, Number):
+            assert "such as 0.37 or 150" in checkpoint.judge("10/0.005").headline
+            for example in EXAMPLES.split(" or "):
+                assert not checkpoint._close(float(example), checkpoint.value)
+
+
+@pytest.mark.parametrize("given", ["", "two", "nan", "inf", None, "20 00", [2000], "3,000"])
 def test_what_is_no_number_is_not_an_attempt(given) -> None:
     assert PITCH.answer(given).kind == "not attempted"
     assert progress.read() == {}
@@ -386,7 +510,18 @@ def test_attempts_are_kept_in_order(own_results: Path) -> None:
     assert [a["kind"] for a in kept["pinhole.pitch"]] == ["wrong", "right"]
     rows = dict(lessons.evidence("pinhole").rows())
     assert "pitch: right at try 2" in " ".join(rows.values())
-    assert "project: right; deproject: not answered yet" in " ".join(rows.values())
+    assert "project: right; deproject: not attempted yet" in " ".join(rows.values())
+    assert "range: not answered yet" in " ".join(rows.values())
+
+
+def test_evidence_of_the_core() -> None:
+    lessons.check("pinhole.project", lambda *args: right(*args)[:, ::-1])
+    lessons.check("pinhole.project", core_only)
+    assert "project: core right" in repr(lessons.evidence("pinhole"))
+    lessons.check("pinhole.project", in_place)  # what was shown stays shown
+    assert "project: core right" in repr(lessons.evidence("pinhole"))
+    lessons.check("pinhole.project", right)
+    assert "project: right at try 4" in repr(lessons.evidence("pinhole"))
 
 
 def test_a_damaged_record_is_set_aside(own_results: Path) -> None:

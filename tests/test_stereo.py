@@ -514,8 +514,9 @@ def test_one_distance_has_no_exponent_and_says_so():
     assert fit.exponent is None
     assert fit.exponent_interval is None
     assert fit.sigma_d_px == pytest.approx(0.08, rel=2e-3)
-    assert str(fit).endswith("from 1 distance. Note: one distance has no exponent; sigma_d takes "
-                             "it to be 2.")  # fmt: skip
+    assert str(fit).endswith(
+        "from 1 distance.\n    Note: one distance has no exponent; sigma_d takes it to be 2."
+    )
 
 
 def test_three_near_distances_say_how_little_they_carry():
@@ -525,10 +526,10 @@ def test_three_near_distances_say_how_little_they_carry():
     low, high = fit.exponent_interval
     assert low < 1
     assert high > 3
-    assert "span a factor of 2.0 only: 10 % more noise at one end moves the exponent by 0.14" in (
-        str(fit)
-    )
-    assert "scatter about the law" in str(fit)
+    said = " ".join(str(fit).split())
+    assert "span a factor of 2.0 only: 10 % more noise at one end moves the exponent by" in said
+    assert "scatter about the law" in said
+    assert max(map(len, str(fit).splitlines())) <= 100
 
 
 def test_a_fit_reads_as_a_sentence():
@@ -545,8 +546,9 @@ def test_distances_without_noise_are_left_out_and_named():
     stds[0], stds[3] = 0.0, np.nan
     fit = stereo.fit_noise(FAR, stds, 500, FX, BASELINE)
     assert fit.n_distances == 4
-    assert "0.3 m is left out: no pixel ever changed there" in str(fit)
-    assert "1 m is left out: it has no std" in str(fit)
+    said = " ".join(str(fit).split())
+    assert "0.3 m is left out: no pixel ever changed there" in said
+    assert "1 m is left out: it has no std" in said
 
 
 @pytest.mark.parametrize(

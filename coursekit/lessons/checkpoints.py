@@ -134,9 +134,9 @@ class Number(Checkpoint):
 
     def judge(self, given: Any) -> Verdict:
         """The verdict on a number, or on text such as "2.4" or "2,4 mm"."""
-        number = _read_number(given, self.unit)
+        number = self._meant(_readings(given, self.unit))
         if number is None:
-            say = f"Type a number in {self.unit}, such as 2.4 or 2000; got {given!r}."
+            say = f"Type a number in {self.unit}, such as {EXAMPLES}; got {given!r}."
             return Verdict(self.name, "not attempted", say)
         said = f"{number:g} {self.unit}"
         if self._close(number, self.value):
@@ -154,6 +154,14 @@ class Number(Checkpoint):
         lines = (self.hint, "Think again, and try another number.")
         return Verdict(self.name, "wrong", f"{said}: not this.", lines)
 
+    def _meant(self, readings: list[float]) -> float | None:
+        """The only reading, or else the one that is right or a known slip."""
+        for value in (self.value, *(c.value for c in self.classics)):
+            for number in readings:
+                if self._close(number, value):
+                    return number
+        return readings[0] if len(readings) == 1 else None
+
     def _close(self, number: float, value: float) -> bool:
         return math.isclose(number, value, rel_tol=self.tolerance, abs_tol=1e-12)
 
@@ -170,28 +178,30 @@ class Number(Checkpoint):
         return ipywidgets.Text(placeholder=f"a number in {self.unit}")
 
 
+EXAMPLES = "0.37 or 150"  # of numbers, and no checkpoint's answer
 LENGTHS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 
 
-def _read_number(given: Any, unit: str) -> float | None:
-    """The number in the student's answer, in `unit`, or None for what is no number or unclear.
+def _readings(given: Any, unit: str) -> list[float]:
+    """The number in the student's answer, in `unit`; none for what is no number.
 
     A decimal comma, spaces between digits and a unit (of length, if `unit` is one) are accepted.
-    "2,000" is not: it is two to some readers and two thousand to others.
+    "2,000" has two readings: it is two to some writers and two thousand to others.
     """
     text = str(given).strip().replace("\N{MINUS SIGN}", "-")
     match = re.fullmatch(r"([-+\d.,\s]+(?:[eE][-+]?\d+)?)\s*([a-zA-Zµ]*)", text)
     if match is None:
-        return None
+        return []
     digits, given_unit = re.sub(r"(?<=\d)\s(?=\d{3}\b)", "", match[1]).strip(), match[2] or unit
-    if re.fullmatch(r"[-+]?\d+,\d+", digits) and not re.fullmatch(r"[-+]?\d{1,3},000", digits):
-        digits = digits.replace(",", ".")
+    written = [digits.replace(",", ".")] if re.fullmatch(r"[-+]?\d+,\d+", digits) else [digits]
+    if re.fullmatch(r"[-+]?\d{1,3},000", digits):
+        written.append(digits.replace(",", ""))
     factor = 1.0 if given_unit == unit else LENGTHS.get(given_unit, 0.0) / LENGTHS.get(unit, 1.0)
     try:
-        number = float(digits) * factor
+        numbers = [float(text) * factor for text in written]
     except ValueError:
-        return None
-    return number if math.isfinite(number) and factor else None
+        return []
+    return [number for number in numbers if math.isfinite(number) and factor]
 
 
 def _panel(checkpoint: Checkpoint) -> Any:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
 
+from coursekit import specifications
 from coursekit.lessons.checkpoints import Choice, Classic, Number, Option
 from coursekit.lessons.exercises import Exercise, Model, Step
 from coursekit.lessons.objectives import Objective
@@ -30,7 +32,7 @@ def _divide(power: Any, constant: float) -> Any:
     return power / constant
 
 
-def _times(slope: Any, sigma_d: float) -> Any:
+def _times(slope: Any, sigma_d: float, Z: Any) -> Any:
     return slope * sigma_d
 
 
@@ -41,7 +43,7 @@ def _as_it_is(value: Any) -> Any:
 def _build_depth_noise(steps: Mapping[str, Step]) -> Model:
     def depth_noise(Z: Any, fx: float, baseline: float, sigma_d: float) -> Any:
         slope = steps["divide"](steps["power"](Z), steps["constant"](fx, baseline))
-        return steps["result"](steps["noise"](slope, sigma_d))
+        return steps["result"](steps["noise"](slope, sigma_d, Z))
 
     return depth_noise
 
@@ -67,13 +69,13 @@ DEPTH_NOISE = Exercise(
         (1.0, 447.0, 0.05, 0.08),
         (np.array([0.30, 0.45, 0.60]), 431.1, 0.0502, 0.08),
         (np.array([0.15, 0.20, 0.30, 0.45]), 425.0, 0.018, 0.06),
-        (np.array([[0.5, 0.7, 1.1], [1.3, 1.7, 1.9]]), 390.4, 0.0951, 0.11),
+        (np.array([[0.5, 0.7, 1.1], [1.3, 1.7, 1.9]]), 390.4, 0.0951, 0.25),
     ],
     per_row=1,
     unit="m",
     tolerance=1e-8,
     describe=_describe_depth_noise,
-    show=lambda row: ", ".join(f"{v:.4g}" for v in np.ravel(row)),
+    show=lambda row: ", ".join(f"{v:.7g}" for v in np.ravel(row)),
 )
 
 _LINEAR = (
@@ -147,6 +149,28 @@ def constant_forgotten(fx: float, baseline: float) -> float:
     return 1.0
 
 
+_OTHER_BASELINE = (
+    "the baseline is a number of your own: B is this notebook's, the argument is called `baseline`",
+    "A D405 has its eyes 18 mm apart. What does your function return for it?",
+)
+
+
+@cache
+def _notebooks_baseline() -> float:
+    """The simulated camera's, which the notebook calls B, m."""
+    return specifications.device("D435").unit.baseline_m
+
+
+@DEPTH_NOISE.mistake("constant", *_OTHER_BASELINE, name="other_baseline")
+def baseline_of_the_notebook(fx: float, baseline: float) -> float:
+    return fx * _notebooks_baseline()
+
+
+@DEPTH_NOISE.mistake("constant", *_OTHER_BASELINE, name="other_baseline")
+def baseline_of_the_data_sheet(fx: float, baseline: float) -> float:
+    return fx * 0.050
+
+
 @DEPTH_NOISE.mistake(
     "divide",
     "you multiply by fx B where you should divide by it",
@@ -188,7 +212,7 @@ def upside_down(power: Any, constant: float) -> Any:
     "you divide by sigma_d where you should multiply by it",
     "A matcher that is twice as noisy: does your depth get better?",
 )
-def noise_divided(slope: Any, sigma_d: float) -> Any:
+def noise_divided(slope: Any, sigma_d: float, Z: Any) -> Any:
     return slope / sigma_d
 
 
@@ -197,8 +221,47 @@ def noise_divided(slope: Any, sigma_d: float) -> Any:
     "sigma_d is not used: this is the depth error of a whole pixel of disparity",
     "By how many pixels is the matcher off?",
 )
-def noise_forgotten(slope: Any, sigma_d: float) -> Any:
+def noise_forgotten(slope: Any, sigma_d: float, Z: Any) -> Any:
     return slope
+
+
+@DEPTH_NOISE.mistake(
+    "noise",
+    "there is a factor √2 too many",
+    "sigma_d is the noise of the *difference* of two positions. Whose errors are in it already?",
+)
+def root_of_two(slope: Any, sigma_d: float, Z: Any) -> Any:
+    return math.sqrt(2) * slope * sigma_d
+
+
+_DIFFERENCE = (
+    "this is a difference of two depths; the law is the slope times sigma_d",
+    "Double sigma_d: does your result double exactly? Differentiate fx B / d by hand.",
+)
+
+
+@DEPTH_NOISE.mistake("noise", *_DIFFERENCE, name="difference")
+def forward_difference(slope: Any, sigma_d: float, Z: Any) -> Any:
+    noise = slope * sigma_d  # fx B / (d - sigma_d) - Z
+    return noise / (1 - noise / Z)
+
+
+@DEPTH_NOISE.mistake("noise", *_DIFFERENCE, name="difference")
+def backward_difference(slope: Any, sigma_d: float, Z: Any) -> Any:
+    noise = slope * sigma_d  # Z - fx B / (d + sigma_d)
+    return noise / (1 + noise / Z)
+
+
+@DEPTH_NOISE.mistake("noise", *_DIFFERENCE, name="difference")
+def central_difference(slope: Any, sigma_d: float, Z: Any) -> Any:
+    noise = slope * sigma_d  # half of fx B / (d - sigma_d) - fx B / (d + sigma_d)
+    return noise / (1 - (noise / Z) ** 2)
+
+
+@DEPTH_NOISE.mistake("noise", *_DIFFERENCE, name="difference")
+def central_difference_of_halves(slope: Any, sigma_d: float, Z: Any) -> Any:
+    noise = slope * sigma_d  # fx B / (d - sigma_d / 2) - fx B / (d + sigma_d / 2)
+    return noise / (1 - (noise / Z / 2) ** 2)
 
 
 @DEPTH_NOISE.mistake(
@@ -253,6 +316,10 @@ def _column_and_row(u: float, v: float) -> Any:
     return u, v
 
 
+def _no_shortcut(image: Array, row: int, column: int) -> Any:
+    return None
+
+
 def _nearest(coordinate: float) -> int:
     return round(coordinate)
 
@@ -284,6 +351,9 @@ def _nan() -> float:
 def _build_robust_depth(steps: Mapping[str, Step]) -> Model:
     def robust_depth(depth_m: Array, u: float, v: float, half: int = 2, min_valid: int = 5) -> Any:
         column, row = (steps["round"](c) for c in steps["read"](u, v))
+        alone = steps["shortcut"](depth_m, row, column)
+        if alone is not None:
+            return alone
         pixels = steps["cut"](depth_m, *steps["window"](row, column, half))
         valid = steps["finite"](steps["zeros"](pixels.ravel()))
         if len(valid) == 0 or not steps["enough"](valid, pixels, min_valid):
@@ -329,6 +399,7 @@ ROBUST_DEPTH = Exercise(
     steps={
         "read": _column_and_row,
         "round": _nearest,
+        "shortcut": _no_shortcut,
         "window": _window,
         "cut": _cut,
         "zeros": _without_zeros,
@@ -405,6 +476,35 @@ def half_ignored(row: int, column: int, half: int) -> Window:
     return _window(row, column, 2)
 
 
+@ROBUST_DEPTH.mistake(
+    "window",
+    "your window reaches only `half // 2` pixels to each side",
+    "`half = 2` makes a window of 5x5. How many pixels does yours have?",
+)
+def half_halved(row: int, column: int, half: int) -> Window:
+    return _window(row, column, half // 2)
+
+
+_ALONE = (
+    "where the pixel itself has a depth, you return that alone",
+    "A flying pixel has a depth, too. Who would notice?",
+)
+
+
+@ROBUST_DEPTH.mistake("shortcut", *_ALONE, name="pixel_alone")
+def pixel_alone(image: Array, row: int, column: int) -> Any:
+    height, width = image.shape
+    inside = 0 <= row < height and 0 <= column < width
+    return image[row, column] if inside and 0 < image[row, column] < math.inf else None
+
+
+@ROBUST_DEPTH.mistake("shortcut", *_ALONE, name="pixel_alone")
+def pixel_alone_unless_zero(image: Array, row: int, column: int) -> Any:
+    height, width = image.shape
+    known = -height <= row < height and -width <= column < width  # -9 counts from the far end
+    return image[row, column] if known and image[row, column] > 0 else None
+
+
 _NEGATIVE = (
     "near the left or top border an index goes negative, and Python counts that from the far end",
     "Try a list of ten numbers: what is `numbers[-2:3]`, and what is `numbers[-2]`?",
@@ -463,14 +563,34 @@ def border_repeated(image: Array, top: int, bottom: int, left: int, right: int) 
     return image[np.ix_(rows, columns)]
 
 
-@ROBUST_DEPTH.mistake(
-    "cut",
+_LOST = (
     "the last row or column of the image is lost",
     "In an image of 16 columns the last is number 15. Does a slice that ends at 15 hold it?",
 )
+
+
+@ROBUST_DEPTH.mistake("cut", *_LOST)
 def border_lost(image: Array, top: int, bottom: int, left: int, right: int) -> Array:
     height, width = image.shape
     return _cut(image, top, min(bottom, height - 1), left, min(right, width - 1))
+
+
+@ROBUST_DEPTH.mistake("cut", *_LOST, name="border_lost")
+def border_lost_and_negative_end(
+    image: Array, top: int, bottom: int, left: int, right: int
+) -> Array:
+    height, width = image.shape
+    return image[max(top, 0) : min(bottom, height - 1), max(left, 0) : min(right, width - 1)]
+
+
+@ROBUST_DEPTH.mistake(
+    "cut",
+    "indices are taken modulo the image's size: at one border you read the opposite one",
+    "What is -1 % 16? Is the pixel at the right border a neighbour of the one at the left?",
+)
+def modulo(image: Array, top: int, bottom: int, left: int, right: int) -> Array:
+    height, width = image.shape
+    return image[np.ix_(np.arange(top, bottom) % height, np.arange(left, right) % width)]
 
 
 @ROBUST_DEPTH.mistake(
@@ -786,8 +906,9 @@ CHECKPOINTS = [
     Choice(
         name="depth_noise.width",
         question="In the studio exercise you measure the width of a block in the middle of the "
-        "image, between two fixed pixels, in each of 100 frames, at three distances. Does the "
-        "standard deviation of that *width* follow the curve of σ_Z?",
+        "image, between two fixed pixels and from the depth of one pixel on its face, in each of "
+        "100 frames, at three distances. Does the standard deviation of that *width* follow the "
+        "curve of σ_Z?",
         options=(
             Option(
                 "yes: the width is computed from depths, so their noise is its noise",
@@ -797,18 +918,18 @@ CHECKPOINTS = [
             Option(
                 "no: a width is a difference, so the noise cancels",
                 "X = x Z, and x has opposite signs at the two ends: an error in Z that they share "
-                "moves them apart instead of along. The rest is not shared at all.",
+                "moves them apart instead of along.",
             ),
             Option(
                 "no: it falls with distance, because the block gets smaller in the image",
                 "tan θ does shrink, with 1/Z. The noise that it is multiplied with grows with Z².",
             ),
             Option(
-                "no: it is far smaller and grows about like Z",
-                "σ_Z tan θ with tan θ = (half the width) / Z: Z² / Z = Z. At 0.4 m, 60 mm wide, "
-                "0.57 mm in depth leaves 0.06 mm in width (with a median over a window down to "
-                "0.015 mm). How well the *edges* are found matters more: 0.1 px makes 0.13 mm. "
-                "So the curve goes with the depth of the face.",
+                "no: it is several times smaller and grows about like Z",
+                "σ_Z times (the width) / Z: Z² / Z = Z. At 0.4 m, 60 mm wide, 0.57 mm in depth "
+                "leaves 0.09 mm in width (0.06 mm if each end takes its own depth, less with a "
+                "median over a window). How well the *edges* are found matters more: 0.1 px makes "
+                "0.13 mm. So the curve goes with the depth of the face.",
                 right=True,
             ),
         ),
@@ -844,24 +965,27 @@ CHECKPOINTS = [
 
 OBJECTIVES = (
     Objective(
-        "say how three kinds of camera make depth, and know each by the way it fails",
+        "predict depth noise from baseline, focal length and distance, and derive the law",
+        ("depth_noise.twice_as_far", "depth_noise.depth_noise"),
+    ),
+    Objective(
+        "say what averaging can remove, and what it cannot",
+        ("depth_noise.hundred_frames",),
+    ),
+    Objective(
+        "deeper: say where the square comes from, and what a place costs",
+        ("depth_noise.why_squared", "depth_noise.short_baseline"),
+    ),
+    Objective(
+        "deeper: say how three kinds of camera make depth, and know each by the way it fails",
         ("depth_noise.rounded_corner", "depth_noise.minimum_range"),
     ),
     Objective(
-        "predict depth noise from baseline, focal length and distance, and derive the law",
-        (
-            "depth_noise.twice_as_far",
-            "depth_noise.why_squared",
-            "depth_noise.short_baseline",
-            "depth_noise.depth_noise",
-        ),
-    ),
-    Objective(
-        "tell noise from bias, and say what averaging and a width can show of either",
-        ("depth_noise.long_baseline", "depth_noise.hundred_frames", "depth_noise.width"),
-    ),
-    Objective(
-        "read one depth out of a depth image without being deceived",
+        "deeper: read one depth out of a depth image without being deceived",
         ("depth_noise.robust_depth",),
+    ),
+    Objective(
+        "studio: tell noise from bias, in depth and in width",
+        ("depth_noise.width", "depth_noise.long_baseline"),
     ),
 )

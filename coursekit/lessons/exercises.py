@@ -17,7 +17,7 @@ import linecache
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -31,13 +31,30 @@ Model = Callable[..., Any]
 
 @dataclass(frozen=True)
 class Mistake:
-    """One wrong step: what it says to the learner, and a question that leads on."""
+    """One wrong step: what it says to the learner, and a question that leads on.
+
+    One that stands `alone` is not tried together with others (one of a long family, say).
+    """
 
     name: str
     step: str
     says: str
     ask: str
     wrong: Step
+    alone: bool = False
+
+
+@dataclass(frozen=True)
+class Core:
+    """The part of an exercise that comes first, where the rest may wait.
+
+    of(args) is a case without the rest; the cases that it leaves as they are belong to the core.
+    The verdict calls them "the cases <which>", and what may wait `rest`.
+    """
+
+    of: Callable[[tuple[Any, ...]], tuple[Any, ...]]
+    which: str
+    rest: str
 
 
 @dataclass
@@ -49,7 +66,9 @@ class Exercise:
     result has rows and the first `per_row` arguments have the same, one row of them is shown;
     otherwise (a result that is one number, say) the whole case. Results agree within `tolerance`
     (in `unit`) or 1e-9 of their size, and NaN with NaN. Where `nan_answers`, NaN is an answer
-    like any other; otherwise a wrong model that comes to NaN or infinity has overflowed.
+    like any other; otherwise a wrong model that comes to NaN or infinity has overflowed. An
+    attempt that leaves out what is beyond the `core` is judged by the core cases alone: by an
+    exercise that has only those, and is `part_of` this one.
     """
 
     name: str
@@ -62,7 +81,12 @@ class Exercise:
     describe: Callable[[tuple[Any, ...]], str]
     show: Callable[[np.ndarray], str]
     nan_answers: bool = False
+    core: Core | None = None
     mistakes: list[Mistake] = field(default_factory=list)
+    part_of: Exercise | None = field(default=None, repr=False)
+    _known: dict[tuple[int, ...], np.ndarray | None] = field(
+        default_factory=dict, init=False, repr=False
+    )
 
     @property
     def function(self) -> str:
@@ -70,12 +94,12 @@ class Exercise:
         return self.name.rpartition(".")[2]
 
     def mistake(
-        self, step: str, says: str, ask: str, name: str | None = None
+        self, step: str, says: str, ask: str, name: str | None = None, alone: bool = False
     ) -> Callable[[Step], Step]:
         """Decorator that adds a misconception, named after the function unless `name` is given."""
 
         def add(wrong: Step) -> Step:
-            self.mistakes.append(Mistake(name or wrong.__name__, step, says, ask, wrong))
+            self.mistakes.append(Mistake(name or wrong.__name__, step, says, ask, wrong, alone))
             return wrong
 
         return add
@@ -94,11 +118,34 @@ class Exercise:
         if not callable(function):
             return self._say("not attempted", f"got a {type(function).__name__}, not a function.")
         runs = [_run(function, args) for args in self.cases]
-        expected = [np.asarray(_run(self.model(), args).value, float) for args in self.cases]
+        if self.core and self._leaves_the_rest(function, runs):
+            cases = [args for args in self.cases if self._is_core(args)]
+            return replace(self, cases=cases, core=None, part_of=self).judge(function)
         unfinished = self._unfinished(runs)
         if unfinished:
             return unfinished
+        expected = [np.asarray(self._answer((), args)) for args in self.cases]
         return self._compare(runs, expected)
+
+    def _is_core(self, args: tuple[Any, ...]) -> bool:
+        return self.core is None or len(self.core.of(args)) == len(args)
+
+    def _leaves_the_rest(self, function: Callable[..., Any], runs: list[Run]) -> bool:
+        """Whether every case beyond the core gets nothing, or what it gets without the rest."""
+        assert self.core is not None
+        for run, args in zip(runs, self.cases, strict=True):
+            if self._is_core(args) or isinstance(run.error, NotImplementedError):
+                continue
+            if run.error is not None:
+                return False
+            if run.value is not None:
+                value = _as_numbers(run.value)
+                without = _as_numbers(_run(function, self.core.of(args)).value)
+                if value is None or without is None:
+                    return False
+                if not np.array_equal(value, without, equal_nan=True):
+                    return False
+        return True
 
     def _unfinished(self, runs: list[Run]) -> Verdict | None:
         """Not attempted, raised, or something that is not an array of the right shape."""
@@ -151,7 +198,12 @@ class Exercise:
         return self._wrong(values, expected, agree, formal)
 
     def _right(self) -> Verdict:
-        text = f"right. All {len(self.cases)} cases agree to {self.tolerance:g} {self.unit}."
+        count = len(self.cases)
+        if self.part_of and self.part_of.core:
+            core, others = self.part_of.core, len(self.part_of.cases) - count
+            text = f"the core is right: all {count} cases {core.which} agree."
+            return self._say("core right", f"{text} Deeper: the other {others} use {core.rest}.")
+        text = f"right. All {count} cases agree to {self.tolerance:g} {self.unit}."
         return self._say("right", text)
 
     def _formal(self, formal: list[Mistake]) -> Verdict:
@@ -159,7 +211,7 @@ class Exercise:
             return self._several(formal[0], ())
         return self._say(
             "wrong",
-            f"{formal[0].says}. The numbers are right.",
+            f"{formal[0].says}. The numbers are right.{self._later}",
             formal[0].ask,
             named=formal[0].name,
         )
@@ -171,7 +223,7 @@ class Exercise:
         agree: list[bool],
         formal: list[Mistake],
     ) -> Verdict:
-        count = f"{sum(agree)} of {len(agree)} cases agree."
+        count = f"{sum(agree)} of {self._all_cases} agree.{self._later}"
         first = agree.index(False)
         evidence = self._evidence(first, values[first], expected[first])
         if formal:
@@ -196,10 +248,24 @@ class Exercise:
     def _seen_in(self, case: int, mistakes: tuple[Mistake, ...], want: np.ndarray) -> Mistake:
         """The first of several mistakes that by itself shows in this case."""
         for mistake in mistakes:
-            value = _as_numbers(_run(self.model(mistake), self.cases[case]).value)
+            value = self._answer((mistake,), self.cases[case])
             if value is None or value.shape != want.shape or not self._agrees(value, want):
                 return mistake
         return mistakes[0]
+
+    @property
+    def _all_cases(self) -> str:
+        count = len(self.cases)
+        if self.part_of and self.part_of.core:
+            return f"the {count} cases {self.part_of.core.which}"
+        return f"{count} cases"
+
+    @property
+    def _later(self) -> str:
+        """Says in a verdict on the core what may wait."""
+        if self.part_of and self.part_of.core:
+            return f" ({self.part_of.core.rest} can wait.)"
+        return ""
 
     def _several(self, first: Mistake, lines: tuple[str, ...]) -> Verdict:
         return self._say(
@@ -214,7 +280,7 @@ class Exercise:
         """Each mistake alone, then each pair of different steps, earlier step first."""
         order = list(self.steps)
         yield from ((m,) for m in self.mistakes)
-        for a, b in itertools.combinations(self.mistakes, 2):
+        for a, b in itertools.combinations([m for m in self.mistakes if not m.alone], 2):
             if a.step != b.step:
                 yield (a, b) if order.index(a.step) < order.index(b.step) else (b, a)
 
@@ -222,17 +288,25 @@ class Exercise:
         """Whether a wrong model gives exactly these values.
 
         Where the model itself overflows (an iteration that diverges, say) nobody's arithmetic
-        agrees, and the case is left out.
+        agrees, and the case is left out; so one case at least must show that the model is wrong.
         """
-        model, compared = self.model(*mistakes), False
+        shown = False
         for value, args in zip(values, self.cases, strict=True):
-            wrong = _as_numbers(_run(model, args).value)
+            wrong = self._answer(mistakes, args)
             if wrong is None or not (self.nan_answers or np.isfinite(wrong).all()):
                 continue
             if not self._agrees(value, wrong):
                 return False
-            compared = True
-        return compared
+            right = self._answer((), args)
+            shown = shown or right is None or not self._agrees(wrong, right)
+        return shown
+
+    def _answer(self, mistakes: tuple[Mistake, ...], args: tuple[Any, ...]) -> np.ndarray | None:
+        """What a wrong model makes of a case; kept, because every check asks all of them."""
+        key = (*map(id, mistakes), id(args))
+        if key not in self._known:
+            self._known[key] = _as_numbers(_run(self.model(*mistakes), args).value)
+        return self._known[key]
 
     def _agrees(self, value: np.ndarray, want: np.ndarray) -> bool:
         return np.allclose(value, want, rtol=1e-9, atol=self.tolerance, equal_nan=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from coursekit.lessons import progress
 
-WORDS = {"right": "right", "wrong": "not right yet", "raised": "raised an error"}
+WORDS = {"wrong": "not right yet", "raised": "raised an error"}
 
 
 @dataclass(frozen=True)
@@ -26,11 +26,15 @@ class Evidence:
 
     def rows(self) -> list[tuple[str, str]]:
         """(objective, evidence) as text; a later attempt counts, the first one is mentioned."""
-        attempts = progress.read()
-        return [
-            (o.text, "; ".join(f"{_words(n)}: {_state(attempts.get(n, []))}" for n in o.names))
-            for o in self.objectives
-        ]
+        from coursekit import lessons  # which imports this module
+
+        attempts, exercises = progress.read(), lessons.exercises()
+
+        def state(name: str) -> str:
+            nothing = "not attempted yet" if name in exercises else "not answered yet"
+            return f"{_words(name)}: {_state(attempts.get(name, [])) or nothing}"
+
+        return [(o.text, "; ".join(map(state, o.names))) for o in self.objectives]
 
     def __repr__(self) -> str:
         return "\n".join(f"- {text}\n  {evidence}" for text, evidence in self.rows())
@@ -50,10 +54,11 @@ def _words(name: str) -> str:
 
 
 def _state(attempts: list[dict[str, str]]) -> str:
+    """The best that there was: right, and when; the core right; else how the last one stands."""
     kinds = [a["kind"] for a in attempts]
-    if not kinds:
-        return "not answered yet"
-    if "right" not in kinds:
-        return WORDS.get(kinds[-1], kinds[-1])
-    tries = kinds.index("right") + 1
-    return "right" if tries == 1 else f"right at try {tries}"
+    if "right" in kinds:
+        tries = kinds.index("right") + 1
+        return "right" if tries == 1 else f"right at try {tries}"
+    if "core right" in kinds:
+        return "core right"
+    return WORDS.get(kinds[-1], kinds[-1]) if kinds else ""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from coursekit.lessons.checkpoints import Choice, Classic, Number, Option
-from coursekit.lessons.exercises import Exercise, Model, Step
+from coursekit.lessons.exercises import Core, Exercise, Model, Step
 from coursekit.lessons.objectives import Objective
 
 Array = np.ndarray
@@ -24,7 +24,7 @@ SEVERAL = np.array([[0.25, 0.40, 0.80], [-0.31, 0.12, 0.55], [0.07, -0.26, 0.62]
 MIXED = np.array([-0.27, 0.11, 0.0018, -0.0012, 0.05])
 
 
-# The steps of projection. The third of x, y, w is 1 unless somebody forgets to divide by Z.
+# The steps of projection. The third of x, y, w is 1 unless somebody treats Z in a way of their own.
 
 
 def _normalise(points: Array) -> Any:
@@ -117,6 +117,7 @@ PROJECT = Exercise(
     tolerance=1e-3,
     describe=_describe_project,
     show=lambda row: _tuple(row, 3),
+    core=Core(of=lambda args: args[:2], which="without distortion", rest="`dist`"),
 )
 
 
@@ -144,6 +145,25 @@ def homogeneous_without_division(points: Array) -> Any:
 def divided_by_range(points: Array) -> Any:
     length = np.linalg.norm(points, axis=1)
     return points[:, 0] / length, points[:, 1] / length, 1.0
+
+
+@PROJECT.mistake(
+    "normalise",
+    "the principal point is divided by Z as well",
+    "Where does a point on the optical axis land, at 0.5 m and at 1 m? And with yours?",
+)
+def centre_divided(points: Array) -> Any:
+    x, y, _ = _normalise(points)
+    return x, y, 1.0 / points[:, 2]
+
+
+@PROJECT.mistake(
+    "normalise",
+    "the ratios are upside down: Z is divided by X and by Y",
+    "Move a point twice as far to the right. Does yours move farther to the right in the image?",
+)
+def upside_down(points: Array) -> Any:
+    return points[:, 2] / points[:, 0], points[:, 2] / points[:, 1], 1.0
 
 
 _UP = ("your y axis points up", "In which row is a point below the optical axis?")
@@ -315,26 +335,42 @@ def tangential_after_radial(
 
 @PROJECT.mistake(
     "bend",
+    "the 1 is missing in the radial factor",
+    "If all five coefficients are 0, nothing may move. Where do your points land then?",
+)
+def one_missing(x: Array, y: Array, *dist: float) -> Any:
+    bent_x, bent_y = _bend(x, y, *dist)
+    return bent_x - x, bent_y - y
+
+
+def _powers(a: float, b: float, c: float, tangential: float) -> Step:
+    """`bend` with these powers of r² in the three radial terms and in the tangential ones."""
+
+    def bend(x: Array, y: Array, k1: float, k2: float, p1: float, p2: float, k3: float) -> Any:
+        r2 = x * x + y * y
+        radial = 1 + k1 * r2**a + k2 * r2**b + k3 * r2**c
+        return (
+            x * radial + 2 * p1 * x * y + p2 * (r2**tangential + 2 * x * x),
+            y * radial + p1 * (r2**tangential + 2 * y * y) + 2 * p2 * x * y,
+        )
+
+    return bend
+
+
+_RADIUS = (
     "the radial polynomial runs in r instead of r²",
     "With k1 alone, the displacement grows as the third power of the radius. How does yours?",
 )
-def r_for_r2(x: Array, y: Array, k1: float, k2: float, p1: float, p2: float, k3: float) -> Any:
-    r2 = x * x + y * y
-    r = np.sqrt(r2)
-    radial = 1 + k1 * r + k2 * r**2 + k3 * r**3
-    return (
-        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-    )
+PROJECT.mistake("bend", *_RADIUS, name="r_for_r2")(_powers(0.5, 1, 1.5, 1))
+PROJECT.mistake("bend", *_RADIUS, name="r_for_r2")(_powers(0.5, 1, 1.5, 0.5))
 
-
-@PROJECT.mistake(
-    "image",
-    "the pinhole part is right, and the distortion is ignored",
-    "That is the core of the exercise. What could your function do with `dist`?",
+_SQUARED = (
+    "r² is taken for r and raised to the powers 2, 4 and 6",
+    "In your code, is the name of x² + y² the name of a radius or of its square?",
 )
-def distortion_ignored(points: Array, normalise: Step, bend: Step, to_pixels: Step) -> Any:
-    return to_pixels(*normalise(points))
+PROJECT.mistake("bend", *_SQUARED, name="r2_for_r")(_powers(2, 4, 6, 1))
+PROJECT.mistake("bend", *_SQUARED, name="r2_for_r")(_powers(2, 4, 6, 2))
+PROJECT.mistake("bend", *_SQUARED, name="r2_for_r")(_powers(1, 4, 6, 1))
 
 
 @PROJECT.mistake(
@@ -410,26 +446,28 @@ def half_pixel_less(u: Array, v: Array) -> Array:
 
 # --- deproject ---
 
+# The steps back. The third of x, y, w is 1 unless somebody multiplies from the wrong side.
+
 
 def _to_normalised(pixels: Array, K: Array) -> Any:
-    return (pixels[:, 0] - K[0, 2]) / K[0, 0], (pixels[:, 1] - K[1, 2]) / K[1, 1]
+    return (pixels[:, 0] - K[0, 2]) / K[0, 0], (pixels[:, 1] - K[1, 2]) / K[1, 1], 1.0
 
 
 def _iterate(rounds: int) -> Step:
     """The fixed-point iteration, so many rounds of it."""
 
-    def unbend(x: Array, y: Array, *dist: float) -> Any:
+    def unbend(x: Array, y: Array, bend: Step, *dist: float) -> Any:
         xd, yd = x, y
         for _ in range(rounds):
-            bent_x, bent_y = _bend(x, y, *dist)
+            bent_x, bent_y = bend(x, y)
             x, y = x + xd - bent_x, y + yd - bent_y
         return x, y
 
     return unbend
 
 
-def _scale(x: Array, y: Array, depth: Array) -> Any:
-    return x * depth, y * depth, depth
+def _scale(x: Array, y: Array, w: Any, depth: Array) -> Any:
+    return x * depth, y * depth, w * depth
 
 
 def _points(X: Array, Y: Array, Z: Array) -> Array:
@@ -438,10 +476,11 @@ def _points(X: Array, Y: Array, Z: Array) -> Array:
 
 def _build_deproject(steps: Mapping[str, Step]) -> Model:
     def deproject(pixels: Array, depth: Array, K: Array, dist: Array | None = None) -> Any:
-        x, y = steps["to_normalised"](pixels, K)
+        x, y, w = steps["to_normalised"](pixels, K)
         if dist is not None:
-            x, y = steps["unbend"](x, y, *steps["read"](*dist))
-        return steps["points"](*steps["scale"](x, y, depth))
+            read = steps["read"](*dist)
+            x, y = steps["unbend"](x, y, lambda x, y: steps["bend"](x, y, *read), *read)
+        return steps["points"](*steps["scale"](x, y, w, depth))
 
     return deproject
 
@@ -468,7 +507,8 @@ DEPROJECT = Exercise(
     steps={
         "to_normalised": _to_normalised,
         "read": _read,
-        "unbend": _iterate(100),
+        "bend": _bend,
+        "unbend": _iterate(40),
         "scale": _scale,
         "points": _points,
     },
@@ -478,6 +518,7 @@ DEPROJECT = Exercise(
         (_PIXELS, _DEPTHS, GENERIC_K),
         (_PIXEL, _DEPTHS[:1], LESSON_K, np.array([0.1, 0.0, 0.0, 0.0, 0.0])),
         (_PIXEL, _DEPTHS[:1], LESSON_K, np.array([0.0, 0.0, 0.0010, 0.0005, 0.0])),
+        (_PIXEL, _DEPTHS[:1], LESSON_K, np.array([0.0, 0.0, 0.0, 0.0, 0.4])),
         (_PIXELS, _DEPTHS, GENERIC_K, MIXED),
         (_CORNER, _DEPTHS[:1], WIDE_K, WIDE),
     ],
@@ -486,17 +527,16 @@ DEPROJECT = Exercise(
     tolerance=1e-5,
     describe=_describe_deproject,
     show=lambda row: _tuple(row, 4),
+    core=Core(of=lambda args: args[:3], which="without distortion", rest="`dist`"),
 )
 
 
-@DEPROJECT.mistake(
-    "scale",
-    "the depth is taken along the ray instead of along Z",
-    "A wall faces the camera. Does your function give all its pixels the same Z?",
-)
-def depth_along_ray(x: Array, y: Array, depth: Array) -> Any:
-    length = np.sqrt(x * x + y * y + 1)
-    return x * depth / length, y * depth / length, depth / length
+def _as_in_project(name: str) -> tuple[str, str]:
+    """What a mistake of the first exercise says and asks."""
+    return next((m.says, m.ask) for m in PROJECT.mistakes if m.name == name)
+
+
+# From the pixel to the ray.
 
 
 @DEPROJECT.mistake(
@@ -505,22 +545,72 @@ def depth_along_ray(x: Array, y: Array, depth: Array) -> Any:
     "K takes rays to pixels. Which way does this function go?",
 )
 def inverse_missing(pixels: Array, K: Array) -> Any:
-    return K[0, 0] * pixels[:, 0] + K[0, 2], K[1, 1] * pixels[:, 1] + K[1, 2]
+    return K[0, 0] * pixels[:, 0] + K[0, 2], K[1, 1] * pixels[:, 1] + K[1, 2], 1.0
+
+
+_SIDE = (
+    "the inverse of K is multiplied from the wrong side",
+    "The equation says K⁻¹ times a column. Your pixels are rows: what has to be transposed?",
+)
+
+
+@DEPROJECT.mistake("to_normalised", *_SIDE, name="K_transposed")
+def inverse_transposed(pixels: Array, K: Array) -> Any:
+    third = 1 - K[0, 2] / K[0, 0] * pixels[:, 0] - K[1, 2] / K[1, 1] * pixels[:, 1]
+    return pixels[:, 0] / K[0, 0], pixels[:, 1] / K[1, 1], third
+
+
+@DEPROJECT.mistake("to_normalised", *_SIDE, name="K_transposed")
+def inverse_transposed_and_divided(pixels: Array, K: Array) -> Any:
+    x, y, third = inverse_transposed(pixels, K)
+    return x / third, y / third, 1.0
 
 
 @DEPROJECT.mistake("to_normalised", *_PRINCIPAL, name="principal_point_forgotten")
 def principal_point_not_subtracted(pixels: Array, K: Array) -> Any:
-    return pixels[:, 0] / K[0, 0], pixels[:, 1] / K[1, 1]
+    return pixels[:, 0] / K[0, 0], pixels[:, 1] / K[1, 1], 1.0
 
 
 @DEPROJECT.mistake(
     "to_normalised",
-    "your fx and fy are swapped",
-    "Which entry of K belongs to the columns of the image?",
-    name="fx_fy_swapped",
+    "the principal point is added",
+    "The pixel at the principal point looks straight ahead. What are your x and y there?",
 )
+def principal_point_added(pixels: Array, K: Array) -> Any:
+    return (pixels[:, 0] + K[0, 2]) / K[0, 0], (pixels[:, 1] + K[1, 2]) / K[1, 1], 1.0
+
+
+@DEPROJECT.mistake(
+    "to_normalised",
+    "only the principal point is divided by fx and fy",
+    "In `a - b / c`, what does Python do first?",
+)
+def brackets_missing(pixels: Array, K: Array) -> Any:
+    return pixels[:, 0] - K[0, 2] / K[0, 0], pixels[:, 1] - K[1, 2] / K[1, 1], 1.0
+
+
+@DEPROJECT.mistake(
+    "to_normalised",
+    "the pixels are multiplied by fx and fy",
+    "Pixels from the principal point, and a focal length in pixels: which of × and ÷ gives X/Z?",
+)
+def times_focal_length(pixels: Array, K: Array) -> Any:
+    return (pixels[:, 0] - K[0, 2]) * K[0, 0], (pixels[:, 1] - K[1, 2]) * K[1, 1], 1.0
+
+
+@DEPROJECT.mistake("to_normalised", *_as_in_project("fx_fy_swapped"), name="fx_fy_swapped")
 def fx_fy_swapped_back(pixels: Array, K: Array) -> Any:
-    return (pixels[:, 0] - K[0, 2]) / K[1, 1], (pixels[:, 1] - K[1, 2]) / K[0, 0]
+    return (pixels[:, 0] - K[0, 2]) / K[1, 1], (pixels[:, 1] - K[1, 2]) / K[0, 0], 1.0
+
+
+@DEPROJECT.mistake("to_normalised", *_as_in_project("fx_for_both"), name="fx_for_both")
+def fx_for_both_back(pixels: Array, K: Array) -> Any:
+    return (pixels[:, 0] - K[0, 2]) / K[0, 0], (pixels[:, 1] - K[1, 2]) / K[0, 0], 1.0
+
+
+@DEPROJECT.mistake("to_normalised", *_as_in_project("cx_cy_swapped"), name="cx_cy_swapped")
+def cx_cy_swapped_back(pixels: Array, K: Array) -> Any:
+    return (pixels[:, 0] - K[1, 2]) / K[0, 0], (pixels[:, 1] - K[0, 2]) / K[1, 1], 1.0
 
 
 @DEPROJECT.mistake(
@@ -534,8 +624,30 @@ def input_swapped(pixels: Array, K: Array) -> Any:
 
 @DEPROJECT.mistake("to_normalised", *_UP, name="y_up")
 def y_up_back(pixels: Array, K: Array) -> Any:
-    x, y = _to_normalised(pixels, K)
-    return x, -y
+    x, y, w = _to_normalised(pixels, K)
+    return x, -y, w
+
+
+@DEPROJECT.mistake("to_normalised", *_HALF, name="half_pixel")
+def half_pixel_more_back(pixels: Array, K: Array) -> Any:
+    return _to_normalised(pixels + 0.5, K)
+
+
+@DEPROJECT.mistake("to_normalised", *_HALF, name="half_pixel")
+def half_pixel_less_back(pixels: Array, K: Array) -> Any:
+    return _to_normalised(pixels - 0.5, K)
+
+
+# From the ray to the point.
+
+
+@DEPROJECT.mistake(
+    "scale",
+    "the depth is taken along the ray instead of along Z",
+    "A wall faces the camera. Does your function give all its pixels the same Z?",
+)
+def depth_along_ray(x: Array, y: Array, w: Any, depth: Array) -> Any:
+    return _scale(x, y, w, depth / np.sqrt(x * x + y * y + w * w))
 
 
 _MILLIMETRES = (
@@ -545,13 +657,13 @@ _MILLIMETRES = (
 
 
 @DEPROJECT.mistake("scale", *_MILLIMETRES, name="millimetres")
-def times_thousand(x: Array, y: Array, depth: Array) -> Any:
-    return 1000 * x * depth, 1000 * y * depth, 1000 * depth
+def times_thousand(x: Array, y: Array, w: Any, depth: Array) -> Any:
+    return _scale(x, y, w, 1000 * depth)
 
 
 @DEPROJECT.mistake("scale", *_MILLIMETRES, name="millimetres")
-def through_thousand(x: Array, y: Array, depth: Array) -> Any:
-    return x * depth / 1000, y * depth / 1000, depth / 1000
+def through_thousand(x: Array, y: Array, w: Any, depth: Array) -> Any:
+    return _scale(x, y, w, depth / 1000)
 
 
 @DEPROJECT.mistake(
@@ -559,93 +671,17 @@ def through_thousand(x: Array, y: Array, depth: Array) -> Any:
     "x and y are not multiplied by the depth",
     "Two pixels of one ray at 0.5 m and at 1 m: is X the same for both?",
 )
-def not_scaled(x: Array, y: Array, depth: Array) -> Any:
-    return x, y, depth
+def not_scaled(x: Array, y: Array, w: Any, depth: Array) -> Any:
+    return x, y, w * depth
 
 
 @DEPROJECT.mistake(
-    "unbend",
-    "the pinhole part is right, and the distortion is ignored",
-    "That is the core of the exercise. What could your function do with `dist`?",
+    "scale",
+    "x and y are divided by the depth",
+    "Of two points on one ray, the farther one is also farther from the axis. Is yours?",
 )
-def coefficients_ignored(x: Array, y: Array, *dist: float) -> Any:
-    return x, y
-
-
-@DEPROJECT.mistake(
-    "unbend",
-    "the distortion is applied once more instead of being inverted",
-    "Project your answer. Do you come back to the pixel that you started from?",
-)
-def distorted_again(x: Array, y: Array, *dist: float) -> Any:
-    return _bend(x, y, *dist)
-
-
-_ONE_STEP = (
-    "the inversion stops after one step (flipping the signs of the coefficients is one, too)",
-    "Project your answer: close, but not back. What would a second step do?",
-)
-
-
-@DEPROJECT.mistake("unbend", *_ONE_STEP, name="one_step")
-def one_step(x: Array, y: Array, *dist: float) -> Any:
-    return _iterate(1)(x, y, *dist)
-
-
-@DEPROJECT.mistake("unbend", *_ONE_STEP, name="one_step")
-def one_division(x: Array, y: Array, *dist: float) -> Any:
-    k1, k2, p1, p2, k3 = dist
-    r2 = x * x + y * y
-    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-    return (
-        (x - 2 * p1 * x * y - p2 * (r2 + 2 * x * x)) / radial,
-        (y - p1 * (r2 + 2 * y * y) - 2 * p2 * x * y) / radial,
-    )
-
-
-def _overwritten(rounds: int) -> Step:
-    """The iteration when xd and x are one array, which `x += ...` changes."""
-
-    def unbend(x: Array, y: Array, *dist: float) -> Any:
-        for _ in range(rounds):
-            bent_x, bent_y = _bend(x, y, *dist)
-            x, y = 2 * x - bent_x, 2 * y - bent_y
-        return x, y
-
-    return unbend
-
-
-for _rounds in (2, 3, 4, 5, 6, 7, 8):
-    DEPROJECT.mistake(
-        "unbend",
-        "the iteration stops too early",
-        "Print how much x changes in the last round. When may you stop?",
-        name="too_few_rounds",
-    )(_iterate(_rounds))
-
-for _rounds in (2, 3, 4, 5, 10, 15, 20, 25, 30, 40, 50, 100):
-    DEPROJECT.mistake(
-        "unbend",
-        "the iteration overwrites the point it is looking for",
-        "After `x = xd` both names stand for one array, and `x += ...` changes that array.",
-        name="target_overwritten",
-    )(_overwritten(_rounds))
-
-
-@DEPROJECT.mistake("read", "your p1 and p2 are swapped", "Which of the two multiplies r² + 2x²?",
-                   name="p1_p2_swapped")  # fmt: skip
-def p1_p2_swapped_back(k1: float, k2: float, p1: float, p2: float, k3: float) -> Any:
-    return k1, k2, p2, p1, k3
-
-
-@DEPROJECT.mistake(
-    "read",
-    "the coefficients are read as (k1, k2, k3, p1, p2)",
-    "OpenCV added k3 when the other four were already there. At which end?",
-    name="k3_before_p1",
-)
-def k3_before_p1_back(k1: float, k2: float, p1: float, p2: float, k3: float) -> Any:
-    return k1, k2, p2, k3, p1
+def divided_by_depth(x: Array, y: Array, w: Any, depth: Array) -> Any:
+    return x / depth, y / depth, w * depth
 
 
 @DEPROJECT.mistake(
@@ -653,8 +689,86 @@ def k3_before_p1_back(k1: float, k2: float, p1: float, p2: float, k3: float) -> 
     "the depth is forgotten: Z is 1 everywhere",
     "Your points lie on a plane at 1 m. What says how far along its ray each of them is?",
 )
-def depth_forgotten(x: Array, y: Array, depth: Array) -> Any:
-    return x, y, np.ones_like(depth)
+def depth_forgotten(x: Array, y: Array, w: Any, depth: Array) -> Any:
+    return x, y, w * np.ones_like(depth)
+
+
+# The coefficients and the equation: what goes wrong in the first exercise does so in this one. But
+# without its 1 the radial factor has no inverse that an iteration would find.
+
+DEPROJECT.mistakes += [
+    m for m in PROJECT.mistakes if m.step in ("read", "bend") and m.name != "one_missing"
+]
+
+# The inversion.
+
+
+@DEPROJECT.mistake(
+    "unbend",
+    "the distortion is applied once more instead of being inverted",
+    "Project your answer. Do you come back to the pixel that you started from?",
+)
+def distorted_again(x: Array, y: Array, bend: Step, *dist: float) -> Any:
+    return bend(x, y)
+
+
+def _divide(rounds: int) -> Step:
+    """OpenCV's iteration: subtract the tangential part, divide by the radial factor."""
+
+    def unbend(x: Array, y: Array, bend: Step, *dist: float) -> Any:
+        k1, k2, p1, p2, k3 = dist
+        xd, yd = x, y
+        for _ in range(rounds):
+            r2 = x * x + y * y
+            radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+            dx = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+            dy = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+            x, y = (xd - dx) / radial, (yd - dy) / radial
+        return x, y
+
+    return unbend
+
+
+def _overwritten(rounds: int) -> Step:
+    """The iteration that compares with its own last guess: xd and x are one array, say."""
+
+    def unbend(x: Array, y: Array, bend: Step, *dist: float) -> Any:
+        for _ in range(rounds):
+            bent_x, bent_y = bend(x, y)
+            x, y = 2 * x - bent_x, 2 * y - bent_y
+        return x, y
+
+    return unbend
+
+
+_ONE_STEP = (
+    "the inversion stops after one step (flipping the signs of the coefficients is one, too)",
+    "Project your answer: close, but not back. What would a second step do?",
+)
+DEPROJECT.mistake("unbend", *_ONE_STEP, name="one_step")(_iterate(1))
+DEPROJECT.mistake("unbend", *_ONE_STEP, name="one_step")(_divide(1))
+
+# With more rounds than these, all cases agree. Of each long family a few are tried in pairs, too.
+_EARLY = (
+    "the iteration stops too early (`cv2.undistortPoints` does after five rounds)",
+    "Print how much x changes in the last round. When may you stop?",
+)
+for _rounds in range(2, 14):
+    _alone = _rounds not in (2, 3, 5, 10)
+    DEPROJECT.mistake("unbend", *_EARLY, "too_few_rounds", _alone)(_iterate(_rounds))
+for _rounds in range(2, 8):
+    _alone = _rounds != 5
+    DEPROJECT.mistake("unbend", *_EARLY, "too_few_rounds", _alone)(_divide(_rounds))
+
+for _rounds in (*range(2, 51), 100):
+    DEPROJECT.mistake(
+        "unbend",
+        "the iteration compares with its own last guess",
+        "Compare with `xd`, which must not change, in every round. Does yours? "
+        "(After `x = xd`, `x += ...` changes both.)",
+        name="target_overwritten",
+        alone=_rounds not in (5, 10, 20, 50),
+    )(_overwritten(_rounds))
 
 
 EXERCISES = [PROJECT, DEPROJECT]
@@ -674,7 +788,7 @@ CHECKPOINTS = [
             ),
             Option(
                 "15 px right of it",
-                "x = f X / Z: X stays, Z doubles, the offset halves. That is why distant "
+                "x_s = f X / Z: X stays, Z doubles, the offset halves. That is why distant "
                 "things look small and why one pixel covers more of them.",
                 right=True,
             ),
@@ -684,7 +798,7 @@ CHECKPOINTS = [
             ),
             Option(
                 "60 px right of it",
-                "Farther away is smaller in the image: Z stands in the denominator of x = f X / Z.",
+                "Farther away is smaller in the image: in x_s = f X / Z, Z is the denominator.",
             ),
         ),
     ),
@@ -718,10 +832,9 @@ CHECKPOINTS = [
                 "Then the optical axis would meet the small image near its right lower corner.",
             ),
             Option(
-                "all four halve (cx and cy up to a quarter pixel)",
-                "Everything measured in pixels shrinks with the pixels. The quarter pixel is the "
-                "convention: (0, 0) is the *centre* of a pixel, so cx becomes "
-                "(cx + 0.5) / 2 - 0.5.",
+                "all four halve",
+                "Everything measured in pixels shrinks with the pixels. (cx and cy to a quarter "
+                "pixel: (0, 0) is the *centre* of a pixel, so cx becomes (cx + 0.5) / 2 - 0.5.)",
                 right=True,
             ),
             Option(
@@ -758,7 +871,7 @@ CHECKPOINTS = [
                 "cameras in this course are 0.4 to 23 px off centre.",
             ),
             Option(
-                "nothing was estimated: that is the image centre, put in by hand",
+                "it was not estimated: that is the image centre, put in by hand",
                 "(640 - 1) / 2 = 319.5 is the centre when (0, 0) is the centre of the first pixel. "
                 "A number that was *measured* has digits that nobody would choose.",
                 right=True,
@@ -766,7 +879,7 @@ CHECKPOINTS = [
             Option(
                 "the camera had already straightened the image",
                 "Straightened (*rectified*) images have a principal point of their own, and it is "
-                "as crooked as any: the depth stream above is one.",
+                "as crooked as any: the depth stream of your camera is one.",
             ),
             Option(
                 "the calibration is half a pixel off: the centre is (320, 240)",
@@ -803,7 +916,8 @@ OBJECTIVES = (
         ("pinhole.pitch", "pinhole.half_size", "pinhole.exact_centre"),
     ),
     Objective(
-        "write project and deproject with distortion, and prove their conventions",
+        "write project, and take a pixel with its depth back to a point (deeper: write deproject, "
+        "with distortion, and test both against OpenCV)",
         ("pinhole.project", "pinhole.deproject"),
     ),
     Objective(

@@ -7,10 +7,16 @@ import re
 from dataclasses import dataclass
 from typing import Literal
 
-Kind = Literal["right", "wrong", "raised", "not attempted"]
+Kind = Literal["right", "core right", "wrong", "raised", "not attempted"]
 
 # Okabe-Ito; the word beside it says the same, so nothing hangs on the colour.
-COLORS = {"right": "#009E73", "wrong": "#D55E00", "raised": "#D55E00", "not attempted": "#56B4E9"}
+COLORS = {
+    "right": "#009E73",
+    "core right": "#009E73",
+    "wrong": "#D55E00",
+    "raised": "#D55E00",
+    "not attempted": "#56B4E9",
+}
 
 
 @dataclass(frozen=True)

@@ -170,28 +170,36 @@ def noise_law(
     error_mm: ArrayLike,
     curve: tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]],
     extra: Mapping[str, tuple[ArrayLike, ArrayLike]] | None = None,
+    law: str = "fitted law",
 ) -> LessonFigure:
-    """Measured std of depth with its standard error over a fitted curve (Z, mid, low, high)."""
+    """Measured std of depth with its standard error over a curve (Z, mid, low, high), the `law`.
+
+    extra: other series (Z, std), by name. The legend stands beside the axes, clear of all points.
+    """
     z, mid, low, high = curve
-    fig = figure(8.0, 4.6)
+    fig = figure(9.5, 4.6)
     ax = fig.subplots()
-    ax.fill_between(z, low, high, color=COLORS["model"], alpha=0.25, label="95 % band of the fit")
-    ax.plot(z, mid, color=COLORS["model"], label="fitted law")
+    ax.plot(z, mid, color=COLORS["model"], label=law)
+    ax.fill_between(z, low, high, color=COLORS["model"], alpha=0.25, label="its 95 % band")
     ax.errorbar(distances_m, std_mm, 1.96 * np.asarray(error_mm), fmt="o", capsize=3,
                 color=COLORS["measured"], label="measured, with 95 % interval")  # fmt: skip
     styles = zip(MARKERS[1:], ("truth", "color", "ink"), strict=False)
     for (marker, color), (name, (x, y)) in zip(styles, (extra or {}).items(), strict=False):
         ax.plot(x, y, marker=marker, ls=":", color=COLORS[color], mfc="white", label=name)
     ax.set(xscale="log", yscale="log", xlabel="distance Z (m)", ylabel="standard deviation (mm)")
-    _plain_log_ticks(ax, (0.3, 0.45, 0.6, 1, 1.5, 2, 3), (0.03, 0.1, 0.3, 1, 3, 10, 30))
-    ax.legend()
-    pairs = zip(np.asarray(distances_m), np.asarray(std_mm), strict=True)
+    _plain_log_ticks(ax, (0.3, 0.45, 0.6, 1, 1.5, 2, 3), (0.01, 0.03, 0.1, 0.3, 1, 3, 10, 30))
+    ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0))
+    others = "".join(f"; {name}: {_listed(x, y)}" for name, (x, y) in (extra or {}).items())
     fig.alt = (
-        "Standard deviation of depth against distance over the fitted law: "
-        + ", ".join(f"{s:.2f} mm at {d:.2f} m" for d, s in pairs)
-        + "."
+        f"Standard deviation of depth against distance over the {law}: "
+        f"{_listed(distances_m, std_mm)}{others}."
     )
     return fig
+
+
+def _listed(distances_m: ArrayLike, std_mm: ArrayLike) -> str:
+    pairs = zip(np.asarray(distances_m), np.asarray(std_mm), strict=True)
+    return ", ".join(f"{s:.2f} mm at {d:.2f} m" for d, s in pairs)
 
 
 def averaging(

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 DISPLACEMENT_PX = 0.1, 120.0  # the colour scale of `displacement`
 SLICE_M = 0.015  # half the height of the slice in `point_cloud`
+NEAR_M = 0.60  # where its view from the side ends, m
 POINT_X_M = 0.10  # how far right of the axis the point of `similar_triangles` is
 
 
@@ -36,9 +37,8 @@ def similar_triangles(focal_length_mm: float = 1.93, depth_m: float = 0.45) -> L
     sensor.axhline(0, color=COLORS["faint"], lw=1)
     sensor.axvline(0, color=COLORS["faint"], lw=1)
     sensor.plot([x_mm], [0], "o", color=COLORS["measured"], ms=10)
-    sensor.set(xlim=(-3.2, 3.2), ylim=(-2, 2), xlabel="x on the sensor (mm)", aspect="equal")
-    sensor.set_yticks([])
-    sensor.set_title(f"x = f X / Z = {x_mm:.3f} mm")
+    sensor.set(xlim=(-1.3, 1.3), ylim=(-1.3, 1.3), xlabel="$x_s$ on the sensor (mm)")
+    sensor.set(aspect="equal", yticks=[], title=f"$x_s = f\\,X/Z$ = {x_mm:.3f} mm")
     fig.alt = (
         f"Side by side: the ray from a point {1000 * POINT_X_M:.0f} mm off the axis at Z = "
         f"{depth_m:.2f} m through the pinhole, and its image {x_mm:.3f} mm off the sensor's "
@@ -252,20 +252,27 @@ def point_cloud(points: NDArray[np.float32]) -> LessonFigure:
     """A point cloud (H, W, 3) in m: from beside the camera, and a slice of it from above.
 
     Points are coloured by depth; NaN points and the few far beyond all others (false matches) are
-    left out. The slice holds the points at most
-    SLICE_M above or below the optical axis.
+    left out. The view from the side ends at NEAR_M if there is anything nearer, and leaves out
+    what lies far beside all others; the slice holds the points at most SLICE_M above or below the
+    optical axis.
     """
     cloud = points[points[..., 2] <= _far(points[..., 2])]
-    some = np.random.default_rng(0).permutation(len(cloud))[:30_000]  # a stride makes moiré
+    near = cloud[cloud[:, 2] < NEAR_M]
+    near = near if len(near) > 0.02 * len(cloud) else cloud
+    low, high = np.quantile(near, (0.01, 0.99), axis=0)
+    near = near[((near >= low - 0.03) & (near <= high + 0.03)).all(axis=1)]  # some stray dots stay
+    some = np.random.default_rng(0).permutation(len(near))[:30_000]  # a stride makes moiré
     fig = figure(9.0, 4.2)
     fig.set_layout_engine("none")  # the 3-D axes reserve far more room than they use
-    _solid(fig.add_axes((0.0, 0.0, 0.48, 0.94), projection="3d"), cloud[some])
+    _solid(fig.add_axes((0.0, 0.0, 0.48, 0.94), projection="3d"), near[some])
     above = fig.add_axes((0.57, 0.14, 0.41, 0.74))
     flat = cloud[np.abs(cloud[:, 1]) < SLICE_M]
-    above.scatter(flat[:, 0], flat[:, 2], s=3, c=flat[:, 2], linewidths=0)
+    above.scatter(flat[:, 0], flat[:, 2], s=1.5, c=flat[:, 2], linewidths=0)
     above.plot(0, 0, "v", color=COLORS["ink"], ms=9)
     above.annotate("camera", (0, 0), (8, 4), textcoords="offset points")
+    side = 0.6 * float(cloud[:, 2].max())
     above.set(xlabel="X (m)", ylabel="Z (m)", aspect="equal", ylim=(-0.05, None))
+    above.set_xlim(-side, side)
     above.set_title(f"from above, |Y| < {1000 * SLICE_M:.0f} mm")
     low, high = cloud.min(axis=0), cloud.max(axis=0)
     fig.alt = (
@@ -278,8 +285,11 @@ def point_cloud(points: NDArray[np.float32]) -> LessonFigure:
 def _solid(ax: Any, cloud: NDArray[np.float32]) -> None:
     ax.scatter(cloud[:, 0], cloud[:, 2], -cloud[:, 1], s=2, c=cloud[:, 2], linewidths=0,
                depthshade=False)  # fmt: skip
-    ax.set(xlabel="X (m)", zlabel="-Y (m)", title="from beside the camera")
-    ax.set_ylabel("Z (m)", labelpad=12)
+    end = f", Z < {NEAR_M:.1f} m" if cloud[:, 2].max() < NEAR_M else ""
+    ax.set(xlabel="X (m)", zlabel="-Y (m)")
+    ax.set_title(f"from beside the camera{end}", y=0.9)
+    ax.xaxis.labelpad = ax.yaxis.labelpad = ax.zaxis.labelpad = 12
+    ax.set_ylabel("Z (m)")
     ax.locator_params(nbins=4)
     ax.locator_params(axis="y", nbins=2)
     ax.view_init(elev=18, azim=-70)

@@ -82,7 +82,8 @@ class BiasFit:
             ("constant", "mm", _mm(self.constant_m), constant and tuple(map(_mm, constant))),
         ):
             if value is not None and interval:
-                text += f", {name} {value:+.2f} {unit} ({interval[0]:+.2f} to {interval[1]:+.2f})"
+                text += f",\n    {name} {value:+.2f} {unit} "
+                text += f"({interval[0]:+.2f} to {interval[1]:+.2f})"
         return with_notes(f"{text}, from {counted(self.n_distances, 'distance')}", self.notes)
 
 
@@ -246,8 +247,8 @@ def _bias_notes(covariance: Floats, consistent: bool) -> tuple[str, ...]:
         correlation = covariance[0, 1] / math.sqrt(covariance[0, 0] * covariance[1, 1])
         if abs(correlation) > 0.9:
             notes.append(
-                f"these distances hardly tell the two apart (correlation {correlation:.2f}); "
-                "the bias at a distance is known better than either"
+                f"these distances hardly tell the two apart (correlation {correlation:.2f}): "
+                "use their sum, the bias at a distance"
             )
     if not consistent:
         notes.append("the residuals are larger than the stated errors; intervals are widened")

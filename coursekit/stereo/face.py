@@ -22,6 +22,7 @@ from coursekit.stereo.stacks import (
     valid_mean,
     valid_median,
     valid_std,
+    wrapped,
 )
 from coursekit.stereo.windows import (
     CORRELATION_PX,
@@ -107,7 +108,7 @@ class BlockFace:
                 f", edges {self.fattening_px:+.2f} ± {self.fattening_error_px:.2f} px outwards "
                 "if its depth is right"
             )
-        return f"{text}, {self.flying_fraction:.1%} flying pixels at its edges"
+        return wrapped(f"{text}, {self.flying_fraction:.1%} flying pixels at its edges")
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from coursekit.stereo.stacks import (
     positive,
     rms,
     valid_mean,
+    wrapped,
 )
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ class DepthQuality:
 
     def __repr__(self) -> str:
         accuracy = "" if self.z_accuracy is None else f"Z accuracy {self.z_accuracy:+.2%}, "
-        return (
+        return wrapped(
             f"fill rate {self.fill_rate:.1%}, {accuracy}plane RMS {1e3 * self.plane_rms_m:.2f} mm "
             f"({self.plane_rms:.2%}), sub-pixel RMS {self.subpixel_rms_px:.3f} px, temporal noise "
             f"{1e3 * self.temporal_noise_m:.2f} mm ({self.temporal_noise:.2%}), "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +14,8 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
     Interval = tuple[float, float]
     Window = tuple[int, int, int, int]
+
+LINE = 84  # characters
 
 
 def first_frame(depth: Any) -> Any:
@@ -151,8 +154,16 @@ def std_interval(std: float, dof: float) -> Interval:
     return std * math.sqrt(dof / low), std * math.sqrt(dof / high)
 
 
+def wrapped(text: str) -> str:
+    """Text in lines that a notebook's page holds; JupyterLab breaks longer ones in mid-word."""
+    return textwrap.fill(text, LINE, subsequent_indent="    ", break_on_hyphens=False)
+
+
 def with_notes(text: str, notes: tuple[str, ...]) -> str:
-    return f"{text}. Note: {'; '.join(notes)}." if notes else text
+    """Text, and below it, indented, what has to be said about it."""
+    if not notes:
+        return text
+    return f"{text}.\n    {wrapped('Note: ' + '; '.join(notes) + '.')}"
 
 
 def counted(n: int, thing: str) -> str:

@@ -21,6 +21,7 @@ from coursekit.stereo.stacks import (
     std_interval,
     valid_mean,
     valid_median,
+    wrapped,
 )
 
 CORRELATION_PX = 12  # disparities farther apart than the matching window (11 px) are independent
@@ -102,7 +103,7 @@ class WindowStats:
             f"{1e3 * high:.3f}), of the window's mean {1e3 * self.mean_std_m:.3f} mm, "
             f"{self.invalid_fraction:.1%} invalid"
         )
-        return f"{text}; {self.rounding}" if self.rounding else text
+        return wrapped(f"{text}; {self.rounding}" if self.rounding else text)
 
 
 def window_stats(depth: Any, window: Window, depth_scale_m: float | None = None) -> WindowStats:
@@ -382,12 +383,12 @@ class AveragingCurve:
         low, high = self.effective_frames_interval
         text = (
             f"{self.n_frames} frames are worth {self.effective_frames:.0f} independent ones "
-            f"(95 %: {low:.0f} to {high:.0f}): their mean is {self.gain:.1f} times quieter than "
-            f"one frame ({math.sqrt(self.n_frames):.1f} if they were independent)"
+            f"(95 %: {low:.0f} to {high:.0f});\n    their mean is {self.gain:.1f} times quieter "
+            f"than one frame ({math.sqrt(self.n_frames):.1f} if they were independent)"
         )
         if self.floor_m is None:
             return text
-        return f"{text}, and {1e3 * self.floor_m:.3f} mm do not average away"
+        return f"{text};\n    {1e3 * self.floor_m:.3f} mm do not average away"
 
 
 def averaging_curve(series_m: ArrayLike) -> AveragingCurve:

@@ -57,6 +57,20 @@ def proportional_to(Z, fx, baseline, sigma_d):
     return Z**2 * sigma_d
 
 
+B = 0.0501707  # of the simulated camera, as the notebook sets it
+
+
+@wrong("other_baseline", "vectorised")
+def global_of_the_notebook(Z, fx, baseline, sigma_d):
+    return Z**2 / (fx * B) * sigma_d
+
+
+@wrong("other_baseline", "by the disparity")
+def fifty_millimetres(Z, fx, baseline, sigma_d):
+    disparity = fx * 0.05 / Z
+    return Z / disparity * sigma_d
+
+
 @wrong("multiplied", "vectorised")
 def precedence(Z, fx, baseline, sigma_d):
     constant = 1 / (fx * baseline)
@@ -120,13 +134,32 @@ def linear_and_in_millimetres(Z, fx, baseline, sigma_d):
     return 1000 * Z * sigma_d / (fx * baseline)
 
 
-@wrong(None, "two depths")
+@wrong("difference", "two depths")
 def difference_of_two_depths(Z, fx, baseline, sigma_d):
     d = fx * baseline / Z
     return fx * baseline / (d - sigma_d) - Z
 
 
-@wrong(None, "vectorised")
+@wrong("difference", "two depths")
+def difference_to_the_nearer_depth(Z, fx, baseline, sigma_d):
+    d = fx * baseline / Z
+    return abs(fx * baseline / (d + sigma_d) - fx * baseline / d)
+
+
+@wrong("difference", "two depths")
+def half_the_depths_on_both_sides(Z, fx, baseline, sigma_d):
+    d = fx * baseline / Z
+    near, far = (fx * baseline / (d + side * sigma_d) for side in (1, -1))
+    return (far - near) / 2
+
+
+@wrong("difference", "two depths")
+def half_a_sigma_to_both_sides(Z, fx, baseline, sigma_d):
+    d = fx * baseline / Z
+    return fx * baseline * (1 / (d - sigma_d / 2) - 1 / (d + sigma_d / 2))
+
+
+@wrong("root_of_two", "vectorised")
 def two_eyes(Z, fx, baseline, sigma_d):
     return math.sqrt(2) * sigma_d * Z**2 / (fx * baseline)
 

@@ -82,6 +82,11 @@ def five_by_five_always(depth_m, u, v, half=2, min_valid=5):
     return _median(_valid(depth_m[near]), min_valid)
 
 
+@wrong("half_halved", "vectorised")
+def half_of_the_half(depth_m, u, v, half=2, min_valid=5):
+    return _median(_valid(_patch(depth_m, u, v, half // 2)), min_valid)
+
+
 @wrong("negative_index", "slices")
 def slices_with_no_limits(depth_m, u, v, half=2, min_valid=5):
     v, u = np.rint([v, u]).astype(int)
@@ -162,6 +167,37 @@ def limited_to_the_last_index(depth_m, u, v, half=2, min_valid=5):
     top, bottom = np.clip([round(v) - half, round(v) + half + 1], 0, last_row)
     left, right = np.clip([round(u) - half, round(u) + half + 1], 0, last_column)
     return _median(_valid(depth_m[top:bottom, left:right]), min_valid)
+
+
+@wrong("border_lost", "slices with limits")
+def slice_ends_at_the_last_index(depth_m, u, v, half=2, min_valid=5):
+    H, W = depth_m.shape
+    v, u = round(v), round(u)
+    rows = slice(max(v - half, 0), min(v + half + 1, H - 1))
+    columns = slice(max(u - half, 0), min(u + half + 1, W - 1))
+    return _median(_valid(depth_m[rows, columns]), min_valid)
+
+
+@wrong("several, first last_missing", "slices with limits")
+def last_index_taken_for_the_end(depth_m, u, v, half=2, min_valid=5):
+    H, W = depth_m.shape
+    v, u = round(v), round(u)
+    patch = depth_m[
+        max(v - half, 0) : min(v + half, H - 1), max(u - half, 0) : min(u + half, W - 1)
+    ]
+    return _median(_valid(patch), min_valid)
+
+
+@wrong("modulo", "loop over lists")
+def indices_modulo_the_size(depth_m, u, v, half=2, min_valid=5):
+    H, W = depth_m.shape
+    found = []
+    for dv in range(-half, half + 1):
+        for du in range(-half, half + 1):
+            z = depth_m[(round(v) + dv) % H, (round(u) + du) % W]
+            if 0 < z < np.inf:
+                found.append(z)
+    return statistics.median(found) if len(found) >= min_valid else math.nan
 
 
 @wrong("height_width_swapped", "slices with limits")
@@ -285,11 +321,19 @@ def short_window_and_mean(depth_m, u, v, half=2, min_valid=5):
     return valid.mean() if len(valid) >= min_valid else math.nan
 
 
-@wrong(None, "vectorised")
+@wrong("pixel_alone", "vectorised")
 def the_pixel_itself_if_it_is_valid(depth_m, u, v, half=2, min_valid=5):
     row, column = round(v), round(u)
     inside = 0 <= row < depth_m.shape[0] and 0 <= column < depth_m.shape[1]
     if inside and np.isfinite(depth_m[row, column]) and depth_m[row, column] > 0:
+        return depth_m[row, column]
+    return _median(_valid(_patch(depth_m, u, v, half)), min_valid)
+
+
+@wrong("pixel_alone", "vectorised")
+def the_pixel_itself_if_above_zero(depth_m, u, v, half=2, min_valid=5):
+    row, column = round(v), round(u)
+    if depth_m[row, column] > 0:
         return depth_m[row, column]
     return _median(_valid(_patch(depth_m, u, v, half)), min_valid)
 

@@ -229,7 +229,7 @@ def radius_not_squared(points, K, dist=None):
     return out
 
 
-@wrong("distortion_ignored", "homogeneous product")
+@wrong(None, "homogeneous product", kind="core right")
 def pinhole_only(points, K, dist=None):
     uvw = (K @ points.T).T
     return uvw[:, :2] / uvw[:, 2:]
@@ -303,10 +303,16 @@ def the_callers_points_divided(points, K, dist=None):
 # --- what no name fits ---------------------------------------------------------------------------
 
 
-@wrong("several, first y_up", "homogeneous product")
+@wrong("y_up", "homogeneous product")
 def y_up_and_no_distortion(points, K, dist=None):
     uvw = points * [1, -1, 1] @ K.T
     return uvw[:, :2] / uvw[:, 2:]
+
+
+@wrong("several, first y_up", "homogeneous product")
+def y_up_and_swapped_coefficients(points, K, dist=None):
+    turned = None if dist is None else dist[[0, 1, 3, 2, 4]]
+    return cv2.projectPoints(points * [1, -1, 1], np.zeros(3), np.zeros(3), K, turned)[0][:, 0]
 
 
 @wrong(None, "vectorised")
@@ -387,3 +393,122 @@ def bends_the_metres(points, K, dist=None):
         flat = cv2.projectPoints(flat, np.zeros(3), np.zeros(3), np.eye(3), dist)[0][:, 0]
     xy = flat[:, :2] / points[:, 2:]
     return xy * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]]
+
+
+@wrong("centre_divided", "vectorised")
+def one_fraction(points, K, dist=None):
+    X, Y, Z = points.T
+    if dist is not None:
+        rays = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), dist)[0][:, 0]
+        X, Y = rays[:, 0] * Z, rays[:, 1] * Z
+    return np.column_stack([(K[0, 0] * X + K[0, 2]) / Z, (K[1, 1] * Y + K[1, 2]) / Z])
+
+
+@wrong("centre_divided", "vectorised")
+def one_fraction_and_no_lens(points, K, dist=None):
+    X, Y, Z = points.T
+    return np.column_stack([(K[0, 0] * X + K[0, 2]) / Z, (K[1, 1] * Y + K[1, 2]) / Z])
+
+
+@wrong("upside_down", "loop over lists")
+def depth_over_offset(points, K, dist=None):
+    pixels = []
+    for X, Y, Z in points:
+        ray = np.array([[Z / X, Z / Y, 1.0]])
+        pixels.append(cv2.projectPoints(ray, np.zeros(3), np.zeros(3), K, dist)[0].ravel())
+    return pixels
+
+
+# --- powers of the radius ------------------------------------------------------------------------
+
+
+def _with_radial(points, K, dist, radial, squared=lambda r2: r2):
+    x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
+    if dist is not None:
+        k1, k2, p1, p2, k3 = dist
+        s = squared(x**2 + y**2)
+        a = radial(x**2 + y**2, k1, k2, k3)
+        x, y = (
+            x * a + 2 * p1 * x * y + p2 * (s + 2 * x**2),
+            y * a + p1 * (s + 2 * y**2) + 2 * p2 * x * y,
+        )
+    return np.column_stack([x, y]) * np.diag(K)[:2] + K[:2, 2]
+
+
+@wrong("one_missing", "vectorised")
+def no_one(points, K, dist=None):
+    return _with_radial(points, K, dist, lambda r2, a, b, c: a * r2 + b * r2**2 + c * r2**3)
+
+
+@wrong("r_for_r2", "vectorised")
+def root_everywhere(points, K, dist=None):
+    def radial(r2, a, b, c):
+        r = np.sqrt(r2)
+        return 1 + a * r + b * r**2 + c * r**3
+
+    return _with_radial(points, K, dist, radial, np.sqrt)
+
+
+@wrong("r2_for_r", "vectorised")
+def powers_of_the_square(points, K, dist=None):
+    def radial(r, a, b, c):
+        return 1 + a * r**2 + b * r**4 + c * r**6
+
+    return _with_radial(points, K, dist, radial)
+
+
+@wrong("r2_for_r", "vectorised")
+def powers_of_the_square_everywhere(points, K, dist=None):
+    def radial(r, a, b, c):
+        return 1 + a * r**2 + b * r**4 + c * r**6
+
+    return _with_radial(points, K, dist, radial, np.square)
+
+
+@wrong("r2_for_r", "vectorised")
+def only_the_higher_powers_of_the_square(points, K, dist=None):
+    def radial(r2, a, b, c):
+        return 1 + a * r2 + b * r2**4 + c * r2**6
+
+    return _with_radial(points, K, dist, radial)
+
+
+# --- the core alone ------------------------------------------------------------------------------
+
+
+@wrong(None, "vectorised", kind="core right")
+def the_rest_is_still_to_do(points, K, dist=None):
+    if dist is not None:
+        raise NotImplementedError
+    return (points / points[:, 2:] @ K.T)[:, :2]
+
+
+@wrong(None, "loop over lists", kind="core right")
+def nothing_with_a_lens(points, K, dist=None):
+    if dist is None:
+        return [[K[0, 0] * X / Z + K[0, 2], K[1, 1] * Y / Z + K[1, 2]] for X, Y, Z in points]
+
+
+@wrong("y_up", "vectorised")
+def y_up_and_nothing_with_a_lens(points, K, dist=None):
+    if dist is None:
+        return (points / points[:, 2:] * [1, -1, 1] @ K.T)[:, :2]
+
+
+@wrong("transposed", "homogeneous product")
+def one_column_a_point_and_no_lens(points, K, dist=None):
+    uvw = K @ points.T
+    return uvw[:2] / uvw[2]
+
+
+@wrong("in_place", "vectorised")
+def the_callers_points_divided_and_no_lens(points, K, dist=None):
+    points /= points[:, 2:]
+    return points @ K[:2].T
+
+
+@wrong("several, first cx_cy_swapped", "homogeneous product")
+def rows_and_columns_mixed_and_rounded(points, K, dist=None):
+    u = K[0, 0] * points[:, 0] / points[:, 2] + K[1, 2]
+    v = K[1, 1] * points[:, 1] / points[:, 2] + K[0, 2]
+    return np.column_stack([u, v]).round()
