@@ -12,8 +12,11 @@ from fake_realsense import real_library
 
 import coursekit
 from coursekit import cli
+from coursekit.boards import Board, save_sheet
 from coursekit.cameras import CameraError, open_camera
 from coursekit.cameras.simulated import SimulatedCamera
+
+CHARUCO = Board("charuco", (9, 6), 0.025)
 
 
 def test_record_writes_a_recording_and_says_how_to_play_it(tmp_path, capsys):
@@ -52,9 +55,53 @@ def test_a_failure_is_one_line_and_exit_code_1(arguments, message, tmp_path, mon
     assert list(tmp_path.iterdir()) == []
 
 
+def test_board_writes_a_sheet_and_says_what_it_is(tmp_path, capsys):
+    path = tmp_path / "board.pdf"
+    arguments = ["board", "--kind", "charuco", "--squares", "9x6", "--square-mm", "25"]
+    assert cli.main([*arguments, "--out", str(path)]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[0] == (
+        f"Wrote {path}: ChArUco board, 9x6 squares (8x5 inner corners), square 25 mm, "
+        "marker 18.75 mm, DICT_5X5_250."
+    )
+    assert path.read_bytes() == save_sheet(CHARUCO, tmp_path / "same.pdf").read_bytes()
+    assert said[-1] == f"In Python: {CHARUCO!r}"
+    assert eval(said[-1].removeprefix("In Python: "), {"Board": Board}) == CHARUCO
+
+    assert cli.main([*arguments, "--out", str(path)]) == 1
+    assert capsys.readouterr().err.endswith("choose another name or overwrite=True\n")
+    changed = [*arguments, "--marker-mm", "15", "--dictionary", "DICT_4X4_50", "--paper", "a3"]
+    assert cli.main([*changed, "--out", str(path), "--overwrite"]) == 0
+    assert "marker 15 mm, DICT_4X4_50." in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--squares", "9x6", "--square-mm", "40"], "paper: a board of 360 x 240 mm does not fit"),
+        (["--squares", "9x1", "--square-mm", "25"], "squares: got (9, 1), want (columns, rows)"),
+        (["--squares", "9x6", "--square-mm", "-1"], "square_m: got -0.001, want a positive"),
+    ],
+)
+def test_a_board_that_cannot_be_is_one_line_and_exit_code_1(arguments, message, tmp_path, capsys):
+    assert cli.main(["board", *arguments, "--out", str(tmp_path / "a.pdf")]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith(f"coursekit: {message}")
+    assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize(
     "arguments",
-    [[], ["record"], ["record", "--out", "a.db3"], ["fly"], ["record", "--frames", "x"]],
+    [
+        ["board"],
+        ["board", "--squares", "9", "--square-mm", "25", "--out", "a.pdf"],
+        [],
+        ["record"],
+        ["record", "--out", "a.db3"],
+        ["fly"],
+        ["record", "--frames", "x"],
+    ],
 )
 def test_wrong_usage_exits_with_2(arguments, capsys):
     with pytest.raises(SystemExit) as caught:

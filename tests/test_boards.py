@@ -1,0 +1,668 @@
+"""Boards: the pattern against OpenCV's own, detection against rendered views of known geometry."""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+
+import cv2
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+import coursekit.boards.folder
+from coursekit.boards import (
+    Board,
+    BoardNotFound,
+    Detection,
+    Detections,
+    Skipped,
+    detect,
+    detect_all,
+    save_sheet,
+)
+from coursekit.boards.find import find
+from coursekit.boards.refine import noise_levels
+
+CHECKERBOARD = Board("checkerboard", (10, 7), 0.025)
+CHARUCO = Board("charuco", (9, 6), 0.025)
+OLD = Board("charuco", (9, 6), 0.025, old_origin=True)
+DARK, BRIGHT, AROUND = 30.0, 200.0, 110.0
+FOCAL = 600.0
+OVER = 4  # samples a pixel each way
+
+
+def pose(board, tilt_deg=25.0, roll_deg=10.0, z_m=0.5, shift_m=(0.0, 0.0), axis_deg=30.0):
+    """T_camera_board with the middle of the board at (shift, z)."""
+    axis = np.radians([np.cos(np.radians(axis_deg)), np.sin(np.radians(axis_deg)), 0.0])
+    R = cv2.Rodrigues(tilt_deg * axis)[0] @ cv2.Rodrigues(np.radians([0.0, 0.0, roll_deg]))[0]
+    if board.old_origin:  # y up, z out of the board
+        R = R @ np.diag([1.0, -1.0, -1.0])
+    T = np.eye(4)
+    T[:3, :3] = R
+    T[:3, 3] = [*shift_m, z_m] - R @ board.points.mean(axis=0)
+    return T
+
+
+def view(board, T=None, size=(640, 480), blur_px=0.6, motion_px=(0.0, 0.0), pixels_per_square=112):
+    """A noiseless view (h, w) in grey levels and the true corners (N, 2) px; no lens distortion."""
+    T = pose(board) if T is None else T
+    width, height = size
+    K = np.array([[FOCAL, 0, (width - 1) / 2], [0, FOCAL, (height - 1) / 2], [0, 0, 1]])
+    H = K @ np.c_[T[:3, :2], T[:3, 3]]
+    paper = np.pad(board.image(pixels_per_square) / np.float32(255), pixels_per_square)
+    rim = np.ones_like(paper, bool)
+    rim[pixels_per_square:-pixels_per_square, pixels_per_square:-pixels_per_square] = False
+    paper[rim] = 1.0
+    to_image = board.image_from_board(pixels_per_square)
+    to_image[:2, 2] += pixels_per_square
+    over = np.array([[OVER, 0, (OVER - 1) / 2], [0, OVER, (OVER - 1) / 2], [0, 0, 1]])
+    grey = cv2.warpPerspective(
+        DARK + (BRIGHT - DARK) * paper,
+        over @ H @ np.linalg.inv(to_image),
+        (width * OVER, height * OVER),
+        borderValue=AROUND,
+    )
+    grey = cv2.GaussianBlur(grey, (0, 0), blur_px * OVER)
+    if any(motion_px):
+        grey = np.mean(
+            [
+                cv2.warpAffine(grey, np.float64([[1, 0, dx], [0, 1, dy]]), grey.shape[::-1])
+                for dx, dy in np.linspace(-0.5, 0.5, 25)[:, None] * np.array(motion_px) * OVER
+            ],
+            axis=0,
+        )
+    grey = grey.reshape(height, OVER, width, OVER).mean(axis=(1, 3))
+    corners = np.c_[board.points[:, :2], np.ones(len(board.points))] @ H.T
+    return grey, corners[:, :2] / corners[:, 2:]
+
+
+def photograph(grey, seed=0, noise=1.5, photon=0.0):
+    """8 bits of `grey` with noise of variance noise^2 + photon x grey."""
+    rng = np.random.default_rng(seed)
+    sigma = np.sqrt(noise**2 + photon * grey)
+    return np.rint(grey + sigma * rng.normal(size=grey.shape)).clip(0, 255).astype(np.uint8)
+
+
+def random_poses(board, seed, count, **ranges):
+    rng = np.random.default_rng(seed)
+    low_high = {"tilt_deg": (0, 45), "roll_deg": (-180, 180), "z_m": (0.5, 0.7)} | ranges
+    for _ in range(count):
+        choice = {name: rng.uniform(*limits) for name, limits in low_high.items()}
+        yield pose(board, axis_deg=rng.uniform(0, 360), **choice)
+
+
+# --- the pattern ---
+
+
+@pytest.mark.parametrize("squares", [(9, 6), (5, 7), (6, 8), (7, 5)])
+@pytest.mark.parametrize("old", [False, True])
+@pytest.mark.parametrize(("dictionary", "share"), [("DICT_5X5_250", 0.7), ("DICT_6X6_250", 0.5)])
+def test_the_picture_is_opencvs(squares, old, dictionary, share):
+    board = Board("charuco", squares, 0.02, 0.02 * share, dictionary, old)
+    bits = int(dictionary[5]) + 2
+    n = 20 * bits  # cells of a marker are whole pixels
+    columns, rows = squares
+    theirs = board.opencv().generateImage((columns * n, rows * n), marginSize=0, borderBits=1)
+    np.testing.assert_array_equal(board.image(n), theirs)
+
+
+def test_a_cell_that_ends_inside_a_pixel_keeps_its_area():
+    fine = CHARUCO.image(560).reshape(6 * 10, 56, 9 * 10, 56).mean(axis=(1, 3))
+    np.testing.assert_allclose(CHARUCO.image(10), fine, atol=0.51)
+
+
+def test_points_are_opencvs_and_lie_on_the_corners_of_the_picture():
+    np.testing.assert_allclose(CHARUCO.points, CHARUCO.opencv().getChessboardCorners(), atol=1e-9)
+    assert CHECKERBOARD.points.shape == (54, 3)
+    np.testing.assert_array_equal(CHECKERBOARD.points[0], 0)
+    np.testing.assert_allclose(CHECKERBOARD.points[10], [0.025, 0.025, 0])
+    for board in (CHARUCO, OLD, CHECKERBOARD, Board("charuco", (5, 7), 0.03, old_origin=True)):
+        n = 40
+        image = board.image(n).astype(int)
+        uv1 = np.c_[board.points[:, :2], np.ones(len(board.points))] @ board.image_from_board(n).T
+        up = -1 if board.old_origin else 1
+        first = np.rint(uv1[:, :2] + 0.5).astype(int)  # the pixel right of and below the corner
+        for (u, v), falling in zip(first.tolist(), board.falling, strict=True):
+            right, left = slice(u, u + 2), slice(u - 2, u)
+            below, above = slice(v, v + 2), slice(v - 2, v)
+            plus_y, minus_y = (below, above)[::up]
+            both = image[plus_y, right].sum() + image[minus_y, left].sum()
+            others = image[plus_y, left].sum() + image[minus_y, right].sum()
+            assert (both, others) == ((8 * 255, 0) if falling else (0, 8 * 255))
+
+
+def test_the_old_origin_is_at_the_bottom_left_with_y_up():
+    top_down = OLD.image_from_board(10) @ [0, 0, 1]
+    np.testing.assert_allclose(top_down, [-0.5, 60 - 0.5, 1])
+    assert (OLD.image_from_board(10) @ [0, 0.01, 1])[1] < top_down[1]
+    assert OLD.image(1)[0, 0] != CHARUCO.image(1)[0, 0]  # an even number of rows
+    odd = Board("charuco", (5, 7), 0.03)
+    old_odd = Board("charuco", (5, 7), 0.03, old_origin=True)
+    np.testing.assert_array_equal(odd.image(20), old_odd.image(20))
+
+
+@pytest.mark.parametrize(
+    ("squares", "turns"),
+    [((10, 7), 1), ((7, 10), 1), ((10, 8), 2), ((9, 7), 2), ((8, 8), 2), ((9, 9), 4)],
+)
+def test_turns_are_those_that_leave_the_colours_alone(squares, turns):
+    image = Board("checkerboard", squares, 0.02).image(4)
+    same = [np.array_equal(np.rot90(image, k), image) for k in range(4)]
+    assert Board("checkerboard", squares, 0.02).turns == turns == sum(same)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        (("chess", (9, 6), 0.02), "kind: got 'chess', want 'checkerboard' or 'charuco'"),
+        (("checkerboard", (9, 3), 0.02), "squares: got (9, 3), want (columns, rows) of squares"),
+        (("charuco", (9, 2), 0.02), "squares: got (9, 2), want"),
+        (("charuco", 9, 0.02), "squares: got 9, want"),
+        (("charuco", (9.0, 6), 0.02), "squares: got (9.0, 6), want"),
+        (("charuco", (9, 6), -0.02), "square_m: got -0.02, want a positive number of metres"),
+        (("charuco", (9, 6), float("nan")), "square_m: got nan, want"),
+        (("charuco", (9, 6), 0.02, 0.02), "marker_m: got 0.02, want less than the square's 0.02 m"),
+        (("charuco", (9, 6), 0.02, None, "DICT_9X9"), "dictionary: got 'DICT_9X9', want one of"),
+        (("charuco", (15, 9), 0.02, None, "DICT_4X4_50"), "DICT_4X4_50 holds 50 markers"),
+        (("checkerboard", (9, 6), 0.02, 0.01), "marker_m, old_origin: a checkerboard has neither"),
+    ],
+)
+def test_fields_that_make_no_board(fields, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        Board(*fields)
+
+
+# --- detection ---
+
+
+@pytest.mark.parametrize("board", [CHECKERBOARD, CHARUCO, OLD], ids=["checker", "charuco", "old"])
+def test_corners_are_true_to_a_twentieth_of_a_pixel(board):
+    errors = []
+    for seed, T in enumerate(random_poses(board, 5, 6)):
+        grey, truth = view(board, T)
+        seen = detect(photograph(grey, seed), board)
+        assert seen.size == (640, 480)
+        assert len(seen) == len(board.points)
+        errors.append(np.linalg.norm(seen.pixels - truth[seen.ids], axis=1))
+    errors = np.concatenate(errors)
+    assert np.sqrt(np.mean(errors**2)) < 0.035
+    assert errors.max() < 0.15
+
+
+def test_the_window_that_follows_the_spacing_beats_fixed_ones():
+    """At 13 px a square 11 px reach the next corner, and on a ChArUco board 5 px reach markers."""
+    for board, window, worse in ((CHECKERBOARD, 11, 30), (CHARUCO, 5, 3)):
+        grey, truth = view(board, pose(board, tilt_deg=40, z_m=0.95), pixels_per_square=56)
+        image = photograph(grey)
+        seen = detect(image, board)
+        fixed = seen.pixels.astype(np.float32).reshape(-1, 1, 2).copy()
+        cv2.cornerSubPix(image, fixed, (window, window), (-1, -1), (3, 50, 1e-3))
+        ours = np.linalg.norm(seen.pixels - truth[seen.ids], axis=1)
+        theirs = np.linalg.norm(fixed.reshape(-1, 2) - truth[seen.ids], axis=1)
+        assert np.sqrt(np.mean(theirs**2)) > worse * np.sqrt(np.mean(ours**2))
+        assert ours.max() < 0.15
+
+
+def test_it_is_corner_sub_pix_where_nothing_is_different():
+    """Seen squarely, on the smoothed image, with 0.4 of a square for its window."""
+    T = pose(CHECKERBOARD, tilt_deg=0.0, roll_deg=0.0, z_m=0.5, shift_m=(0.0013, 0.0007))
+    image = photograph(view(CHECKERBOARD, T)[0])  # 30 px a square
+    seen = detect(image, CHECKERBOARD)
+    smooth = cv2.GaussianBlur(image.astype(np.float32), (7, 7), 1.0)
+    theirs = np.rint(seen.pixels).astype(np.float32).reshape(-1, 1, 2)
+    cv2.cornerSubPix(smooth, theirs, (12, 12), (-1, -1), (3, 100, 1e-4))
+    np.testing.assert_allclose(seen.pixels, theirs.reshape(-1, 2), atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("board", "noise", "photon", "blur_px", "z_m"),
+    [
+        (CHECKERBOARD, 1.5, 0.0, 0.6, 0.5),
+        (CHECKERBOARD, 4.0, 0.0, 0.6, 0.7),
+        (CHARUCO, 1.5, 0.0, 1.2, 0.4),
+        (CHARUCO, 1.0, 0.05, 0.6, 0.6),
+    ],
+)
+def test_the_noise_estimate_is_the_scatter_of_the_corners(board, noise, photon, blur_px, z_m):
+    """80 to 108 coordinates over 40 seeds: their standard deviation is known to 1.5 %."""
+    grey, _ = view(board, pose(board, tilt_deg=20, z_m=z_m), blur_px=blur_px)
+    views = [detect(photograph(grey, seed, noise, photon), board) for seed in range(40)]
+    scatter = np.sqrt(np.var([seen.pixels for seen in views], axis=0, ddof=1).mean())
+    estimate = np.sqrt(np.mean([seen.noise_px**2 for seen in views]))
+    assert estimate == pytest.approx(scatter, rel=0.07)
+
+
+def test_noise_levels_measures_noise_and_not_edges():
+    grey, _ = view(CHARUCO)
+    levels, variances = noise_levels(photograph(grey, noise=1.0, photon=0.05))
+    expected = 1.0 + 0.05 * np.array([DARK, AROUND, BRIGHT]) + 1 / 12  # rounding to whole numbers
+    found = np.interp([DARK, AROUND, BRIGHT], levels, variances)
+    np.testing.assert_allclose(found, expected, rtol=0.08)
+
+
+@pytest.mark.parametrize("board", [CHECKERBOARD, CHARUCO], ids=["checker", "charuco"])
+@pytest.mark.parametrize(
+    ("blur_px", "motion_px"),
+    [
+        (0.5, (0, 0)),
+        (1.2, (0, 0)),
+        (0.6, (3, 0)),
+        (0.6, (0, 3)),
+        (0.6, (2.1, 2.1)),
+        (0.6, (2.1, -2.1)),
+    ],
+)
+def test_the_blur_has_its_size_and_direction(board, blur_px, motion_px):
+    """A uniform motion of length L has the variance L^2 / 12, a pixel that of its width.
+
+    A Gaussian fitted to the edge of a uniform motion is up to a fifth wider.
+    """
+    grey, _ = view(board, pose(board, tilt_deg=25, z_m=0.45), blur_px=blur_px, motion_px=motion_px)
+    blur = detect(photograph(grey), board).blur
+    expected = (blur_px**2 + 1 / 12) * np.eye(2) + np.outer(motion_px, motion_px) / 12
+    np.testing.assert_allclose(blur, expected, atol=0.25 * expected.max())
+    values, directions = np.linalg.eigh(blur)
+    if any(motion_px):
+        along = np.array(motion_px) / np.hypot(*motion_px)
+        assert abs(directions[:, 1] @ along) > np.cos(np.radians(6))
+        assert values[1] > 1.7 * values[0]
+    else:
+        assert values[1] < 1.15 * values[0]
+
+
+@pytest.mark.parametrize("quarter_turns", [1, 2, 3])
+def test_the_colours_tell_which_corner_is_the_first(quarter_turns):
+    grey, _ = view(CHECKERBOARD, pose(CHECKERBOARD, z_m=0.6, roll_deg=20), size=(480, 480))
+    upright = detect(photograph(grey), CHECKERBOARD).pixels
+    turned = detect(np.rot90(photograph(grey), quarter_turns), CHECKERBOARD).pixels
+    for _ in range(quarter_turns):  # back: np.rot90 takes (u, v) to (v, w - 1 - u)
+        turned = np.stack([479 - turned[:, 1], turned[:, 0]], axis=1)
+    np.testing.assert_allclose(turned, upright, atol=0.02)
+
+
+def test_a_symmetric_board_is_read_with_x_to_the_right():
+    board = Board("checkerboard", (10, 8), 0.02)
+    for roll, first_is_first in ((20, True), (200, False)):
+        grey, truth = view(board, pose(board, roll_deg=roll))
+        seen = detect(photograph(grey), board).pixels
+        np.testing.assert_allclose(seen, truth if first_is_first else truth[::-1], atol=0.15)
+
+
+def test_a_board_turned_by_a_quarter_is_the_same_board():
+    """(7, 10) and (10, 7) are one print; corners are then numbered from another corner."""
+    grey, _ = view(CHECKERBOARD)
+    image = photograph(grey)
+    lying = detect(image, CHECKERBOARD).pixels.reshape(6, 9, 2)
+    standing = detect(image, Board("checkerboard", (7, 10), 0.025)).pixels.reshape(9, 6, 2)
+    turned = [np.rot90(lying, k) for k in (1, 3)]
+    assert min(np.abs(standing - grid).max() for grid in turned) < 0.02
+
+
+def test_part_of_a_charuco_board_is_enough():
+    grey, truth = view(CHARUCO)
+    image = photograph(grey)
+    cut = image[:, : int(truth[3, 0])]
+    seen = detect(cut, CHARUCO)
+    assert 6 <= len(seen) < 40
+    assert seen.size == cut.shape[::-1]
+    np.testing.assert_allclose(seen.pixels, truth[seen.ids], atol=0.15)
+    with pytest.raises(BoardNotFound, match=r"no marker of|usable corners"):
+        detect(image[:, : int(truth[0, 0])], CHARUCO)
+
+
+def test_a_checkerboard_is_whole_and_its_own_or_not_found():
+    """OpenCV's searches take the outer edge for corners, or skewed parts of a larger board."""
+    found = missed = 0
+    for T in random_poses(CHECKERBOARD, 6, 12, z_m=(0.3, 0.35), roll_deg=(-40, 40)):
+        grey, truth = view(CHECKERBOARD, T)
+        inside = ((truth > 5) & (truth < np.array([634, 474]))).all()
+        seen = find(photograph(grey), CHECKERBOARD)
+        missed += inside and seen is None
+        if seen is not None:
+            found += 1
+            assert np.linalg.norm(seen[1] - truth, axis=1).max() < 5
+    assert found >= 4
+    assert missed == 0
+    image = photograph(view(CHECKERBOARD)[0])
+    for squares in ((6, 5), (5, 4), (8, 6), (9, 6), (10, 6), (9, 7), (11, 7)):
+        assert find(image, Board("checkerboard", squares, 0.025)) is None
+
+
+def test_corners_at_the_rim_of_the_image_are_as_good():
+    near = []
+    for seed, T in enumerate(random_poses(CHARUCO, 8, 8, z_m=(0.25, 0.3))):
+        T[:2, 3] += [0.06, -0.05]
+        grey, truth = view(CHARUCO, T)
+        seen = detect(photograph(grey, seed), CHARUCO)
+        rim = np.minimum(seen.pixels, np.array([639, 479]) - seen.pixels).min(axis=1)
+        errors = np.linalg.norm(seen.pixels - truth[seen.ids], axis=1)
+        near.append(errors[rim < 15])  # of a window's 20 to 24
+    near = np.concatenate(near)
+    assert len(near) >= 6
+    assert near.max() < 0.1
+
+
+@pytest.mark.parametrize("board", [CHECKERBOARD, CHARUCO], ids=["checker", "charuco"])
+def test_colour_images_and_large_ones(board):
+    grey, truth = view(board)
+    image = photograph(grey)
+    seen = detect(np.stack([image] * 3, axis=-1), board)
+    np.testing.assert_allclose(seen.pixels, detect(image, board).pixels, atol=1e-9)
+    large = cv2.resize(image, (4000, 3000), interpolation=cv2.INTER_CUBIC)
+    seen = detect(large, board)
+    assert len(seen) == len(board.points)
+    np.testing.assert_allclose(seen.pixels, (truth + 0.5) * 6.25 - 0.5, atol=0.15 * 6.25)
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        np.zeros((480, 640)),
+        np.zeros((480, 640, 4), np.uint8),
+        np.zeros((0, 640), np.uint8),
+        "a.png",
+    ],
+)
+def test_what_is_no_image(image):
+    with pytest.raises(ValueError, match=r"^image: got .* want"):
+        detect(image, CHARUCO)
+
+
+# --- what is there instead ---
+
+
+def not_found(image, board):
+    with pytest.raises(BoardNotFound) as caught:
+        detect(image, board)
+    return str(caught.value)
+
+
+@pytest.fixture(scope="module")
+def checkerboard_image():
+    return photograph(view(CHECKERBOARD)[0])
+
+
+@pytest.fixture(scope="module")
+def charuco_image():
+    return photograph(view(CHARUCO)[0])
+
+
+def test_says_which_checkerboard_it_sees(checkerboard_image):
+    said = not_found(checkerboard_image, Board("checkerboard", (9, 6), 0.025))
+    assert said == (
+        "not the 9x6 squares (8x5 inner corners) asked for, but a checkerboard of 10x7 squares: "
+        "you gave inner corners, squares are one more in each direction"
+    )
+    said = not_found(checkerboard_image, Board("checkerboard", (11, 7), 0.025))
+    assert said.endswith("but a checkerboard of 10x7 squares: use squares=(10, 7)")
+    said = not_found(checkerboard_image, CHARUCO)
+    assert "a checkerboard of 10x7 squares, without markers: use Board('checkerboard'" in said
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        (
+            Board("charuco", (6, 9), 0.025),
+            "27 markers of DICT_5X5_250 as on a board of 9x6 squares",
+        ),
+        (Board("charuco", (8, 6), 0.025), "use squares=(9, 6)"),
+        (Board("charuco", (9, 6), 0.025, None, "DICT_6X6_250"), "use dictionary='DICT_5X5_250'"),
+        (
+            Board("charuco", (9, 6), 0.025, None, "DICT_APRILTAG_36H11"),
+            "27 markers of DICT_5X5_250",
+        ),
+        (OLD, "use old_origin=False"),
+        (CHECKERBOARD, "27 markers of DICT_5X5_1000: this is a ChArUco board"),
+    ],
+)
+def test_says_which_charuco_board_it_sees(asked, said, charuco_image):
+    assert said in not_found(charuco_image, asked)
+
+
+def test_a_longer_dictionary_of_the_family_has_the_same_markers(charuco_image):
+    for name in ("DICT_5X5_50", "DICT_5X5_1000"):
+        assert len(detect(charuco_image, Board("charuco", (9, 6), 0.025, None, name))) == 40
+
+
+@pytest.mark.parametrize("board", [CHECKERBOARD, CHARUCO], ids=["checker", "charuco"])
+def test_says_what_keeps_it_from_seeing(board, checkerboard_image):
+    assert not_found(np.full((480, 640), 30, np.uint8), board) == (
+        "the picture is blank: nearly all of it has grey levels from 30 to 30"
+    )
+    assert not_found(np.zeros((20, 640), np.uint8), board).startswith("the picture is 640x20 px")
+    blurred = cv2.GaussianBlur(checkerboard_image, (0, 0), 12)
+    assert "the picture is blurred (its sharpest edges are 2" in not_found(blurred, board)
+    noise = np.random.default_rng(2).integers(0, 256, (240, 320)).astype(np.uint8)
+    assert not_found(noise, board).startswith(("no checkerboard of 10x7", "no marker of DICT_5X5"))
+
+
+# --- many images ---
+
+
+def write(path, image):
+    path.write_bytes(cv2.imencode(path.suffix, image)[1].tobytes())
+
+
+@pytest.fixture
+def mixed_folder(tmp_path, charuco_image):
+    """Good images 2, 10 and a rotated photograph; and every kind of bad file."""
+    write(tmp_path / "view2.png", charuco_image)
+    write(tmp_path / "view10.jpg", charuco_image)
+    jpeg = (tmp_path / "view10.jpg").read_bytes()
+    tiff = b"II*\0\x08\0\0\0\x01\0" + struct.pack("<HHIHH", 0x112, 3, 1, 6, 0) + b"\0\0\0\0"
+    exif = b"Exif\0\0" + tiff
+    header = b"\xff\xe1" + struct.pack(">H", 2 + len(exif)) + exif
+    (tmp_path / "turned.jpg").write_bytes(jpeg[:2] + header + jpeg[2:])
+    thumbnail = b"\xff\xe1" + struct.pack(">H", 6) + b"\xff\xd8\xff\xd9"
+    (tmp_path / "cut.jpg").write_bytes(jpeg[:2] + thumbnail + jpeg[2 : len(jpeg) // 2])
+    png = (tmp_path / "view2.png").read_bytes()
+    (tmp_path / "cut.png").write_bytes(png[: len(png) // 2])
+    (tmp_path / "empty.png").write_bytes(b"")
+    (tmp_path / "notes.txt").write_text("view 3 was the good one")
+    (tmp_path / "session.json").write_text("{}")
+    write(tmp_path / "blank.png", np.full_like(charuco_image, 90))
+    write(tmp_path / "large.jpg", cv2.resize(charuco_image, (4000, 3000)))
+    (tmp_path / "folder.png").mkdir()
+    return tmp_path
+
+
+def test_a_folder_names_every_file_it_does_not_use(mixed_folder, charuco_image, capfd):
+    seen = detect_all(mixed_folder, CHARUCO)
+    assert [one.name for one in seen] == ["turned.jpg", "view2.png", "view10.jpg"]
+    assert seen.size == (640, 480)
+    np.testing.assert_array_equal(seen[0].pixels, seen[2].pixels)
+    np.testing.assert_array_equal(seen[1].pixels, detect(charuco_image, CHARUCO).pixels)
+    reasons = {skip.name: skip.reason for skip in seen.skipped}
+    assert list(reasons) == [
+        "blank.png",
+        "cut.jpg",
+        "cut.png",
+        "empty.png",
+        "large.jpg",
+        "notes.txt",
+    ]
+    assert reasons["blank.png"].startswith("the picture is blank")
+    assert reasons["cut.jpg"] == reasons["cut.png"] == "the file is cut off, its end is missing"
+    assert reasons["empty.png"] == "the file is empty"
+    assert reasons["notes.txt"] == "not an image that OpenCV can read"
+    assert reasons["large.jpg"] == (
+        "4000x3000 px, where most are 640x480: one calibration is for one size"
+    )
+    said = repr(seen)
+    assert said.startswith("3 views with 120 corners, 6 not used\n  turned.jpg: 40 corners in 640")
+    assert "\n  not used: empty.png: the file is empty" in said
+    assert capfd.readouterr() == ("", "")
+
+
+def test_arrays_paths_and_frames(mixed_folder, charuco_image):
+    class Frame:
+        number = 7
+        color = np.stack([charuco_image] * 3, axis=-1)
+
+    images = [charuco_image, mixed_folder / "view2.png", str(mixed_folder / "none.png"), Frame()]
+    seen = detect_all(images, CHARUCO)
+    assert [one.name for one in seen] == ["image 0", "view2.png", "frame 7"]
+    assert [skip.name for skip in seen.skipped] == ["none.png"]
+    assert seen.skipped[0].reason == "cannot be read (No such file or directory)"
+    Frame.color = None
+    with pytest.raises(ValueError, match="frame 0 has no colour image"):
+        detect_all([Frame()], CHARUCO)
+
+
+@pytest.mark.parametrize(
+    ("images", "message"),
+    [
+        ("no such folder", "images: got 'no such folder', want a folder that exists"),
+        ([], "images: got none"),
+        (7, "images: got a int, want a folder"),
+        ([7], "images: number 0 is a int, want a path, an array or a frame"),
+        ([np.zeros((480, 640))], "image: got float64 of shape (480, 640), want uint8"),
+    ],
+)
+def test_what_are_no_images(images, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        detect_all(images, CHARUCO)
+
+
+def test_an_empty_folder(tmp_path):
+    with pytest.raises(ValueError, match="holds no files"):
+        detect_all(tmp_path, CHARUCO)
+
+
+def test_ctrl_c_keeps_what_was_detected(charuco_image, monkeypatch, capsys):
+    calls = []
+
+    def until_third(image, board, name):
+        calls.append(name)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return detect(image, board, name)
+
+    monkeypatch.setattr(coursekit.boards.folder, "detect", until_third)
+    seen = detect_all([charuco_image] * 5, CHARUCO)
+    assert [one.name for one in seen] == ["image 0", "image 1"]
+    assert capsys.readouterr().out == "Stopped after 2 of 5 images; they are kept.\n"
+
+
+def test_detections_are_a_sequence_that_keeps_its_type():
+    views = [Detection(np.arange(3), np.zeros((3, 2)), (640, 480), f"v{k}") for k in range(4)]
+    odd = Detection(np.arange(3), np.zeros((3, 2)), (320, 240), "odd")
+    seen = Detections(views, [Skipped("a.png", "the file is empty")])
+    assert [one.name for one in seen[1:3]] == ["v1", "v2"]
+    assert [one.name for one in seen.pick([3, 0])] == ["v3", "v0"]
+    assert seen[::2].skipped == seen.pick([0]).skipped == seen.skipped
+    assert seen.size == (640, 480)
+    with pytest.raises(ValueError, match=r"view 4 \(odd\) is 320x240 px, the first 640x480"):
+        _ = Detections([*views, odd]).size
+    with pytest.raises(ValueError, match="there are none"):
+        _ = Detections().size
+    with pytest.raises(ValueError, match=r"pixels: got shape \(2, 2\), want \(3, 2\)"):
+        Detection(np.arange(3), np.zeros((2, 2)), (640, 480))
+    with pytest.raises(ValueError, match="read-only"):
+        views[0].pixels[0] = 1
+
+
+# --- paper ---
+
+BOX = re.compile(r"([\d.]+) ([\d.]+) m\n" + r"([\d.]+) ([\d.]+) l\n" * 3 + "h")
+MM = 25.4 / 72  # a PDF's unit
+
+
+def pdf_boxes(path):
+    """(left, bottom, right, top) in mm of every closed box in a PDF's page."""
+    data = path.read_bytes()
+    streams = re.findall(rb"stream\r?\n(.*?)\r?\nendstream", data, re.DOTALL)
+    page = next(text for text in map(unpacked, streams) if BOX.search(text))
+    corners = np.array([match.groups() for match in BOX.finditer(page)], float).reshape(-1, 4, 2)
+    return MM * np.concatenate([corners.min(axis=1), corners.max(axis=1)], axis=1)
+
+
+def unpacked(stream):
+    try:
+        return zlib.decompress(stream).decode("latin1")
+    except zlib.error:
+        return ""
+
+
+def test_a_pdf_has_its_true_size(tmp_path):
+    path = save_sheet(CHARUCO, tmp_path / "board.pdf")
+    page = re.search(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", path.read_bytes())
+    assert [float(side) * MM for side in page.groups()] == pytest.approx([297, 210], abs=1e-3)
+    boxes = pdf_boxes(path)
+    boxes = boxes[boxes[:, 0] > 0]  # without the page itself
+    sizes = boxes[:, 2:] - boxes[:, :2]
+    square = np.isclose(sizes, 25.0, atol=1e-3).all(axis=1)
+    assert square.sum() == 27
+    spread = boxes[square, 2:].max(axis=0) - boxes[square, :2].min(axis=0)
+    np.testing.assert_allclose(spread, [225, 150], atol=1e-3)
+    bar = sizes[np.isclose(sizes[:, 1], 1.5, atol=1e-3)]
+    np.testing.assert_allclose(bar, [[100.0, 1.5]], atol=1e-3)
+    cell = 18.75 / 7
+    rest = sizes[~square & ~np.isclose(sizes[:, 1], 1.5, atol=1e-3)]
+    np.testing.assert_allclose(rest[:, 1], cell, atol=1e-3)
+    np.testing.assert_allclose(rest[:, 0] / cell, np.rint(rest[:, 0] / cell), atol=1e-3)
+    assert (boxes[:, :2] > 5).all()
+    assert (boxes[:, 2:] < [292, 205]).all()
+
+
+@pytest.mark.parametrize("board", [CHARUCO, CHECKERBOARD, OLD], ids=["charuco", "checker", "old"])
+def test_a_png_has_its_true_size_and_is_found(board, tmp_path):
+    path = save_sheet(board, tmp_path / "board.png", dpi=150)
+    data = path.read_bytes()
+    per_metre = struct.unpack(">II", data[data.index(b"pHYs") + 4 :][:8])
+    assert np.array(per_metre) * 0.0254 == pytest.approx([150, 150], abs=0.02)
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    seen = detect(image, board)
+    assert len(seen) == len(board.points)
+    mm = seen.pixels * 25.4 / 150
+    expected = 1000 * board.points[:, :2] * ([1, -1] if board.old_origin else [1, 1])
+    np.testing.assert_allclose(mm - mm[0], expected - expected[0], atol=0.02)
+    bar = image[round(190.7 / 25.4 * 150)] / 255.0  # of the 210 mm of the sheet's height
+    assert (1 - bar)[: round(108 / 25.4 * 150)].sum() * 25.4 / 150 == pytest.approx(100, abs=0.01)
+
+
+def test_a_sheet_repeats_and_takes_no_notice_of_the_readers_style(tmp_path):
+    first = save_sheet(CHARUCO, tmp_path / "a.pdf").read_bytes()
+    with mpl.rc_context({"savefig.bbox": "tight", "text.color": "white", "path.simplify": False}):
+        assert save_sheet(CHARUCO, tmp_path / "b.pdf").read_bytes() == first
+        assert mpl.rcParams["savefig.bbox"] == "tight"
+    with pytest.raises(ValueError, match="exists already: choose another name or overwrite=True"):
+        save_sheet(CHECKERBOARD, tmp_path / "a.pdf")
+    assert (tmp_path / "a.pdf").read_bytes() == first
+    save_sheet(CHECKERBOARD, tmp_path / "a.pdf", overwrite=True)
+    assert (tmp_path / "a.pdf").read_bytes() != first
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.pdf", "b.pdf"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"path": "a.svg"}, "path: got 'a.svg', want a name that ends in .pdf or .png"),
+        ({"path": "none/a.pdf"}, "path: the folder none does not exist"),
+        ({"paper": "A7"}, "paper: got 'A7', want one of A4, A3"),
+        ({"dpi": 10}, "dpi: got 10, want a whole number from 72 to 2400"),
+        (
+            {"board": Board("charuco", (12, 9), 0.03)},
+            "paper: a board of 360 x 270 mm does not fit on A4: take A2, or squares of at most "
+            "20 mm",
+        ),
+        (
+            {"board": Board("charuco", (20, 20), 0.1, dictionary="DICT_5X5_1000")},
+            "take a print shop, or squares of at most 9.9 mm",
+        ),
+    ],
+)
+def test_a_sheet_that_cannot_be(changes, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=re.escape(message)):
+        save_sheet(**{"board": CHARUCO, "path": "a.pdf"} | changes)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_largest_square_that_is_offered_fits(tmp_path):
+    save_sheet(Board("charuco", (12, 9), 0.020), tmp_path / "a.pdf")
+    with pytest.raises(ValueError, match="does not fit"):
+        save_sheet(Board("charuco", (12, 9), 0.0201), tmp_path / "b.pdf")
