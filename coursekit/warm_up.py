@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from coursekit import geometry, simulation
-from coursekit.geometry import Intrinsics
+from coursekit.boards import Board
+from coursekit.geometry import Intrinsics, make_transform
+from coursekit.simulation.board_images import render_board
 
 
 def forget() -> None:
@@ -31,6 +33,8 @@ def compile_all() -> None:
     view = simulation.Rig(eye, 0.05).look_at(simulation.tabletop())
     view.depth(view.frame(np.random.default_rng(0)))
     view.truth_m  # noqa: B018 - a property that renders
+    pose = make_transform(np.eye(3), (-0.05, -0.05, 0.4))
+    render_board(Board("checkerboard", (5, 4), 0.025), pose, eye, np.random.default_rng(0))
 
 
 if __name__ == "__main__":

@@ -13,12 +13,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_realsense import real_library
+from scipy.spatial.transform import Rotation
 
 import coursekit as ck
+from coursekit.boards import Board, detect
 from coursekit.cameras import Camera, CameraError, Frame, Frames, open_camera
 from coursekit.cameras.camera import _looks_still, _noise_std
 from coursekit.cameras.simulated import SimulatedCamera
-from coursekit.geometry import Intrinsics, deproject, project, transform_points
+from coursekit.geometry import (
+    Intrinsics,
+    deproject,
+    make_transform,
+    pixel_grid,
+    project,
+    transform_points,
+)
 from coursekit.simulation import tabletop, wall_scene
 
 CALIBRATION_TOLERANCE = 1e-6  # the recorder writes extrinsics with six decimals
@@ -359,8 +368,111 @@ def test_the_truth_is_near_what_is_reported_and_each_unit_has_its_own():
     assert np.mean((np.abs(bias_mm) > 1.5) & (np.abs(bias_mm) < 5.5)) > 0.8
     assert repr(truths[7]) == (
         "true baseline 50.558 mm, reported 50.171 mm: depth scale error -0.77 %\n"
-        "disparity offset -0.198 px, drifting by 0.008 px with a correlation time of 3 s"
+        "disparity offset -0.198 px, drifting by 0.008 px with a correlation time of 3 s\n"
+        "true colour lens fx 614.69, fy 614.87, cx 321.37, cy 238.27 px, "
+        "k1 +0.0278, k2 -0.0228, p1 -0.0008, p2 -0.0001\n"
+        "        reported fx 613.20, fy 613.42, cx 319.94, cy 239.18 px, no distortion"
     )
+
+
+def test_the_colour_lens_is_near_what_is_reported_and_each_unit_has_its_own():
+    """Focal length off by 0.3 %, centre by 1.5 px, a residual distortion; pixels stay square."""
+    truths = [SimulatedCamera(seed=seed).reveal() for seed in range(200)]
+    lenses = [truth.color_lens for truth in truths]
+    factory = ck.specifications.device("D435").unit.color
+    assert all(truth.reported_color_lens == factory for truth in truths)
+    fx, fy = (np.array([getattr(lens, f) for lens in lenses]) for f in ("fx", "fy"))
+    assert np.std(fx / factory.fx - 1) == pytest.approx(0.003, rel=0.2)
+    assert np.std((fx / fy) * (factory.fy / factory.fx) - 1) == pytest.approx(0.0004, rel=0.2)
+    for entry in ("cx", "cy"):
+        off = [getattr(lens, entry) - getattr(factory, entry) for lens in lenses]
+        assert np.std(off) == pytest.approx(1.5, rel=0.2)
+    k1, k2, p1, p2, k3 = np.transpose([lens.coeffs for lens in lenses])
+    assert k1.mean() == pytest.approx(0.020, abs=0.001)
+    assert k2.mean() == pytest.approx(-0.030, abs=0.002)
+    assert np.std([p1, p2]) == pytest.approx(3e-4, rel=0.15)
+    assert not k3.any()
+
+
+def test_a_factory_distortion_is_part_of_the_true_lens():
+    factory = ck.specifications.device("D405").unit.color
+    true = SimulatedCamera("D405").reveal().color_lens
+    assert true.coeffs[0] - factory.coeffs[0] == pytest.approx(0.02, abs=0.01)
+    assert true.coeffs[4] == factory.coeffs[4]
+
+
+def test_what_the_factory_lens_predicts_is_seen_within_two_pixels_in_the_middle():
+    """So overlays in the notebooks fit, and yet a calibration finds something."""
+    camera = SimulatedCamera()
+    true = camera.reveal().color_lens
+    rays = deproject(pixel_grid(*camera.color.size), 1.0, camera.color.K)
+    off = np.linalg.norm(project(rays, true.K, true.dist) - project(rays, camera.color.K), axis=-1)
+    assert 1.0 < off[240, 320] < 2.0
+    assert 1.5 < np.sqrt((off**2).mean()) < 2.5
+    assert off.max() < 6.5  # in the image corners
+
+
+def test_the_colour_image_is_seen_through_the_true_lens():
+    """The block's front edges are where the true lens puts them, not the reported one."""
+    with SimulatedCamera() as camera:
+        row = camera.frame().color[240].astype(float).mean(axis=-1)
+        true, reported = camera.reveal().color_lens, camera.color
+    sides = transform_points(camera.T_color_depth, [[-0.03, 0.0, 0.45], [0.03, 0.0, 0.45]])
+    expected = project(sides, true.K, true.dist)[:, 0]
+    steps = np.abs(np.diff(row))
+    for u in expected:
+        near = slice(round(u) - 4, round(u) + 4)
+        assert near.start + steps[near].argmax() + 0.5 == pytest.approx(u, abs=0.6)
+    assert (np.abs(project(sides, reported.K)[:, 0] - expected) > 1.0).any()
+
+
+def test_a_board_is_shown_until_the_next_place():
+    board = Board("charuco", (9, 6), 0.025)
+    T = make_transform(Rotation.from_euler("xy", [25, -20], degrees=True), (-0.10, -0.06, 0.45))
+    with SimulatedCamera() as camera:
+        before = camera.frame()
+        camera.show_board(board, T)
+        one, two = camera.frames(2)
+        camera.show_board(board, T)
+        again = camera.color_image()
+        camera.place("60 mm block", 0.45)
+        after = camera.frame()
+    true = camera.reveal().color_lens
+    seen = detect(one.color, board)
+    expected = project(transform_points(T, board.points[seen.ids]), true.K, true.dist)
+    assert np.sqrt(((seen.pixels - expected) ** 2).mean()) < 0.1
+    np.testing.assert_array_equal(one.color[..., 0], one.color[..., 2])
+    np.testing.assert_array_equal(one.color, again)
+    assert (one.color != two.color).mean() > 0.5  # new noise
+    assert two.number == one.number + 1
+    np.testing.assert_array_equal(before.depth, after.depth)
+    np.testing.assert_array_equal(before.color, after.color)
+
+
+def test_depth_sees_the_board_where_it_is():
+    board = Board("checkerboard", (10, 7), 0.025)
+    T = make_transform(Rotation.from_euler("y", -20, degrees=True), (-0.09, -0.06, 0.50))
+    with SimulatedCamera() as camera:
+        camera.show_board(board, T)
+        frame = camera.frame()
+    seen = transform_points(T, board.points)
+    pixels = np.rint(project(seen, camera.color.K)).astype(int)
+    depth_m = frame.depth_on_color()[pixels[:, 1], pixels[:, 0]]
+    found = depth_m > 0
+    assert found.mean() > 0.7
+    ratio = np.median(depth_m[found] / seen[found, 2])
+    assert ratio == pytest.approx(expected_m(camera, 0.48) / 0.48, abs=0.003)
+
+
+def test_a_board_that_faces_away_is_refused_and_changes_nothing():
+    board = Board("charuco", (9, 6), 0.025)
+    turned = make_transform(Rotation.from_euler("y", 180, degrees=True), (0.1, 0.0, 0.5))
+    with SimulatedCamera() as camera:
+        scene = camera.scene
+        for T in (turned, make_transform(np.eye(3), (0.0, 0.0, -0.5))):
+            with pytest.raises(ValueError, match=r"^T_camera_board: .* does not face the camera"):
+                camera.show_board(board, T)
+        assert camera.scene is scene
 
 
 def test_a_recording_reveals_nothing(recording):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Literal
 
@@ -18,13 +18,15 @@ from coursekit.cameras.camera import (
     check_depth_scale,
     check_distance,
 )
-from coursekit.geometry import invert_transform
+from coursekit.geometry import Intrinsics, invert_transform
 from coursekit.simulation import Rig, Scene, artefact_scene, render, tabletop, wall_scene
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
+    from coursekit.boards import Board
     from coursekit.simulation import View
+    from coursekit.specifications import Unit
 
 FRAMES_PER_S = 30
 PLUG_IN = (
@@ -40,6 +42,11 @@ SCENES: dict[str, Callable[[float], Scene]] = {
 # D435 is 2-5 mm off at 0.45 m, as people find (data/published_depth_noise.json).
 BASELINE_ERROR = (0.004, 0.010)  # least and largest, of the baseline, either sign
 OFFSET_PX = 0.10  # std
+# How far the colour lens is from the factory's figures, std: plausible, not measured. Its pixels
+# are square to a far smaller part than its focal length is known.
+FOCAL_ERROR, ASPECT_ERROR, CENTRE_ERROR_PX = 0.003, 0.0002, 1.5
+RADIAL = ((0.020, 0.003), (-0.030, 0.005))  # k1 and k2 that the factory's lack: mean and std
+TANGENTIAL = 3e-4
 DRIFT_PX, DRIFT_TIME_S = 0.008, 3.0  # a wall at 0.5 m then varies as published ones do
 
 
@@ -49,7 +56,8 @@ class HiddenTruth:
 
     baseline_m: the true one. reported_baseline_m: the one its depth is computed with.
     disparity_offset_px: by which disparities come out too large. drift_px, drift_time_s: standard
-    deviation and correlation time of a slow change of that offset.
+    deviation and correlation time of a slow change of that offset. color_lens: of the colour image,
+    coefficients in OpenCV's sense. reported_color_lens: what the device says of it.
     """
 
     baseline_m: float
@@ -57,6 +65,8 @@ class HiddenTruth:
     disparity_offset_px: float
     drift_px: float
     drift_time_s: float
+    color_lens: Intrinsics
+    reported_color_lens: Intrinsics
 
     @property
     def scale_error(self) -> float:
@@ -69,7 +79,9 @@ class HiddenTruth:
             f"{1000 * self.reported_baseline_m:.3f} mm: depth scale error "
             f"{100 * self.scale_error:+.2f} %\n"
             f"disparity offset {self.disparity_offset_px:+.3f} px, drifting by "
-            f"{self.drift_px:.3f} px with a correlation time of {self.drift_time_s:g} s"
+            f"{self.drift_px:.3f} px with a correlation time of {self.drift_time_s:g} s\n"
+            f"true colour lens {_lens_text(self.color_lens)}\n"
+            f"        reported {_lens_text(self.reported_color_lens)}"
         )
 
 
@@ -77,7 +89,8 @@ class SimulatedCamera(Camera):
     """A stand-in for one unit of a real camera model, looking at a block on a table.
 
     Two infrared images are rendered and exposed, and depth is what a block matcher makes of them:
-    see `simulation.active_stereo`. The colour image has no noise.
+    see `simulation.active_stereo`. The colour image has no noise unless it shows a board (see
+    `show_board`), and its true lens is not quite the one that the camera reports.
 
     device: a name of data/devices.toml. seed: names the unit, so its hidden truth, its pattern of
     speckle and its noise. scene: in the depth camera's frame. ambient, exposure, depth_scale_m: see
@@ -114,11 +127,12 @@ class SimulatedCamera(Camera):
         self.T_color_depth = unit.T_color_depth
         self._device, self._projector = device, profile.projector
         self._seed, self._advice, self._closed = int(seed), advice, False
-        self._truth = _hidden_truth(self._seed, unit.baseline_m)
+        self._truth = _hidden_truth(self._seed, unit)
         self._given = 0
         self._place_name, self._distance_m = ("60 mm block", 0.45) if scene is None else ("", 0.0)
         self.scene = _scene(self._place_name, self._distance_m) if scene is None else scene
         self._view: View | None = None
+        self._shown: tuple[Board, NDArray[np.float64]] | None = None
         self._ambient, self._exposure = ambient, exposure
         self.set(ambient, exposure, depth_scale_m)
 
@@ -134,7 +148,26 @@ class SimulatedCamera(Camera):
         scene = _scene(name, float(distance_m))
         if scene is not self.scene:
             self.scene, self._view = scene, None
+        self._shown = None
         self._place_name, self._distance_m = name, float(distance_m)
+        self._start_afresh()
+
+    def show_board(self, board: Board, T_camera_board: ArrayLike) -> None:
+        """Lay a calibration board on a table before the camera, until the next `place`.
+
+        T_camera_board (4, 4): board frame to the colour camera's frame. The colour image is then
+        what `render_board` makes with the true lens, grey and with noise; the depth image that of a
+        plain plate of the board's size. Raises ValueError for a pose that does not face the camera.
+        """
+        from coursekit.simulation.board_images import board_scene, check_pose
+
+        T = check_pose(board, T_camera_board)
+        T_color_depth = specifications.device(self._device).unit.T_color_depth
+        self.scene = board_scene(board, invert_transform(T_color_depth) @ T)
+        self._view, self._shown = None, (board, T)
+        # Rounded: the last bits of a pose differ between machines, the pictures must not.
+        name = f"{board.kind} {board.squares} {board.square_m:.6f} {np.rint(1e6 * T).astype(int)}"
+        self._place_name, self._distance_m = name, float(T[2, 3])
         self._start_afresh()
 
     def set(
@@ -179,14 +212,11 @@ class SimulatedCamera(Camera):
     def _stream(self) -> Generator[Frame, None, None]:
         self._check_open()
         while not self._closed:
-            view = self._look()
-            color = _color_image(self.scene, self._device)
-            self._given += 1
-            self._since_placed_s += 1 / FRAMES_PER_S
+            view, color = self._look(), self.color_image()
             shot = view.frame(self._rng, self._drift_from_s + self._since_placed_s)
             yield Frame(
                 view.depth(shot, self.depth_scale_m),
-                color.copy(),
+                color,
                 self.depth_scale_m,
                 self._given / FRAMES_PER_S,
                 self._given,
@@ -195,6 +225,19 @@ class SimulatedCamera(Camera):
                 self.T_color_depth,
                 (shot.left, shot.right),
             )
+
+    def color_image(self) -> NDArray[np.uint8]:
+        """The colour image (h, w, 3) of the next frame alone, which needs no stereo matching."""
+        self._check_open()
+        self._given += 1
+        self._since_placed_s += 1 / FRAMES_PER_S
+        lens = self._truth.color_lens
+        if self._shown is None:
+            return _color_image(self.scene, self._device, lens).copy()
+        from coursekit.simulation.board_images import render_board
+
+        grey = render_board(*self._shown, lens, self._color_rng)
+        return np.repeat(grey[..., None], 3, axis=2)
 
     def _check_open(self) -> None:
         if self._closed:
@@ -219,6 +262,7 @@ class SimulatedCamera(Camera):
         """Start the named stream of random numbers, and the drift at a moment that it names."""
         name = f"{self._place_name} {self._distance_m:.6f} {self._ambient:.6g} {self._exposure}"
         self._rng = np.random.default_rng([self._seed, zlib.crc32(name.encode())])
+        self._color_rng = np.random.default_rng([self._seed, zlib.crc32(name.encode()), 1])
         self._drift_from_s = self._rng.uniform(0.0, 1000.0 * DRIFT_TIME_S)
         self._since_placed_s = 0.0
 
@@ -235,16 +279,49 @@ def _scene(name: str, distance_m: float) -> Scene:
 
 
 @lru_cache(maxsize=4)
-def _color_image(scene: Scene, device: str) -> NDArray[np.uint8]:
-    """The colour image (h, w, 3) of a scene, without noise."""
-    unit = specifications.device(device).unit
-    return render(scene, unit.color, invert_transform(unit.T_color_depth)).color
+def _color_image(scene: Scene, device: str, lens: Intrinsics) -> NDArray[np.uint8]:
+    """The colour image (h, w, 3) of a scene through this lens, without noise."""
+    T_color_depth = specifications.device(device).unit.T_color_depth
+    return render(scene, lens, invert_transform(T_color_depth)).color
 
 
-def _hidden_truth(seed: int, baseline_m: float) -> HiddenTruth:
+def _hidden_truth(seed: int, unit: Unit) -> HiddenTruth:
     rng = np.random.default_rng([seed, zlib.crc32(b"hidden truth")])
     error = rng.choice([-1.0, 1.0]) * rng.uniform(*BASELINE_ERROR)
     offset_px = OFFSET_PX * rng.standard_normal()
     return HiddenTruth(
-        baseline_m * (1.0 + error), baseline_m, float(offset_px), DRIFT_PX, DRIFT_TIME_S
+        unit.baseline_m * (1.0 + error),
+        unit.baseline_m,
+        float(offset_px),
+        DRIFT_PX,
+        DRIFT_TIME_S,
+        _true_lens(seed, unit.color),
+        unit.color,
+    )
+
+
+def _true_lens(seed: int, reported: Intrinsics) -> Intrinsics:
+    """The colour lens of the unit that this seed names."""
+    rng = np.random.default_rng([seed, zlib.crc32(b"colour lens")])
+    scale, aspect = 1 + FOCAL_ERROR * rng.standard_normal(), ASPECT_ERROR * rng.standard_normal()
+    dx, dy = CENTRE_ERROR_PX * rng.standard_normal(2)
+    radial = [mean + std * rng.standard_normal() for mean, std in RADIAL]
+    missed = [*radial, *(TANGENTIAL * rng.standard_normal(2)), 0.0]
+    return replace(
+        reported,
+        fx=reported.fx * scale * (1 + aspect),
+        fy=reported.fy * scale * (1 - aspect),
+        cx=reported.cx + dx,
+        cy=reported.cy + dy,
+        model="brown_conrady",
+        coeffs=tuple(np.add(reported.coeffs, missed).tolist()),
+    )
+
+
+def _lens_text(lens: Intrinsics) -> str:
+    names = ("k1", "k2", "p1", "p2", "k3")
+    coeffs = ", ".join(f"{n} {c:+.4f}" for n, c in zip(names, lens.coeffs, strict=True) if c)
+    return (
+        f"fx {lens.fx:.2f}, fy {lens.fy:.2f}, cx {lens.cx:.2f}, cy {lens.cy:.2f} px, "
+        f"{coeffs or 'no distortion'}"
     )
