@@ -217,7 +217,7 @@ def undistort(xy: ArrayLike, dist: ArrayLike) -> tuple[Floats, NDArray[np.bool_]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         for _ in range(NEWTON_STEPS):
             residual = distort(ideal, dist) - target
-            a, b, d = _distortion_jacobian(ideal, dist)
+            a, b, d = distortion_jacobian(ideal, dist)
             determinant = a * d - b * b
             step_x = (d * residual[..., 0] - b * residual[..., 1]) / determinant
             step_y = (a * residual[..., 1] - b * residual[..., 0]) / determinant
@@ -227,12 +227,15 @@ def undistort(xy: ArrayLike, dist: ArrayLike) -> tuple[Floats, NDArray[np.bool_]
         error = np.abs(distort(ideal, dist) - target).max(axis=-1, initial=0.0)
         radius = np.hypot(ideal[..., 0], ideal[..., 1])
         converged = (error < 1e3 * NEWTON_TOLERANCE * (1 + radius)) & (determinant > 0)
-        converged &= radius < _fold_radius(dist)
+        converged &= radius < fold_radius(dist)
     return ideal, converged
 
 
-def _distortion_jacobian(xy: Floats, dist: Floats) -> tuple[Floats, Floats, Floats]:
-    """d xd/dx, d xd/dy (= d yd/dx) and d yd/dy of `distort`, each (...)."""
+def distortion_jacobian(xy: Floats, dist: Floats) -> tuple[Floats, Floats, Floats]:
+    """d xd/dx, d xd/dy (= d yd/dx) and d yd/dy of `distort`, each (...).
+
+    xy (..., 2): ideal normalised coordinates. dist (5,): (k1, k2, p1, p2, k3).
+    """
     k1, k2, p1, p2, k3 = dist
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
@@ -245,8 +248,11 @@ def _distortion_jacobian(xy: Floats, dist: Floats) -> tuple[Floats, Floats, Floa
     )
 
 
-def _fold_radius(dist: Floats) -> float:
-    """The normalised radius at which r (1 + k1 r2 + k2 r4 + k3 r6) stops growing, or infinity."""
+def fold_radius(dist: Floats) -> float:
+    """The normalised radius at which r (1 + k1 r2 + k2 r4 + k3 r6) stops growing, or infinity.
+
+    dist (5,): (k1, k2, p1, p2, k3). Past this radius a model bends rays back into the image.
+    """
     k1, k2, _, _, k3 = dist
     # 1 + 3 k1 s + 5 k2 s2 + 7 k3 s3 = 0 with s = r2, written in 1/s so that small k3 do no harm
     inverses = np.roots([1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3])

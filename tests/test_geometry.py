@@ -58,7 +58,7 @@ def test_project_is_opencvs(K: np.ndarray, dist: np.ndarray, seed: int) -> None:
 def test_deproject_inverts_and_is_opencvs(K: np.ndarray, dist: np.ndarray, seed: int) -> None:
     points = points_in_view(seed)
     radius = np.hypot(points[:, 0], points[:, 1]) / points[:, 2]
-    points = points[radius < 0.95 * geometry._fold_radius(dist)]
+    points = points[radius < 0.95 * geometry.fold_radius(dist)]
     assume(len(points) > 0)
     pixels = geometry.project(points, K, dist)
     back = geometry.deproject(pixels, points[:, 2], K, dist)
@@ -95,7 +95,7 @@ def test_undistort_says_where_it_cannot() -> None:
 
 def test_distortion_jacobian_is_the_numerical_one() -> None:
     xy, h = np.array([0.31, -0.22]), 1e-6
-    a, b, d = geometry._distortion_jacobian(xy, DIST)
+    a, b, d = geometry.distortion_jacobian(xy, DIST)
     columns = [
         (geometry.distort(xy + e, DIST) - geometry.distort(xy - e, DIST)) / (2 * h)
         for e in h * np.eye(2)

@@ -1,0 +1,170 @@
+"""Derivatives of the projection, and least squares over a camera and the poses of its boards.
+
+A board's pose is perturbed from the left, in the camera's frame: T <- exp(xi) T with
+xi = (omega, v), a rotation (rad) about the camera's axes and a translation (m). A point moves by
+omega x p + v, whichever board it is on; so an uncertain pose and a moving camera have the same
+columns, and the pose that several boards have in common is the mean of their xi.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from coursekit.geometry import distort, distortion_jacobian
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from coursekit.geometry import Intrinsics
+
+    Floats = NDArray[np.float64]
+
+PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+
+
+def project_with_derivatives(
+    points: Floats, intrinsics: Intrinsics
+) -> tuple[Floats, Floats, Floats]:
+    """Pixels of points in the camera's frame and their derivatives.
+
+    points (N, 3): m, Z > 0. Returns pixels (N, 2), d pixels / d `PARAMETERS` (N, 2, 9) and
+    d pixels / d point (N, 2, 3), px/m. Source: the derivatives of OpenCV's `projectPoints`.
+    """
+    z = points[:, 2]
+    xy = points[:, :2] / z[:, None]
+    x, y = xy[:, 0], xy[:, 1]
+    r2 = x * x + y * y
+    coeffs = np.array(intrinsics.coeffs)
+    distorted = distort(xy, coeffs)
+    focal = np.array([intrinsics.fx, intrinsics.fy])
+    pixels = distorted * focal + [intrinsics.cx, intrinsics.cy]
+
+    by_parameter = np.zeros((len(points), 2, 9))
+    by_parameter[:, [0, 1], [0, 1]] = distorted
+    by_parameter[:, [0, 1], [2, 3]] = 1.0
+    for column, power in ((4, r2), (5, r2 * r2), (8, r2**3)):
+        by_parameter[:, :, column] = xy * power[:, None]
+    by_parameter[:, 0, 6] = by_parameter[:, 1, 7] = 2.0 * x * y
+    by_parameter[:, 0, 7] = r2 + 2.0 * x * x
+    by_parameter[:, 1, 6] = r2 + 2.0 * y * y
+    by_parameter[:, :, 4:] *= focal[:, None]
+
+    xx, cross, yy = distortion_jacobian(xy, coeffs)
+    by_xy = np.stack([xx, cross, cross, yy], axis=-1).reshape(-1, 2, 2) * focal[:, None]
+    by_point = np.empty((len(points), 2, 3))
+    by_point[..., :2] = by_xy / z[:, None, None]
+    by_point[..., 2] = -np.einsum("nij,nj->ni", by_point[..., :2], xy)
+    return pixels, by_parameter, by_point
+
+
+def twist_columns(points: Floats, by_point: Floats) -> Floats:
+    """d pixels / d (omega, v), (N, 2, 6), of points (N, 3) that move by omega x p + v."""
+    # d (omega x p) / d omega = -[p]x, and -(row . [p]x) = (p x row)
+    rotation = np.cross(points[:, None, :], by_point)
+    return np.concatenate([rotation, by_point], axis=-1)
+
+
+def moved(T: Floats, twists: Floats) -> Floats:
+    """exp(xi) T for transforms (n, 4, 4) and twists (n, 6), with R = exp(omega), t = v."""
+    from scipy.spatial.transform import Rotation
+
+    step = np.broadcast_to(np.eye(4), T.shape).copy()
+    step[:, :3, :3] = Rotation.from_rotvec(twists[:, :3]).as_matrix()
+    step[:, :3, 3] = twists[:, 3:]
+    return step @ T
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """J'J of parameters that all views share and six of a pose a view, poses eliminated.
+
+    shared (2N, g): rows u, v of each corner, view after view. poses: one (2 N_i, 6) a view.
+    residuals (2N,): observed - predicted, px. Everything is in units where the residuals have
+    variance 1; the caller multiplies covariances by sigma^2.
+    """
+
+    shared: Floats
+    poses: Sequence[Floats]
+    residuals: Floats
+
+    @cached_property
+    def slices(self) -> list[slice]:
+        """The rows of each view."""
+        ends = np.cumsum([len(block) for block in self.poses])
+        return [slice(e - len(b), e) for e, b in zip(ends, self.poses, strict=True)]
+
+    @cached_property
+    def pose_covariances(self) -> Floats:
+        """(B_i' B_i)^-1 of each view, (n, 6, 6): of its pose where the shared are known."""
+        return np.stack([scaled_inverse(block.T @ block) for block in self.poses])
+
+    @cached_property
+    def responses(self) -> Floats:
+        """Y (n, 6, g): pose i moves by -Y_i d when the shared parameters move by d."""
+        return np.stack([
+            inverse @ (block.T @ self.shared[rows])
+            for inverse, block, rows in zip(
+                self.pose_covariances, self.poses, self.slices, strict=True
+            )
+        ])  # fmt: skip
+
+    @cached_property
+    def information(self) -> Floats:
+        """The Schur complement (g, g): what is known of the shared parameters, poses unknown."""
+        total = self.shared.T @ self.shared
+        for block, rows, response in zip(self.poses, self.slices, self.responses, strict=True):
+            total -= (self.shared[rows].T @ block) @ response
+        return (total + total.T) / 2
+
+    @cached_property
+    def shared_covariance(self) -> Floats:
+        """The inverse of `information`, (g, g)."""
+        return scaled_inverse(self.information)
+
+    def step(self) -> tuple[Floats, Floats]:
+        """The Gauss-Newton step: (g,) of the shared parameters and (n, 6) of the poses."""
+        by_pose = np.stack([
+            block.T @ self.residuals[rows]
+            for block, rows in zip(self.poses, self.slices, strict=True)
+        ])  # fmt: skip
+        reduced = self.shared.T @ self.residuals - np.einsum("nig,ni->g", self.responses, by_pose)
+        shared = self.shared_covariance @ reduced
+        own = np.einsum("nij,nj->ni", self.pose_covariances, by_pose)
+        return shared, own - self.responses @ shared
+
+    def decrease(self) -> float:
+        """What the Gauss-Newton step takes off the sum of squares where the model is linear."""
+        shared, twists = self.step()
+        change = self.shared @ shared
+        for block, rows, twist in zip(self.poses, self.slices, twists, strict=True):
+            change[rows] += block @ twist
+        return float(change @ change)
+
+    def covariance(self) -> Floats:
+        """The covariance (g + 6n, g + 6n) of the shared parameters, then the poses in order."""
+        g, n = self.shared.shape[1], len(self.poses)
+        spread = np.concatenate([np.eye(g), -self.responses.reshape(6 * n, g)])
+        joint = spread @ self.shared_covariance @ spread.T
+        for i, own in enumerate(self.pose_covariances):
+            at = slice(g + 6 * i, g + 6 * i + 6)
+            joint[at, at] += own
+        return joint
+
+
+def scaled_inverse(matrix: Floats) -> Floats:
+    """The inverse of a symmetric positive matrix whose rows have very different units.
+
+    A direction that the data do not determine at all (to double precision) gets a variance that
+    is huge, not an exception: that it is undetermined is what the reader must learn.
+    """
+    scale = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    scale = np.where(scale > 0, scale, 1.0)
+    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
+    values = np.maximum(values, len(values) * np.finfo(float).eps * values[-1])
+    return (vectors / values) @ vectors.T / np.outer(scale, scale)

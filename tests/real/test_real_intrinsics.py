@@ -1,0 +1,118 @@
+"""OpenCV's own calibration pictures, against what its authors published and what it hides."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from coursekit import boards, intrinsics
+from coursekit.boards import Board, Detection, Detections
+
+pytestmark = pytest.mark.real
+
+CHESSBOARD = Board("checkerboard", (10, 7), 0.025)
+CHARUCO = Board("charuco", (5, 7), 0.04, 0.02, "DICT_6X6_250")
+PUBLISHED = {"f": 535.91573, "cx": 342.28315, "cy": 235.57083}
+PUBLISHED_RMS_PX = 0.39259
+PUBLISHED_PER_VIEW_PX = [
+    0.19297, 1.18205, 0.17318, 0.19342, 0.15957, 0.17968, 0.23099, 0.24195, 0.29627, 0.16718,
+    0.20200, 0.38104, 0.17440,
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder():
+    if not os.environ.get("COURSEKIT_REAL_DATA"):
+        pytest.skip("COURSEKIT_REAL_DATA is not set: it names the folder of real data")
+    return Path(os.environ["COURSEKIT_REAL_DATA"])
+
+
+@pytest.fixture(scope="module")
+def published_corners(folder) -> Detections:
+    """Corners as OpenCV's sample finds them: an 11 px half window for cornerSubPix."""
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 0.1)
+    views = []
+    for path in sorted((folder / "opencv_chessboard").glob("left*.jpg")):
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        found, corners = cv2.findChessboardCorners(image, CHESSBOARD.corners)
+        assert found
+        corners = cv2.cornerSubPix(image, corners, (11, 11), (-1, -1), criteria)[:, 0]
+        views.append(Detection(np.arange(54), corners, image.shape[::-1], path.name))
+    return Detections(views)
+
+
+@pytest.fixture(scope="module")
+def own_corners(folder) -> Detections:
+    return boards.detect_all(folder / "opencv_chessboard", CHESSBOARD, progress=False)
+
+
+def test_the_published_fit_comes_out_with_the_published_settings(published_corners):
+    """fx = fy held, five coefficients, 11 px window: within 2 % of the stated sigmas."""
+    fit = intrinsics.calibrate(published_corners, CHESSBOARD, same_focal=True)
+    assert fit.converged
+    assert fit.rms_px == pytest.approx(PUBLISHED_RMS_PX, abs=0.001)
+    for name, value in PUBLISHED.items():
+        assert fit.value(name) == pytest.approx(value, abs=0.02 * fit.sigma(name))
+    np.testing.assert_allclose(fit.per_view_rms_px, PUBLISHED_PER_VIEW_PX, atol=0.002)
+
+
+def test_the_window_moves_f_by_more_than_its_interval(published_corners, own_corners):
+    """With windows as wide as the corners allow, view 02 is as good as any and f is another."""
+    assert len(own_corners) == 13
+    theirs = intrinsics.calibrate(published_corners, CHESSBOARD, same_focal=True)
+    ours = intrinsics.calibrate(own_corners, CHESSBOARD, same_focal=True)
+    assert theirs.per_view_rms_px[1] > 1.1
+    assert ours.per_view_rms_px.max() < 0.3
+    assert ours.rms_px == pytest.approx(0.195, abs=0.02)
+    assert 2 < theirs.value("f") - ours.value("f") < 4
+    assert theirs.value("f") - ours.value("f") > 2.2 * theirs.sigma("f")
+
+
+def test_halves_agree_in_the_middle_and_differ_by_pixels_at_the_edge(own_corners):
+    """Held-out views do not see it: they have no corners there either."""
+    both = intrinsics.halves(own_corners, CHESSBOARD)
+    length = both.length_px
+    assert length[10:20, 15:25].max() < 0.15
+    assert 5 < length.max() < 40
+    assert both.expected_px.max() > 5  # and the covariance says so
+    held = intrinsics.held_out(own_corners, CHESSBOARD)
+    assert held.rms_px == pytest.approx(0.20, abs=0.02)
+    verdict = intrinsics.calibrate(own_corners, CHESSBOARD).verdict()
+    assert verdict.startswith("Not good enough: in 95 % of the image")
+    assert "no corners in the outer tenth" in verdict
+
+
+def test_four_charuco_views_do_not_determine_k(folder):
+    detections = boards.detect_all(folder / "opencv_charuco", CHARUCO, progress=False)
+    assert len(detections) == 4
+    fit = intrinsics.calibrate(detections, CHARUCO)
+    assert fit.rms_px == pytest.approx(0.19, abs=0.03)
+    assert fit.sigma("fx") > 10
+    assert fit.sigma("cy") > 7
+    low, high = fit.interval("fx")
+    assert low < 452.5 < high  # the published fit, 27 px from the careful re-run with equal RMS
+    verdict = fit.verdict()
+    assert verdict.startswith("Not good enough: these 4 views do not determine K")
+    assert "tilt 30 to 45" in verdict.replace("\n  ", " ")
+
+
+def test_diagnose_names_the_artefact_in_view_02(published_corners):
+    """A refinement window wider than the corners' spacing took in a neighbour."""
+    found = {f.name: f for f in intrinsics.diagnose(published_corners, CHESSBOARD)}
+    assert "left02" in found["spoiled_view"].evidence
+    assert "window" in found["spoiled_view"].remedy
+
+
+def test_diagnose_says_that_the_halves_disagree_at_the_edge(own_corners):
+    found = {f.name: f for f in intrinsics.diagnose(own_corners, CHESSBOARD)}
+    assert "spoiled_view" not in found
+    assert "halves_disagree" in found
+
+
+def test_diagnose_says_that_four_views_are_few(folder):
+    detections = boards.detect_all(folder / "opencv_charuco", CHARUCO, progress=False)
+    assert {"few_views", "no_edge_corners"} <= set(intrinsics.diagnose(detections, CHARUCO).names)

@@ -1,0 +1,413 @@
+"""Judging a fit: coverage, tilts, verdict, halves, held-out views, the factory's K, bow, next view.
+
+COURSEKIT_NIGHTLY=1 takes more sessions.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from coursekit import intrinsics
+from coursekit.boards import Board, Detection, Detections
+from coursekit.geometry import Intrinsics, make_transform, project, transform_points
+from coursekit.intrinsics.differences import difference_px
+from coursekit.intrinsics.next_view import visible
+from coursekit.intrinsics.uncertainty import image_grid
+from coursekit.simulation.sessions import Effects, bowed, corner_session
+
+NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
+LENS = Intrinsics(
+    640, 480, 612.0, 610.0, 322.0, 238.0, "brown_conrady", (0.08, -0.18, 0.0007, -0.0004, 0.05)
+)
+CHARUCO = Board("charuco", (9, 6), 0.025)
+CHECKERBOARD = Board("checkerboard", (10, 7), 0.025)
+
+
+def fit(board: Board, seed: int, **arguments) -> intrinsics.IntrinsicsResult:
+    return intrinsics.calibrate(corner_session(board, LENS, seed, **arguments)[0], board)
+
+
+@pytest.fixture(scope="module")
+def good() -> intrinsics.IntrinsicsResult:
+    return fit(CHARUCO, 1)
+
+
+# --- coverage and tilts ---
+
+
+def test_coverage_counts_cells_and_margins() -> None:
+    pixels = np.array([[63.5, 47.5], [319.5, 239.5], [575.5, 335.5]])
+    seen = intrinsics.coverage([Detection(np.arange(3), pixels, (640, 480))], cells=(2, 4))
+    np.testing.assert_array_equal(seen.counts, [[1, 0, 0, 0], [0, 0, 1, 1]])
+    assert seen.fraction == pytest.approx(3 / 8)
+    assert seen.margins == pytest.approx((0.1, 0.1, 0.1, 0.3))
+    assert seen.reach == pytest.approx(math.hypot(256, 192) / 400)
+    assert seen.empty_sides == ("bottom",)
+    with pytest.raises(ValueError, match="detections: there are none"):
+        intrinsics.coverage([])
+
+
+def test_tilts_are_the_angles_the_boards_were_turned_by(good) -> None:
+    turns = [(25.0, 0.0), (-10.0, 0.0), (0.0, 30.0), (0.0, -40.0)]
+    poses = np.stack([
+        make_transform(Rotation.from_euler("xy", turn, degrees=True), [0, 0, 0.5]) for turn in turns
+    ])  # fmt: skip
+    turned = intrinsics.tilts(replace(good, T_camera_board=poses))
+    np.testing.assert_allclose(turned.about_x_deg, [25, -10, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(turned.about_y_deg, [0, 0, 30, -40], atol=1e-9)
+    np.testing.assert_allclose(turned.total_deg, [25, 10, 30, 40])
+    # the other direction of z, as on boards with the old origin, is the same tilt
+    flipped = poses @ np.diag([1.0, -1.0, -1.0, 1.0])
+    again = intrinsics.tilts(replace(good, T_camera_board=flipped))
+    np.testing.assert_allclose(again.about_x_deg, turned.about_x_deg, atol=1e-9)
+    assert repr(turned) == "boards tilted 10 to 40 deg, spread 13 and 25 deg about x and y"
+
+
+# --- the verdict ---
+
+SEEDS = range(100, 130) if NIGHTLY else range(100, 104)
+FLAT, INNER = Effects(max_tilt_deg=3.0), Effects(inner_only=0.15)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "head", "words"),
+    [
+        ({"effects": FLAT}, "Not good enough: these 28 views do not determine K", "tilt 30 to 45"),
+        ({"effects": INNER}, "Not good enough", "no corners in the outer tenth"),
+        ({"noise_px": 0.25}, "Usable with care", "corners scatter by 0.2"),
+    ],
+    ids=["flat", "inner", "noisy"],
+)
+def test_verdict_names_what_is_weak(arguments, head, words) -> None:
+    for seed in SEEDS:
+        result = fit(CHARUCO, seed, **arguments)
+        verdict = result.verdict()
+        assert verdict.startswith(head)
+        assert words in verdict.replace("\n  ", " ")
+        assert max(map(len, (verdict + "\n" + repr(result)).splitlines())) <= 92
+
+
+def test_verdict_does_not_judge_by_rms() -> None:
+    """Good sessions are called good; the useless ones above have the same RMS, 0.11 px."""
+    verdicts = [fit(CHARUCO, seed).verdict() for seed in SEEDS]
+    assert sum(text.startswith("Good: ") for text in verdicts) >= 0.75 * len(verdicts)
+    assert not any(text.startswith("Not") for text in verdicts)
+    flat = fit(CHARUCO, 100, effects=FLAT)
+    assert flat.rms_px == pytest.approx(fit(CHARUCO, 100).rms_px, rel=0.05)
+    few = fit(CHARUCO, 3, views=4).verdict()
+    assert "4 views are few" in few
+
+
+# --- two halves ---
+
+
+def test_p_values_of_healthy_halves_are_uniform() -> None:
+    p_values = []
+    for seed in range(7000, 7000 + (500 if NIGHTLY else 40)):
+        detections, _ = corner_session(CHARUCO, LENS, seed)
+        p_values.append(intrinsics.halves(detections, CHARUCO, shape=(2, 2)).p_value)
+    for level in (0.1, 0.5):
+        share = np.mean(np.array(p_values) < level)
+        assert abs(share - level) < 3.5 * math.sqrt(level * (1 - level) / len(p_values))
+
+
+def test_difference_of_halves_is_as_large_as_it_says() -> None:
+    lengths, expected = [], []
+    for seed in range(7600, 7600 + (300 if NIGHTLY else 25)):
+        detections, _ = corner_session(CHARUCO, LENS, seed)
+        both = intrinsics.halves(detections, CHARUCO, range_m=0.6, shape=(5, 5))
+        lengths.append(both.length_px)
+        expected.append(both.expected_px)
+    # the length has two directions, the expected sigma is of the worse one
+    ratio = np.sqrt(np.mean(np.square(lengths), axis=0) / np.mean(np.square(expected), axis=0))
+    assert 0.8 < ratio.min() < ratio.max() < 1.7
+    assert 0.95 < np.median(ratio) < 1.45
+
+
+def test_halves_disagree_when_the_lens_was_refocused_between() -> None:
+    other = replace(LENS, fx=LENS.fx * 1.02, fy=LENS.fy * 1.02)
+    even, _ = corner_session(CHARUCO, LENS, 8, views=14)
+    odd, _ = corner_session(CHARUCO, other, 9, views=14)
+    mixed = Detections(view for pair in zip(even, odd, strict=True) for view in pair)
+    both = intrinsics.halves(mixed, CHARUCO)
+    assert both.p_value < 1e-6
+    assert "more than noise explains (p < 0.000001)" in repr(both)
+    assert both.first.value("fx") == pytest.approx(612, abs=4)
+    assert both.second.value("fx") == pytest.approx(624, abs=4)
+    with pytest.raises(ValueError, match="got 5 views, halves need at least 6"):
+        intrinsics.halves(mixed[:5], CHARUCO)
+
+
+def test_difference_takes_out_a_motion_of_the_frame_and_no_more() -> None:
+    """A principal point 5 px off is nearly a rotation; a distortion is not."""
+    grid = image_grid(LENS, (9, 11)).reshape(-1, 2)
+    shifted = replace(LENS, cx=LENS.cx + 5.0)
+    assert np.abs(difference_px(LENS, LENS, grid, 0.5)).max() < 1e-9
+    left = difference_px(LENS, shifted, grid, 0.5)
+    assert 0.01 < np.linalg.norm(left, axis=1).max() < 1.0  # of 5
+    scaled = replace(LENS, fx=LENS.fx * 1.01, fy=LENS.fy * 1.01)
+    near, far = (
+        np.linalg.norm(difference_px(LENS, scaled, grid, r), axis=1).max() for r in (0.5, math.inf)
+    )
+    assert near < 0.5 * far  # at one distance, moving away takes the place of a longer f
+    assert far > 3
+    bent = replace(LENS, coeffs=(0.06, *LENS.coeffs[1:]))
+    assert np.linalg.norm(difference_px(LENS, bent, grid, 0.5), axis=1).max() > 0.3
+
+
+# --- held out ---
+
+
+def test_held_out_views_prove_little(good) -> None:
+    detections = good.detections
+    held = intrinsics.held_out(detections, CHARUCO)
+    assert held.fitted_rms_px == good.rms_px
+    assert good.rms_px < held.rms_px < 1.1 * good.rms_px
+    assert held.per_view_rms_px.shape == (28,)
+    corners = np.array([len(d) for d in detections])
+    mean = (corners * held.per_view_rms_px**2).sum() / corners.sum()
+    assert held.rms_px**2 == pytest.approx(mean)
+    flat, _ = corner_session(CHARUCO, LENS, 1, effects=FLAT)
+    useless = intrinsics.held_out(flat, CHARUCO)
+    assert useless.rms_px == pytest.approx(held.rms_px, rel=0.1)  # and f is unknown by 20 %
+    assert "This proves little" in repr(useless)
+    with pytest.raises(ValueError, match="folds: got 1, want 2 to 28"):
+        intrinsics.held_out(detections, CHARUCO, folds=1)
+
+
+# --- the factory's K ---
+
+
+def test_comparison_with_the_truth_and_with_another_camera(good) -> None:
+    same = intrinsics.compare(good, LENS)
+    assert same.p_value > 0.01
+    assert np.abs(same.differences / same.sigmas).max() < 4
+    factory = replace(LENS, fx=620.0, fy=618.0)
+    other = intrinsics.compare(good, factory, range_m=0.5, shape=(5, 5))
+    assert other.p_value < 1e-6
+    assert other.differences[0] == pytest.approx(good.value("fx") - 620)
+    # pixel (0, 0) at Z = 0.5 m: x = (u - cx) Z / f, 322 / 612 of 0.5 m, a ratio of 620 / 612
+    own = 0.5 * (np.array([-322.0, -238.0]) / 612.0)
+    expected = np.linalg.norm(own) * (8 / 620)
+    assert other.shift_m[0, 0] == pytest.approx(expected, abs=0.0015)
+    assert max(map(len, repr(other).splitlines())) <= 92
+    with pytest.raises(ValueError, match=r"factory: made for \(848, 480\) px"):
+        intrinsics.compare(good, Intrinsics(848, 480, 600, 600, 424, 240))
+
+
+def test_comparison_of_a_shared_focal_length() -> None:
+    lens = replace(LENS, fy=LENS.fx)
+    detections, _ = corner_session(CHARUCO, lens, 5)
+    result = intrinsics.calibrate(detections, CHARUCO, same_focal=True)
+    factory = replace(lens, fx=610.0, fy=616.0)
+    assert intrinsics.compare(result, factory).differences[0] == pytest.approx(
+        result.value("f") - 613
+    )
+
+
+# --- the bow ---
+
+
+def biased(name: str, truth: float, results: list[intrinsics.IntrinsicsResult]) -> float:
+    """The mean error in units of its standard error."""
+    errors = np.array([r.value(name) - truth for r in results])
+    return float(errors.mean() / (errors.std(ddof=1) / math.sqrt(len(errors))))
+
+
+@pytest.mark.parametrize("board", [CHARUCO, CHECKERBOARD], ids=lambda board: board.kind)
+def test_a_bow_is_found_and_its_damage_undone(board: Board) -> None:
+    """Claim I1: 1 mm biases fx by about 2 % and k1 by several sigmas, at an RMS of 0.2 px."""
+    count = 100 if NIGHTLY else 10
+    flat, fitted, sag_held, fx_held = [], [], 0, 0
+    for seed in range(9000, 9000 + count):
+        detections, _ = corner_session(board, LENS, seed, effects=Effects(bow_m=0.001))
+        result = intrinsics.calibrate(detections, board)
+        bow = intrinsics.fit_bow(result)
+        assert bow.result.converged
+        assert bow.p_value < 1e-6
+        low, high = bow.interval_m()
+        sag_held += low <= 0.001 <= high
+        low, high = bow.result.interval("fx")
+        fx_held += low <= LENS.fx <= high
+        flat.append(result)
+        fitted.append(bow.result)
+    share = np.mean([r.value("fx") / LENS.fx - 1 for r in flat])
+    assert -0.030 < share < -0.015
+    off = np.mean([(r.value("k1") - 0.08) / r.sigma("k1") for r in flat])
+    assert -7 < off < -2
+    assert 0.15 < np.mean([r.rms_px for r in flat]) < 0.25
+    assert abs(biased("fx", LENS.fx, fitted)) < 3.5
+    assert abs(biased("k1", 0.08, fitted)) < 3.5
+    assert min(sag_held, fx_held) >= 0.88 * count - 1
+    assert np.mean([r.sigma_px for r in fitted]) == pytest.approx(0.08, rel=0.03)
+
+
+def test_a_flat_board_has_no_bow_and_a_hollow_one_a_negative_sag() -> None:
+    p_values = []
+    for seed in range(9500, 9500 + (200 if NIGHTLY else 15)):
+        bow = intrinsics.fit_bow(fit(CHARUCO, seed))
+        p_values.append(bow.p_value)
+        assert abs(bow.sag_m) < 4.5 * bow.sigma_m
+    assert 0.3 < np.mean(p_values) < 0.7
+    assert np.mean(np.array(p_values) < 0.05) < (0.1 if NIGHTLY else 0.2)
+    hollow = intrinsics.fit_bow(fit(CHARUCO, 1, effects=Effects(bow_m=-0.0005)))
+    assert hollow.sag_m == pytest.approx(-0.0005, abs=3 * hollow.sigma_m)
+    assert repr(hollow).startswith("the board's middle stands out by -0.")
+    assert max(map(len, repr(hollow.result).splitlines())) <= 92
+
+
+def test_bow_is_what_scipy_finds_over_everything() -> None:
+    """All intrinsics, poses and the bow by scipy's least_squares and OpenCV's projection."""
+    detections, truth = corner_session(CHARUCO, LENS, 11, views=9, effects=Effects(bow_m=0.0015))
+    bow = intrinsics.fit_bow(intrinsics.calibrate(detections, CHARUCO, model="k1k2"))
+    x, y = (CHARUCO.points[:, :2] - CHARUCO.points[:, :2].mean(axis=0)).T
+    names = bow.result.names
+
+    def residuals(theta: np.ndarray) -> np.ndarray:
+        fx, fy, cx, cy, k1, k2, a, b, c = theta[:9]
+        points = CHARUCO.points + np.outer(a * x * x + b * x * y + c * y * y, [0, 0, 1])
+        K, dist = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.array([k1, k2, 0, 0, 0])
+        parts = []
+        for pose, view in zip(theta[9:].reshape(-1, 6), detections, strict=True):
+            seen = cv2.projectPoints(points[view.ids], pose[:3], pose[3:], K, dist)[0][:, 0]
+            parts.append((view.pixels - seen).ravel())
+        return np.concatenate(parts)
+
+    poses = [
+        [*Rotation.from_matrix(T[:3, :3]).as_rotvec(), *T[:3, 3]] for T in truth.T_camera_board
+    ]
+    start = np.array([600.0, 600, 320, 240, 0, 0, 0, 0, 0, *np.ravel(poses)])
+    found = least_squares(residuals, start, x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    for i, name in enumerate(names):
+        assert bow.result.value(name) == pytest.approx(
+            found.x[i], abs=0.02 * bow.result.sigma(name)
+        )
+    sigma = np.sqrt(np.diag(bow.covariance))
+    assert np.abs((bow.coefficients - found.x[6:9]) / sigma).max() < 0.02
+    free = len(found.fun) - len(found.x)
+    covariance = np.linalg.inv(found.jac.T @ found.jac) * (found.fun @ found.fun) / free
+    expected = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(sigma, expected[6:9], rtol=0.01)
+    np.testing.assert_allclose([bow.result.sigma(name) for name in names], expected[:6], rtol=0.01)
+
+
+def test_bow_agrees_with_opencvs_released_object() -> None:
+    """calibrateCameraRO frees every corner of the board: a shape of our three coefficients."""
+    detections, _ = corner_session(CHECKERBOARD, LENS, 2, effects=Effects(bow_m=0.001))
+    result = intrinsics.calibrate(detections, CHECKERBOARD)
+    bow = intrinsics.fit_bow(result)
+    points = CHECKERBOARD.points.astype(np.float32)
+    _, K, _, _, _, found = cv2.calibrateCameraRO(
+        [points] * len(detections), [d.pixels.astype(np.float32) for d in detections], LENS.size,
+        CHECKERBOARD.corners[0] - 1, None, None, criteria=(3, 200, 1e-12),
+    )  # fmt: skip
+    assert K[0, 0] == pytest.approx(bow.result.value("fx"), abs=2 * bow.result.sigma("fx"))
+    assert abs(result.value("fx") - K[0, 0]) > 10 * bow.result.sigma("fx")
+
+    def shape(z: np.ndarray) -> np.ndarray:
+        plane = np.column_stack([CHECKERBOARD.points[:, :2], np.ones(54)])
+        return z - plane @ np.linalg.lstsq(plane, z, rcond=None)[0]
+
+    ours = shape(bow.result.points[:, 2])
+    theirs = shape(found.reshape(-1, 3)[:, 2])
+    true = shape(bowed(CHECKERBOARD, 0.001)[:, 2])
+    assert np.std(true) > 0.00025
+    assert np.std(ours - true) < 0.00001
+    assert np.std(theirs - ours) < 0.00004
+
+
+def test_a_bow_moves_corners_by_less_than_the_lesson_says() -> None:
+    """Claim I1: at most about a pixel, and it is absorbed; not several pixels."""
+    centre = CHECKERBOARD.points.mean(axis=0)
+    for focal, expected in ((600.0, (0.4, 0.9, 1.0)), (900.0, (0.5, 1.3, 1.6))):
+        K = np.array([[focal, 0, 320], [0, focal, 240], [0, 0, 1]])
+        for tilt, wanted in zip((15, 45, 60), expected, strict=True):
+            R = Rotation.from_euler("x", tilt, degrees=True)
+            T = make_transform(R, np.array([0, 0, 0.5]) - R.apply(centre))
+            flat = project(transform_points(T, CHECKERBOARD.points), K)
+            bent = project(transform_points(T, bowed(CHECKERBOARD, 0.001)), K)
+            moved = np.linalg.norm(bent - flat, axis=1).max()
+            assert moved == pytest.approx(wanted, abs=0.07)
+            _, r, t = cv2.solvePnP(CHECKERBOARD.points, bent, K, None)
+            again = cv2.projectPoints(CHECKERBOARD.points, r, t, K, None)[0][:, 0]
+            assert np.linalg.norm(again - bent, axis=1).max() < 0.95
+
+
+# --- the next view ---
+
+
+@pytest.mark.parametrize(
+    "arguments", [{"views": 5}, {"effects": FLAT}, {"effects": INNER}], ids=["few", "flat", "inner"]
+)
+def test_the_predicted_uncertainty_is_what_follows(arguments) -> None:
+    """The view is taken, everything is fitted again, and the map is as foretold."""
+    detections, _ = corner_session(CHARUCO, LENS, 3, **arguments)
+    result = intrinsics.calibrate(detections, CHARUCO)
+    best = intrinsics.next_view(result)
+    ids = visible(CHARUCO, LENS, best.T_camera_board)
+    rng = np.random.default_rng(0)
+    pixels = project(transform_points(best.T_camera_board, CHARUCO.points[ids]), LENS.K, LENS.dist)
+    taken = Detection(ids, pixels + rng.normal(0, 0.08, pixels.shape), LENS.size)
+    after = intrinsics.calibrate([*detections, taken], CHARUCO)
+
+    def worst(r: intrinsics.IntrinsicsResult) -> float:
+        return max(r.uncertainty_map(range_m, (7, 9)).max() for range_m in (0.45, math.inf))
+
+    assert worst(result) == pytest.approx(best.now_px)
+    assert worst(after) == pytest.approx(best.worst_px[best.index], rel=0.15)
+    assert worst(after) < 0.75 * worst(result)
+
+
+def test_next_view_goes_where_the_session_was_weak() -> None:
+    flat = intrinsics.next_view(fit(CHARUCO, 3, effects=FLAT))
+    tilt = math.degrees(math.acos(flat.T_camera_board[2, 2]))
+    assert tilt == pytest.approx(40)
+    inner = intrinsics.next_view(fit(CHARUCO, 3, effects=INNER))
+    seen = visible(CHARUCO, LENS, inner.T_camera_board)
+    pixels = project(
+        transform_points(inner.T_camera_board, CHARUCO.points[seen]), LENS.K, LENS.dist
+    )
+    # from 96 px free at the sides and 72 at top and bottom to corners in that margin
+    assert ((pixels < [96, 72]) | (pixels > [544, 408])).any()
+
+
+def test_candidates_show_enough_of_the_board() -> None:
+    for board, least in ((CHARUCO, 16), (CHECKERBOARD, 54)):
+        poses = intrinsics.candidate_views(board, LENS)
+        assert poses.shape == (459, 4, 4)
+        assert min(len(visible(board, LENS, T)) for T in poses) >= least
+    old = Board("charuco", (9, 6), 0.025, old_origin=True)
+    poses = intrinsics.candidate_views(old, LENS)
+    assert (poses[:, 2, 2] < 0).all()  # its z points at the viewer
+
+
+def test_candidates_that_show_nothing_are_never_chosen(good) -> None:
+    poses = intrinsics.candidate_views(CHARUCO, LENS)[:3]
+    behind = make_transform(np.eye(3), [0.0, 0.0, -0.5])
+    best = intrinsics.next_view(good, np.concatenate([behind[None], poses]), range_m=0.45)
+    assert np.isinf(best.worst_px[0])
+    assert best.index > 0
+    with pytest.raises(ValueError, match="none of them shows enough of the board"):
+        intrinsics.next_view(good, behind[None])
+    with pytest.raises(ValueError, match=r"candidates: got shape \(4, 4\), want \(m, 4, 4\)"):
+        intrinsics.next_view(good, behind)
+
+
+def test_a_bowed_boards_next_view_counts_the_bow(good) -> None:
+    """The bow's three coefficients widen the uncertainty, before and after.
+
+    A poor view may raise the worst a little: its pose counts in the mean over the boards.
+    """
+    poses = intrinsics.candidate_views(CHARUCO, LENS)[::40]
+    with_bow = intrinsics.next_view(intrinsics.fit_bow(good).result, poses)
+    without = intrinsics.next_view(good, poses)
+    assert with_bow.now_px > without.now_px
+    assert (with_bow.worst_px <= 1.02 * with_bow.now_px).all()
