@@ -10,8 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from coursekit import (
+        arm,
+        boards,
         cameras,
         geometry,
+        hand_eye,
+        intrinsics,
         lessons,
         plots,
         results,
@@ -20,16 +24,22 @@ if TYPE_CHECKING:
         stereo,
     )
     from coursekit.cameras import open_camera, place
+    from coursekit.cameras.capture import capture
     from coursekit.lessons import check, checkpoint, evidence
     from coursekit.plots import drag
 
 __all__ = [
+    "arm",
+    "boards",
     "cameras",
+    "capture",
     "check",
     "checkpoint",
     "drag",
     "evidence",
     "geometry",
+    "hand_eye",
+    "intrinsics",
     "lessons",
     "open_camera",
     "place",
@@ -41,6 +51,7 @@ __all__ = [
 ]
 
 _FUNCTIONS = {
+    "capture": "coursekit.cameras.capture",
     "open_camera": "coursekit.cameras",
     "place": "coursekit.cameras",
     "check": "coursekit.lessons",

@@ -12,7 +12,7 @@ import math
 import os
 import platform
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -59,8 +59,40 @@ class Quantity:
 
 
 @dataclass(frozen=True)
+class Covariance:
+    """The covariance of several numbers that were estimated together.
+
+    names (n): which numbers; matrix (n, n): in the product of their units, symmetric, none of its
+    eigenvalues negative. A NumPy array is taken and kept as tuples.
+    """
+
+    names: tuple[str, ...]
+    matrix: tuple[tuple[float, ...], ...]
+
+    def __post_init__(self) -> None:
+        import numpy as np
+
+        names, matrix = tuple(self.names), np.array(self.matrix, dtype=float)
+        if matrix.shape != (len(names), len(names)):
+            raise ValueError(f"matrix: got shape {matrix.shape}, want {(len(names), len(names))}")
+        if not np.isfinite(matrix).all():
+            raise ValueError("matrix: got NaN or infinity, want finite numbers")
+        sigma = np.sqrt(np.clip(np.diag(matrix), 1e-300, None))
+        correlation = matrix / np.outer(sigma, sigma)  # units differ by powers of ten
+        if not np.allclose(correlation, correlation.T, atol=1e-9):
+            raise ValueError("matrix: is not symmetric")
+        if np.linalg.eigvalsh(correlation).min() < -1e-9:
+            raise ValueError("matrix: is no covariance, one of its eigenvalues is negative")
+        object.__setattr__(self, "names", names)
+        object.__setattr__(self, "matrix", tuple(map(tuple, matrix.tolist())))
+
+
+@dataclass(frozen=True)
 class Result:
-    """What one notebook found: quantities by name, and the camera and day they come from."""
+    """What one notebook found: quantities by name, and the camera and day they come from.
+
+    covariances: of those quantities that were estimated together, by a name for the group.
+    """
 
     lesson: str
     source: Source
@@ -68,6 +100,7 @@ class Result:
     date: str
     versions: dict[str, str]
     quantities: dict[str, Quantity]
+    covariances: dict[str, Covariance] = field(default_factory=dict)
 
 
 def folder() -> Path:
@@ -75,12 +108,35 @@ def folder() -> Path:
     return Path(os.environ.get("COURSEKIT_RESULTS") or ROOT / "results")
 
 
-def save(lesson: str, camera: Camera, quantities: Mapping[str, Quantity]) -> Path:
+def save(
+    lesson: str,
+    camera: Camera,
+    quantities: Mapping[str, Quantity],
+    covariances: Mapping[str, Covariance] | None = None,
+) -> Path:
     """Write `results/<lesson>.json` in one step (a reader sees the old file or the new one)."""
-    for name, quantity in quantities.items():
-        if not isinstance(quantity, Quantity):
-            raise ValueError(f"quantities: {name} is a {type(quantity).__name__}, want Quantity")
-    result = Result(lesson, camera.source, camera.name, now(), _versions(), dict(quantities))
+    covariances = covariances or {}
+    for argument, given, want in (
+        ("quantities", quantities, Quantity),
+        ("covariances", covariances, Covariance),
+    ):
+        for name, value in given.items():
+            if not isinstance(value, want):
+                got = type(value).__name__
+                raise ValueError(f"{argument}: {name} is a {got}, want {want.__name__}")
+    for group, covariance in covariances.items():
+        unknown = [name for name in covariance.names if name not in quantities]
+        if unknown:
+            raise ValueError(f"covariances: {group} has {unknown[0]!r}, which is no quantity")
+    result = Result(
+        lesson,
+        camera.source,
+        camera.name,
+        now(),
+        _versions(),
+        dict(quantities),
+        dict(covariances),
+    )
     path = _path(lesson)
     write_json(path, {"format": FORMAT} | asdict(result))
     return path
@@ -94,7 +150,8 @@ def load(lesson: str) -> Result:
         if content.pop("format") != FORMAT:
             raise ValueError("written by another version of the course")
         quantities = {k: Quantity(**v) for k, v in content.pop("quantities").items()}
-        result = Result(**content, quantities=quantities)
+        covariances = {k: Covariance(**v) for k, v in content.pop("covariances", {}).items()}
+        result = Result(**content, quantities=quantities, covariances=covariances)
         if result.source not in get_args(Source):
             raise ValueError(f"source is {result.source!r}")
         return result

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 
-from coursekit import geometry, plots, specifications
+from coursekit import boards, geometry, plots, specifications
 from coursekit.geometry import Intrinsics
-from coursekit.plots import depth_noise, pinhole
+from coursekit.intrinsics import calibrate, compare, stored_power
+from coursekit.plots import depth_noise, intrinsics, pinhole
 from coursekit.plots.interactive import label
-from coursekit.simulation import tabletop
+from coursekit.simulation import Effects, corner_session, tabletop
 
 D435 = specifications.device("D435").unit
 LENSES = {n: specifications.lens(n).intrinsics for n in ("opencv_left", "d405_color")}
@@ -107,6 +108,27 @@ def test_field_of_view_in_millimetres() -> None:
 
 def test_point_cloud_leaves_invalid_points_out() -> None:
     assert f"{475 * 848} points" in FIGURES["point_cloud"].alt
+
+
+def test_point_cloud_shows_what_is_near_from_the_side_if_there_is_anything() -> None:
+    near = np.full((480, 848), 0.9, np.float32)
+    near[200:280, 300:500] = 0.45
+    cases = ((near, (0.45, 0.45), True), (np.full_like(near, 0.9), (0.9, 0.9), False))
+    for depth, shown, says in cases:
+        solid, above = pinhole.point_cloud(geometry.deproject_image(depth, D435.depth)).axes
+        (dots,) = solid.collections
+        z = np.asarray(dots._offsets3d[1])
+        assert (z.min(), z.max()) == pytest.approx(shown)
+        assert ("Z < 0.6 m" in solid.get_title()) == says
+        assert above.get_ylim()[1] > 0.9
+
+
+def test_the_spot_has_room_on_the_sensor() -> None:
+    """At every place of the notebook's sliders."""
+    for focal_length, depth in ((1.0, 1.2), (4.0, 0.35)):
+        sensor = pinhole.similar_triangles(focal_length, depth).axes[1]
+        (spot,) = [line.get_xdata()[0] for line in sensor.lines if line.get_marker() == "o"]
+        assert sensor.get_xlim()[0] < spot < sensor.get_xlim()[1] < 1.5
 
 
 def test_drag_draws_its_start_and_follows_a_slider() -> None:
@@ -208,3 +230,75 @@ def test_reciprocal_is_the_derivative() -> None:
     z, fb, sigma = 0.8, 21.6, 0.08
     slope = (fb / (fb / z - 1e-6) - fb / (fb / z + 1e-6)) / 2e-6
     assert f"{1000 * slope * sigma:.2f} mm" in depth_noise.reciprocal(fb, z, sigma).alt
+
+
+# --- notebook 03 ---
+
+BOARD = boards.Board("charuco", (9, 6), 0.025)
+
+
+def toy(tilt_deg: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Corners of a board at 0.5 m, and where a camera of f = 600 px sees them."""
+    X, Y = (a.ravel() for a in np.meshgrid(np.linspace(-0.1, 0.1, 9), np.linspace(-0.06, 0.06, 6)))
+    tilt = np.radians(tilt_deg)
+    depth = 0.5 + X * np.sin(tilt)
+    u, v = 600 * X * np.cos(tilt) / depth, 600 * Y / depth
+    noise = np.random.default_rng(0).normal(0, 0.1, 2 * X.size)
+    return X, Y, np.concatenate([u, v]) + noise
+
+
+def intrinsics_figures() -> dict[str, plots.LessonFigure]:
+    found, _ = corner_session(BOARD, D435.color, seed=1, views=10)
+    flat, _ = corner_session(BOARD, D435.color, seed=1, views=10, effects=Effects(max_tilt_deg=8))
+    two = {"P": calibrate(flat, BOARD), "Q": calibrate(found, BOARD)}
+    X, Y, seen = toy(30)
+    return {
+        "best_fits": intrinsics.best_fits(X, Y, {"30 deg": seen}, 600.0),
+        "board": intrinsics.board(BOARD),
+        "views": intrinsics.views(specifications.DATA / "intrinsics_session", SHIPPED),
+        "coverage": intrinsics.coverage(two["Q"]),
+        "residuals": intrinsics.residuals(two["Q"]),
+        "uncertainty": intrinsics.uncertainty(two, 0.45),
+        "two_sessions": intrinsics.two_sessions(two),
+        "rules": intrinsics.rules(two, 0.45),
+        "signature": intrinsics.signature(two),
+        "power": intrinsics.power(stored_power()),
+        "difference": intrinsics.difference(compare(two["Q"], D435.color)),
+    }
+
+
+SHIPPED = boards.detect_all(
+    [specifications.DATA / "intrinsics_session" / f"view_0{n}.jpg" for n in (0, 1)], BOARD, False
+)
+INTRINSICS_FIGURES = intrinsics_figures()
+
+
+@pytest.mark.parametrize("name", INTRINSICS_FIGURES)
+def test_intrinsics_figures_have_labels_and_words(name: str) -> None:
+    check_labels_and_words(INTRINSICS_FIGURES[name])
+
+
+def test_square_on_every_focal_length_fits_and_tilted_only_one() -> None:
+    X, Y, flat = toy(0)
+    flat_alt = intrinsics.best_fits(X, Y, {"flat": flat}, 600.0).alt
+    assert "from 300 to 1200 px" in flat_alt
+    tilted = intrinsics.best_fits(X, Y, {"tilted": toy(45)[2]}, 600.0).axes[0].lines[0]
+    best = tilted.get_xdata()[np.argmin(tilted.get_ydata())]
+    assert best == pytest.approx(600, abs=10)
+
+
+def test_outlines_are_opencvs() -> None:
+    import cv2
+
+    found, _ = corner_session(BOARD, D435.color, seed=1, views=10)
+    result = calibrate(found, BOARD)
+    T, lens = result.T_camera_board[3], result.intrinsics
+    rim = BOARD.points[[0, 7, 39, 32]]
+    seen = cv2.projectPoints(rim, cv2.Rodrigues(T[:3, :3])[0], T[:3, 3], lens.K, lens.dist)[0]
+    assert intrinsics.outlines(result)[3] == pytest.approx(seen[:, 0], abs=1e-6)
+
+
+def test_maps_of_two_sessions_share_their_scale() -> None:
+    axes = INTRINSICS_FIGURES["uncertainty"].axes
+    limits = [ax.collections[0].get_clim() for ax in axes[:2]]
+    assert limits[0] == limits[1]

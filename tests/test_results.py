@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from coursekit import results
-from coursekit.results import Quantity
+from coursekit.results import Covariance, Quantity
 
 CAMERA = SimpleNamespace(source="simulated", name="Simulated D435")
 
@@ -85,6 +85,42 @@ def test_damaged_files_are_named(damage) -> None:
     path.write_text(damage(path.read_text()))
     with pytest.raises(ValueError, match=r"01_pinhole\.json"):
         results.load("01_pinhole")
+
+
+def test_a_covariance_goes_along(own_results: Path) -> None:
+    quantities = {"fx": Quantity(612.0, "px", 0.9), "k1": Quantity(0.02, "1", 0.001)}
+    matrix = np.array([[0.81, 4e-4], [4e-4, 1e-6]])
+    results.save(
+        "03_intrinsics", CAMERA, quantities, {"intrinsics": Covariance(("fx", "k1"), matrix)}
+    )
+    loaded = results.load("03_intrinsics").covariances["intrinsics"]
+    assert loaded.names == ("fx", "k1")
+    assert np.array_equal(loaded.matrix, matrix)
+    results.save("01_pinhole", CAMERA, quantities)
+    assert results.load("01_pinhole").covariances == {}
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        np.eye(3),
+        [[1.0, 0.5], [0.4, 1.0]],
+        [[1.0, 2.0], [2.0, 1.0]],
+        [[1.0, np.nan], [np.nan, 1.0]],
+    ],
+)
+def test_what_is_no_covariance(matrix) -> None:
+    with pytest.raises(ValueError, match=r"^matrix: "):
+        Covariance(("fx", "fy"), matrix)
+
+
+def test_a_covariance_of_something_else_is_refused(own_results: Path) -> None:
+    covariance = {"K": Covariance(("fx", "cx"), np.eye(2))}
+    with pytest.raises(ValueError, match=r"^covariances: K has 'cx'"):
+        results.save("03_intrinsics", CAMERA, {"fx": Quantity(1.0, "px")}, covariance)
+    with pytest.raises(ValueError, match=r"^covariances: K is a ndarray"):
+        results.save("03_intrinsics", CAMERA, {}, {"K": np.eye(2)})
+    assert not own_results.exists()
 
 
 def test_a_missing_file_is_a_missing_file() -> None:

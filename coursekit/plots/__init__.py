@@ -2,8 +2,17 @@
 
 from __future__ import annotations
 
-from coursekit.plots import depth_noise, pinhole
+from coursekit.plots import depth_noise, hand_eye, intrinsics, pinhole
 from coursekit.plots.interactive import drag
 from coursekit.plots.style import COLORS, LessonFigure, figure
 
-__all__ = ["COLORS", "LessonFigure", "depth_noise", "drag", "figure", "pinhole"]
+__all__ = [
+    "COLORS",
+    "LessonFigure",
+    "depth_noise",
+    "drag",
+    "figure",
+    "hand_eye",
+    "intrinsics",
+    "pinhole",
+]

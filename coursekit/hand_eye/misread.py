@@ -1,0 +1,354 @@
+"""Ways of reading arm poses wrongly, undone: which of them would make a session consistent.
+
+Positions alone fix the mount but for the camera's rotation (`places_agree`), so a mistake in the
+rotations shows against positions that agree. Degrees that were taken as radians can be undone: an
+angle that became a matrix is known up to 360 "degrees" that are 2 pi, so there are a few dozen
+candidates for each, and only the true ones fit the camera in all poses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from coursekit.geometry import invert_transform
+from coursekit.hand_eye.pairs import Fit, Pairs, robust_fit
+from coursekit.hand_eye.poses import nearest_rotation
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+
+PER_RADIAN = 180.0 / np.pi
+GOLD = 4.0  # times smaller residuals: by chance a wrong reading is better by 1.5 at most
+PLACES_AGREE = 0.15  # of the positions' spread; in degrees taken as radians positions stay true
+LIKE_CHANCE = np.radians(75.0)  # median angle of a decoding; random rotations are 130 deg apart
+CLOSE = np.radians(80.0)  # noise in degrees taken as radians grows 57-fold
+WITNESSES = 6  # poses that a candidate must pass before all of them are asked
+FIRST_TRIES = 5  # poses that candidates are taken from
+EULER = ("xyz", "XYZ")  # about fixed axes (roll, pitch, yaw), and about the body's own
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """Another reading of the same numbers: its name, what it says in words, and its fit."""
+
+    name: str
+    says: str
+    fit: Fit
+
+
+def better_readings(given: Fit, readings: Iterator[tuple[str, str, Pairs]]) -> list[Reading]:
+    """The readings that make residuals GOLD times smaller, the best first."""
+    fits = [Reading(name, says, robust_fit(pairs)) for name, says, pairs in readings]
+    good = [reading for reading in fits if reading.fit.better_than(given) > GOLD]
+    return sorted(good, key=lambda reading: -reading.fit.better_than(given))
+
+
+def other_pairing(pairs: Pairs) -> Iterator[tuple[str, str, Pairs]]:
+    """Images with the arm pose of another image, and either one inverted."""
+    for by in (-1, 1, -2, 2):
+        if len(pairs) - abs(by) >= 4:
+            towards = "before" if by < 0 else "after"
+            where = f"the arm pose {abs(by)} place{'s' * (abs(by) > 1)} {towards} its own"
+            yield f"off_by_one {by:+d}", where, pairs.shifted(by)
+    T = invert_transform(pairs.T_base_gripper)
+    yield "inverted", "one side inverted", replace(pairs, T_base_gripper=T)
+
+
+def other_rotations(pairs: Pairs) -> Iterator[tuple[str, str, Pairs]]:
+    """The arm's rotations as another convention would have them; the positions stay."""
+    R = Rotation.from_matrix(pairs.T_base_gripper[:, :3, :3])
+    quaternions = R.as_quat()
+    small = R.as_rotvec() * PER_RADIAN
+    if np.linalg.norm(small, axis=1).max() < 1.5 * np.pi:
+        words = "the rotations' angles 57.3 times larger: radians had been taken as degrees"
+        yield "degrees", words, with_rotations(pairs, Rotation.from_rotvec(small))
+        for order in EULER:
+            angles = PER_RADIAN * R.as_euler(order)
+            yield "degrees", words, with_rotations(pairs, Rotation.from_euler(order, angles))
+    for name, places in (("(w, x, y, z)", [1, 2, 3, 0]), ("(x, y, z, w)", [3, 0, 1, 2])):
+        words = f"the quaternions read as {name}"
+        yield "quaternion", words, with_rotations(pairs, Rotation.from_quat(quaternions[:, places]))
+    yield (
+        "transposed",
+        "the rotations transposed, the positions left",
+        with_rotations(pairs, R.inv()),
+    )
+    for said, meant in (("xyz", "XYZ"), ("XYZ", "xyz"), ("xyz", "zyx"), ("zyx", "xyz")):
+        other = Rotation.from_euler(meant, R.as_euler(said))
+        yield (
+            "euler",
+            f"Euler angles of order {said!r} read as {meant!r}",
+            with_rotations(pairs, other),
+        )
+
+
+def with_rotations(pairs: Pairs, R: Rotation) -> Pairs:
+    """The same pairs with other rotations of the arm."""
+    T = pairs.T_base_gripper.copy()
+    T[:, :3, :3] = R.as_matrix()
+    return replace(pairs, T_base_gripper=T)
+
+
+# --- positions alone ---
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """How far the arm's positions agree with the camera, whatever its rotations.
+
+    expected (n, 3, 3): the arm's rotations but for a constant one on the right. gap_m, spread_m:
+    typical distance that is left over, and that of the positions from their mean.
+    """
+
+    expected: Floats
+    gap_m: float
+    spread_m: float
+
+    @property
+    def agree(self) -> bool:
+        """Whether the positions are true."""
+        return self.gap_m < PLACES_AGREE * self.spread_m
+
+
+def places(pairs: Pairs) -> Places:
+    """The arm's positions against the camera's view of the board.
+
+    Eye-in-hand: the gripper's origin has a fixed place p in the camera's frame, so in the board's
+    it is at T_camera_board^-1 p; eye-to-hand: a fixed place p in the board's frame, at
+    T_camera_board p in the camera's. A rotation and a shift bring those to the arm's positions.
+    """
+    from scipy.optimize import least_squares
+
+    seen = pairs.T_camera_board
+    M = invert_transform(seen) if pairs.mount == "eye_in_hand" else seen
+    target = pairs.T_base_gripper[:, :3, 3]
+    scale = max(float(np.sqrt(np.mean((target - target.mean(axis=0)) ** 2))), 1e-9)
+
+    def moved(p: Floats) -> tuple[Floats, Floats]:
+        at = M[:, :3, :3] @ p + M[:, :3, 3]
+        centred, goal = at - at.mean(axis=0), target - target.mean(axis=0)
+        Q = nearest_rotation(goal.T @ centred)
+        return Q, goal - centred @ Q.T
+
+    fits = [
+        least_squares(lambda p: moved(p)[1].ravel() / scale, start, loss="soft_l1", f_scale=0.05)
+        for start in np.vstack([np.zeros(3), 0.15 * np.eye(3), -0.15 * np.eye(3)])
+    ]
+    Q, gaps = moved(min(fits, key=lambda found: found.cost).x)
+    spread = np.median(np.linalg.norm(target - target.mean(axis=0), axis=1))
+    gap = float(np.median(np.linalg.norm(gaps, axis=1)))
+    return Places(Q @ M[:, :3, :3], gap, float(spread))
+
+
+# --- degrees taken as radians ---
+
+
+def undo_degrees(given: Fit, expected: Floats) -> Reading | None:
+    """The arm's rotations if their angles were degrees taken as radians; None where nothing fits.
+
+    expected (n, 3, 3): from `places`. Tried are rotation vectors and two orders of Euler angles.
+    """
+    for kind in ("rotation vectors", *EULER):
+        R = _decoded(given.pairs.T_base_gripper[:, :3, :3], expected, kind)
+        if R is None:
+            continue
+        fit = robust_fit(with_rotations(given.pairs, R))
+        if fit.better_than(given) > GOLD:
+            what = kind if kind not in EULER else f"Euler angles ({kind})"
+            return Reading("degrees", f"the {what} read as degrees", fit)
+    return None
+
+
+def _decoded(given: Floats, expected: Floats, kind: str) -> Rotation | None:
+    """The true rotations (n,) behind given ones (n, 3, 3), or None."""
+    order = np.linspace(0, len(given) - 1, min(FIRST_TRIES, len(given))).astype(int)
+    for first in order:
+        constant = expected[first].T @ _candidates(given[first], kind)
+        others = [i for i in range(len(given)) if i != first][:WITNESSES]
+        near = np.zeros(len(constant), int)
+        for i in others:
+            near += _misses(given[i], expected[i] @ constant, kind) < CLOSE
+        for number in np.argsort(-near, kind="stable")[:50]:
+            wrong = _misses(given, expected @ constant[number], kind)
+            if np.median(wrong) < LIKE_CHANCE:
+                return _nearest(given, expected @ constant[number], kind)
+    return None
+
+
+def _candidates(R: Floats, kind: str) -> Floats:
+    """All rotations (m, 3, 3) whose angles in degrees, taken as radians, give R (3, 3)."""
+    angles = _angles(R, kind)
+    turns = 2 * np.pi * np.arange(-29, 30)
+    if kind == "rotation vectors":
+        length = np.linalg.norm(angles)
+        axis = angles / length if length > 0 else np.array([0.0, 0.0, 1.0])
+        sizes = (length + turns) / PER_RADIAN
+        return np.asarray(
+            Rotation.from_rotvec(sizes[np.abs(sizes) <= np.pi, None] * axis).as_matrix()
+        )
+    limits = np.array([np.pi, np.pi / 2, np.pi]) * PER_RADIAN  # as drivers give them
+    found = []
+    for same in _same_rotation(angles):
+        lists = [angle + turns for angle in same]
+        lists = [a[np.abs(a) <= limit] for a, limit in zip(lists, limits, strict=True)]
+        found.append(np.stack(np.meshgrid(*lists, indexing="ij"), axis=-1).reshape(-1, 3))
+    degrees = np.concatenate(found)
+    return np.asarray(Rotation.from_euler(kind, degrees, degrees=True).as_matrix())
+
+
+def _same_rotation(angles: Floats) -> list[Floats]:
+    """The two triples of Euler angles (..., 3) about three different axes that mean the same."""
+    first, second, third = np.moveaxis(angles, -1, 0)
+    return [angles, np.stack([first + np.pi, np.pi - second, third + np.pi], axis=-1)]
+
+
+def _angles(R: Floats, kind: str) -> Floats:
+    turn = Rotation.from_matrix(R)
+    return turn.as_rotvec() if kind == "rotation vectors" else turn.as_euler(kind)
+
+
+def _as_radians(R: Floats, kind: str) -> Rotation:
+    """What becomes of rotations (m, 3, 3) whose angles in degrees are taken as radians."""
+    angles = PER_RADIAN * _angles(R, kind)
+    if kind == "rotation vectors":
+        return Rotation.from_rotvec(angles)
+    return Rotation.from_euler(kind, angles)
+
+
+def _misses(given: Floats, R: Floats, kind: str) -> Floats:
+    """Angles (m,), rad, between given (3, 3) or (m, 3, 3) and what R (m, 3, 3) would become."""
+    return np.asarray((_as_radians(R, kind).inv() * Rotation.from_matrix(given)).magnitude())
+
+
+def _nearest(given: Floats, near: Floats, kind: str) -> Rotation:
+    """The candidates (n,) of given rotations that are nearest to rotations (n, 3, 3)."""
+    if kind == "rotation vectors":
+        chosen = []
+        for R, expected in zip(given, near, strict=True):
+            tried = _candidates(R, kind)
+            chosen.append(tried[np.einsum("mij,ij->m", tried, expected).argmax()])
+        return Rotation.from_matrix(np.stack(chosen))
+    wanted = PER_RADIAN * _angles(near, kind)
+    tried = np.stack([
+        angles + 2 * np.pi * np.round((wanted - angles) / (2 * np.pi))
+        for angles in _same_rotation(_angles(given, kind))
+    ])  # fmt: skip
+    best = np.linalg.norm(tried - wanted, axis=2).argmin(axis=0)
+    return Rotation.from_euler(kind, tried[best, np.arange(len(given))], degrees=True)
+
+
+# --- inverted poses, inverted detections, the other mount ---
+
+CAMERA_ON_GRIPPER_M = 0.4  # no wrist carries a camera farther away
+BOARD_IN_GRIPPER_M = 0.5  # nor a board
+ROOM_M = 4.0  # from the base to a camera or a board that it works with
+WIDE_DEG = 50.0  # from the optical axis to the board's middle, where no intrinsics are known
+ENOUGH = 0.9  # of the images in which the board must be in view
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A way to read a session, with the X and Y that it implies.
+
+    against: what speaks against it; () where nothing does.
+    """
+
+    name: str
+    mount: str
+    X: Floats
+    Y: Floats
+    against: tuple[str, ...]
+
+    def says(self) -> str:
+        """In one line."""
+        where = ", ".join(f"{value:.3f}" for value in self.X[:3, 3])
+        name = "T_gripper_camera" if self.mount == "eye_in_hand" else "T_base_camera"
+        line = f"{self.name}: {name} at ({where}) m"
+        return line + (f"; against it: {', '.join(self.against)}" if self.against else "")
+
+
+def declared(
+    fit: Fit, middle: Floats, view_limit: Floats | None, measured: bool
+) -> list[Candidate]:
+    """The session as declared, and the two pairs of mistakes that cancel, as `candidates`.
+
+    Arm and board poses both inverted obey the declared equation with X and Y exchanged; inverted
+    arm poses together with the other mount obey it as they are.
+    """
+    pairs, X, Y = fit.pairs, fit.X, fit.Y[0]
+    seen, inverse = pairs.T_camera_board, invert_transform(pairs.T_camera_board)
+    other = "eye_to_hand" if pairs.mount == "eye_in_hand" else "eye_in_hand"
+    rows = [
+        ("as declared", pairs.mount, X, Y, seen),
+        ("arm poses and board poses both inverted", pairs.mount, Y, X, inverse),
+        (f"arm poses inverted and another mount than declared ({other})", other, X, Y, seen),
+    ]
+    return _judged(rows, middle, view_limit, measured)
+
+
+def candidates(
+    fit: Fit, middle: Floats, view_limit: Floats | None, measured: bool
+) -> list[Candidate]:
+    """The three readings behind a session that fits with its arm poses inverted, and their X.
+
+    fit: of the declared mount with inverted arm poses. middle (3,): of the board. view_limit (2,):
+    half the field of view, tangents, None where no intrinsics are known. measured: whether the
+    board's poses were computed here from corners, and so cannot be inverted.
+    """
+    pairs, X, Y = fit.pairs, fit.X, fit.Y[0]
+    seen, inverse = pairs.T_camera_board, invert_transform(pairs.T_camera_board)
+    other = "eye_to_hand" if pairs.mount == "eye_in_hand" else "eye_in_hand"
+    # With M = T_carrier_stand of the declared mount and C = T_camera_board the data obey
+    # C = X^-1 M^-1 Y. So M was inverted; or the mount is the other one, whose M this is; or C^-1 =
+    # Y^-1 M X was meant, where X and Y exchange their parts.
+    rows = [
+        ("arm poses inverted (T_gripper_base given)", pairs.mount, X, Y, seen),
+        ("board poses inverted (T_board_camera given)", pairs.mount, Y, X, inverse),
+        (f"another mount than declared ({other})", other, X, Y, seen),
+    ]
+    return _judged(rows, middle, view_limit, measured)
+
+
+def _judged(
+    rows: list[tuple[str, str, Floats, Floats, Floats]],
+    middle: Floats,
+    view_limit: Floats | None,
+    measured: bool,
+) -> list[Candidate]:
+    """Name, mount, X, Y and T_camera_board of each reading, with what speaks against it."""
+    found = []
+    as_given = rows[0][4]
+    for name, mount, X, Y, C in rows:
+        against = list(_implausible(mount, X, Y, C @ [*middle, 1.0], view_limit))
+        if measured and C is not as_given:
+            against.append("the board's poses were computed here from the images")
+        found.append(Candidate(name, mount, X, Y, tuple(against)))
+    return found
+
+
+def _implausible(
+    mount: str, X: Floats, Y: Floats, place: Floats, view_limit: Floats | None
+) -> Iterator[str]:
+    camera, board = np.linalg.norm(X[:3, 3]), np.linalg.norm(Y[:3, 3])
+    limits = (
+        (CAMERA_ON_GRIPPER_M, ROOM_M) if mount == "eye_in_hand" else (ROOM_M, BOARD_IN_GRIPPER_M)
+    )
+    stands = ("gripper", "base") if mount == "eye_in_hand" else ("base", "gripper")
+    if camera > limits[0]:
+        yield f"the camera would be {camera:.2f} m from the {stands[0]}"
+    if board > limits[1]:
+        yield f"the board would be {board:.2f} m from the {stands[1]}"
+    limit = np.full(2, np.tan(np.radians(WIDE_DEG))) if view_limit is None else view_limit
+    front = place[:, 2] > 0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inside = front & (np.abs(place[:, :2] / place[:, 2:3]) < limit).all(axis=1)
+    if inside.mean() < ENOUGH:
+        what = "behind the camera" if front.mean() < ENOUGH else "outside its field of view"
+        yield f"the board would be {what} in {np.sum(~inside)} of {len(inside)} images"

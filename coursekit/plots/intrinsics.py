@@ -1,0 +1,372 @@
+"""Figures of notebook 03."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.patches import Polygon
+from numpy.typing import NDArray
+
+from coursekit.plots.style import COLORS, LessonFigure, figure
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from coursekit.boards import Board, Detection
+    from coursekit.intrinsics import Comparison, IntrinsicsResult
+
+Floats = NDArray[np.float64]
+
+F_PX = np.linspace(300, 1200, 181)
+ARROWS = 150  # residuals are drawn so many times too long
+
+
+# --- what is fitted ---
+
+
+def best_fits(X: Floats, Y: Floats, seen: Mapping[str, Floats], f_px: float) -> LessonFigure:
+    """The smallest RMS that each focal length allows, distance and tilt fitted to it.
+
+    X, Y (N,): corners on the board, m. seen: by name, their pixels (2N,) from the principal point,
+    first all u, then all v. f_px: the true focal length. The model is a board that is turned by
+    `tilt` about its Y axis: u = f X cos(tilt) / (Z + X sin(tilt)), v = f Y / (Z + X sin(tilt)).
+    """
+    fig = figure(8.0, 4.2)
+    ax = fig.subplots()
+    texts = []
+    for style, (name, pixels) in zip(("-", "--", "-.", ":"), seen.items(), strict=False):
+        rms = _best_rms(X, Y, pixels)
+        ax.plot(F_PX, rms, style, label=name)
+        good = F_PX[rms < 1.1 * rms.min()]
+        texts.append(f"{name}: within a tenth of the best from {good[0]:.0f} to {good[-1]:.0f} px")
+    ax.axvline(f_px, color=COLORS["truth"], lw=1.5, label="true f")
+    ax.set(xlim=(F_PX[0], F_PX[-1]), ylim=(0, 3), xlabel="assumed focal length f (px)",
+           ylabel="smallest RMS (px)")  # fmt: skip
+    ax.legend(loc="upper left")
+    fig.alt = f"The smallest RMS against the assumed focal length. {'; '.join(texts)}."
+    return fig
+
+
+def _best_rms(X: Floats, Y: Floats, seen: Floats) -> Floats:
+    """The RMS (len(F_PX),) with the best distance and tilt at each f, by damped Gauss-Newton."""
+    f = F_PX[:, None]
+    theta = np.stack([F_PX * 0.5 / 600, np.full(F_PX.size, 0.4)], axis=1)
+    for _ in range(40):
+        sine, cosine = np.sin(theta[:, 1:]), np.cos(theta[:, 1:])
+        depth = theta[:, :1] + X * sine
+        u, v = f * X * cosine / depth, f * Y / depth
+        residual = seen - np.concatenate([u, v], axis=1)
+        by_z = -np.concatenate([u / depth, v / depth], axis=1)
+        by_tilt = np.concatenate([-f * X * sine / depth - u * X * cosine / depth,
+                                  -v * X * cosine / depth], axis=1)  # fmt: skip
+        J = np.stack([by_z, by_tilt], axis=2)
+        A = np.swapaxes(J, 1, 2) @ J
+        A[:, [0, 1], [0, 1]] *= 1 + 1e-3  # a board without tilt does not show its sign
+        step = np.linalg.solve(A, np.swapaxes(J, 1, 2) @ residual[..., None])[..., 0]
+        theta = theta + np.clip(step, -0.2, 0.2)
+        theta[:, 1] = np.clip(theta[:, 1], 0.0, 1.3)
+    return np.sqrt(2 * np.mean(residual**2, axis=1))
+
+
+# --- board and views ---
+
+
+def board(board: Board) -> LessonFigure:
+    """The board's pattern with its frame and the numbers of a few corners."""
+    fig = figure(6.4, 4.4)
+    ax = fig.subplots()
+    width, height = (1000 * s for s in board.size_m)
+    left, top = (1000 * (c - board.square_m) for c in board.points[0, :2])
+    ax.imshow(board.image(60), cmap="gray", vmin=0, vmax=255,
+              extent=(left, left + width, top + height, top))  # fmt: skip
+    points = 1000 * board.points
+    ax.plot(points[:, 0], points[:, 1], "o", ms=4, color=COLORS["measured"])
+    for name, tip, color in (("x", (1, 0), "measured"), ("y", (0, 1), "truth")):
+        arrow = {"arrowstyle": "-|>", "color": COLORS[color], "lw": 2.5}
+        ax.annotate("", (60 * tip[0], 60 * tip[1]), (0, 0), arrowprops=arrow)
+        ax.text(68 * tip[0], 68 * tip[1], name, color=COLORS[color], fontweight="bold",
+                ha="center", va="center", bbox={"fc": "white", "ec": "none", "pad": 1})  # fmt: skip
+    ax.set(xlabel="x (mm)", ylabel="y (mm)")
+    columns, rows = board.corners
+    fig.alt = (
+        f"The board: {board.squares[0]} x {board.squares[1]} squares of "
+        f"{1000 * board.square_m:g} mm, {columns} x {rows} inner corners marked, and its frame: "
+        "x to the right, y down, z into the board."
+    )
+    return fig
+
+
+def views(folder: Path, detections: Sequence[Detection]) -> LessonFigure:
+    """The images of a folder with the corners that were found in them."""
+    import cv2
+
+    columns = 3
+    rows = -(-len(detections) // columns)
+    fig = figure(9.0, 2.35 * rows + 0.3)
+    axes = fig.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    for ax, found in zip(axes.flat, detections, strict=False):
+        image = cv2.imread(str(folder / found.name), cv2.IMREAD_GRAYSCALE)
+        ax.imshow(image, cmap="gray", vmin=0, vmax=255)
+        ax.plot(found.pixels[:, 0], found.pixels[:, 1], ".", ms=3, color=COLORS["measured"])
+        ax.set_title(f"{found.name}: {len(found.ids)} corners", fontsize=10)
+        ax.set(xlabel="u (px)", ylabel="v (px)")
+        ax.label_outer()
+    for ax in axes.flat[len(detections) :]:
+        ax.set_visible(False)
+    fig.alt = "Views of the board: " + ", ".join(
+        f"{d.name} with {len(d.ids)} corners" for d in detections
+    )
+    return fig
+
+
+def coverage(result: IntrinsicsResult) -> LessonFigure:
+    """Where the corners are in the image, and how the board was tilted."""
+    from coursekit.intrinsics import judge
+
+    fig = figure(9.0, 3.9)
+    image, tilt = fig.subplots(1, 2, width_ratios=(1.45, 1))
+    width, height = result.intrinsics.size
+    for found in result.detections:
+        image.plot(found.pixels[:, 0], found.pixels[:, 1], ".", ms=3, color=COLORS["measured"])
+    _frame(image, width, height)
+    image.set_title("corners of all views")
+    tilts = judge.tilts(result)
+    x, y = tilts.about_x_deg, tilts.about_y_deg
+    tilt.axhline(0, color=COLORS["faint"], lw=1)
+    tilt.axvline(0, color=COLORS["faint"], lw=1)
+    tilt.plot(y, x, "o", color=COLORS["measured"])
+    reach = max(50.0, 5 + np.abs([x, y]).max())
+    tilt.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal",
+             xlabel="tilt about the vertical (deg)",
+             ylabel="tilt about the horizontal (deg)")  # fmt: skip
+    tilt.set_title("tilt of the board, one dot a view")
+    fig.alt = (
+        f"Corners of {len(result.detections)} views over the image, and the tilts of the board: "
+        f"{x.min():.0f} to {x.max():.0f} degrees about the horizontal, {y.min():.0f} to "
+        f"{y.max():.0f} about the vertical."
+    )
+    return fig
+
+
+# --- a result ---
+
+
+def residuals(result: IntrinsicsResult) -> LessonFigure:
+    """Residuals as arrows where they are in the image, and as a cloud."""
+    fig = figure(9.0, 3.9)
+    image, cloud = fig.subplots(1, 2, width_ratios=(1.45, 1))
+    pixels = np.concatenate([d.pixels for d in result.detections])
+    errors = np.concatenate(result.residuals)
+    _arrows(image, pixels, errors, ARROWS)
+    _frame(image, *result.intrinsics.size)
+    image.set_title(f"residuals, drawn {ARROWS} times too long")
+    cloud.plot(errors[:, 0], errors[:, 1], ".", ms=3, alpha=0.5, color=COLORS["measured"])
+    angle = np.linspace(0, 2 * np.pi, 100)
+    for k in (1, 2):
+        cloud.plot(k * result.sigma_px * np.cos(angle), k * result.sigma_px * np.sin(angle),
+                   color=COLORS["model"], lw=1.5)  # fmt: skip
+    reach = 1.1 * np.abs(errors).max()
+    cloud.set(xlim=(-reach, reach), ylim=(reach, -reach), aspect="equal",
+              xlabel="residual in u (px)", ylabel="residual in v (px)")  # fmt: skip
+    cloud.set_title("circles: 1 and 2 σ per axis")
+    fig.alt = (
+        f"Residuals of {len(errors)} corners: RMS {result.rms_u_px:.3f} px in u, "
+        f"{result.rms_v_px:.3f} px in v, {result.rms_px:.3f} px in two dimensions."
+    )
+    return fig
+
+
+def _arrows(
+    ax: Any,
+    at: Floats,
+    vectors: Floats,
+    times: float,
+    color: str = "measured",
+    width: float = 0.003,
+) -> None:
+    ax.quiver(*at.T, *(times * vectors.T), angles="xy", scale_units="xy", scale=1, width=width,
+              color=COLORS[color])  # fmt: skip
+
+
+def _frame(ax: Any, width: int, height: int) -> None:
+    """An image's rim, v downwards."""
+    ax.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal",
+           xlabel="u (px)", ylabel="v (px)")  # fmt: skip
+
+
+def uncertainty(results: Mapping[str, IntrinsicsResult], range_m: float) -> LessonFigure:
+    """Maps of the standard deviation of a projected pixel, with one scale for all of them."""
+    maps = {name: r.uncertainty_map(range_m, (30, 40)) for name, r in results.items()}
+    top = max(float(m.max()) for m in maps.values())
+    fig = figure(4.7 * len(maps) + 0.6, 3.9)
+    axes = fig.subplots(1, len(maps), squeeze=False, sharey=True)[0]
+    levels = np.array([0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100])
+    for ax, (name, sigma) in zip(axes, maps.items(), strict=True):
+        width, height = results[name].intrinsics.size
+        u, v = np.linspace(0, width - 1, sigma.shape[1]), np.linspace(0, height - 1, len(sigma))
+        shown = ax.pcolormesh(u, v, sigma, vmin=0, vmax=top, shading="gouraud", cmap="cividis")
+        lines = ax.contour(u, v, sigma, levels, colors="white", linewidths=1)
+        ax.clabel(lines, fmt="%g px", fontsize=9)
+        _frame(ax, width, height)
+        ax.label_outer()
+        ax.set_title(f"{name} at {range_m:g} m" if name else f"at {range_m:g} m")
+    fig.colorbar(shown, ax=list(axes), label="σ of a projected pixel (px)", shrink=0.9)
+    fig.alt = (
+        f"Standard deviation of a projected pixel over the image, for points {range_m:g} m away: "
+        + "; ".join(
+            f"{name or 'this calibration'} from {m.min():.3f} to {m.max():.3f} px"
+            for name, m in maps.items()
+        )
+        + "."
+    )
+    return fig
+
+
+def two_sessions(results: Mapping[str, IntrinsicsResult]) -> LessonFigure:
+    """RMS of each view, and the outlines of the boards, of some sessions side by side."""
+    fig = figure(9.0, 5.6)
+    axes = fig.subplots(2, len(results), height_ratios=(1, 1.5), squeeze=False)
+    top = 1.3 * max(float(r.per_view_rms_px.max()) for r in results.values())
+    for (bars, image), (name, result) in zip(axes.T, results.items(), strict=True):
+        numbers = np.arange(1, len(result.detections) + 1)
+        bars.bar(numbers, result.per_view_rms_px, color=COLORS["measured"])
+        bars.axhline(result.rms_px, color=COLORS["model"])
+        bars.set(ylim=(0, top), xlabel="view (number)", ylabel="RMS (px)")
+        bars.set_title(f"{name}: RMS {result.rms_px:.3f} px, fx = {result.intrinsics.fx:.1f} px")
+        for outline in outlines(result):
+            image.add_patch(Polygon(outline, fill=False, ec=COLORS["measured"], lw=1))
+        _frame(image, *result.intrinsics.size)
+    fig.alt = "RMS of each view and the outlines of the boards: " + "; ".join(
+        f"session {name} has RMS {r.rms_px:.3f} px and fx {r.intrinsics.fx:.1f} px"
+        for name, r in results.items()
+    )
+    return fig
+
+
+def outlines(result: IntrinsicsResult) -> list[Floats]:
+    """The rims of the boards as the fitted camera sees them, each (4, 2) px."""
+    from coursekit.geometry import project, transform_points
+
+    columns, rows = result.board.corners
+    rim = result.board.points[[0, columns - 1, columns * rows - 1, columns * (rows - 1)]]
+    lens = result.intrinsics
+    return [project(transform_points(T, rim), lens.K, lens.dist) for T in result.T_camera_board]
+
+
+def rules(rows: Mapping[str, IntrinsicsResult], range_m: float) -> LessonFigure:
+    """What each capture rule buys: sigma of fx, and the worst pixel's sigma, of some sessions."""
+    names = list(rows)
+    fx = [100 * r.sigma("fx") / r.intrinsics.fx for r in rows.values()]
+    worst = [float(r.uncertainty_map(range_m, (12, 16)).max()) for r in rows.values()]
+    fig = figure(9.0, 0.55 * len(names) + 1.4)
+    axes = fig.subplots(1, 2, sharey=True)
+    for ax, values, label in (
+        (axes[0], fx, "σ of fx (%)"),
+        (axes[1], worst, f"σ of the worst pixel at {range_m:g} m (px)"),
+    ):
+        ax.barh(names, values, color=COLORS["model"], height=0.6)
+        ax.set(xscale="log", xlabel=label, xlim=(0.5 * min(values), 3 * max(values)))
+        ticks = [t for t in (0.1, 0.3, 1, 3, 10, 30) if t > 0.5 * min(values)]
+        ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
+        ax.set_xticks([], minor=True)
+        for y, value in enumerate(values):
+            ax.text(1.1 * value, y, f"{value:.2g}", va="center", fontsize=10)
+    axes[0].invert_yaxis()
+    axes[0].set_ylabel(" ")
+    fig.alt = "What each rule buys: " + "; ".join(
+        f"{n}: fx to {f:.2g} %, worst pixel {w:.2g} px"
+        for n, f, w in zip(names, fx, worst, strict=True)
+    )
+    return fig
+
+
+# --- the museum ---
+
+
+def signature(results: Mapping[str, IntrinsicsResult]) -> LessonFigure:
+    """The residuals that failures leave in the view that suffers most, one panel each."""
+    columns = 3
+    rows = -(-len(results) // columns)
+    fig = figure(9.6, 3.3 * rows)
+    axes = fig.subplots(rows, columns, squeeze=False)
+    for ax, (name, result) in zip(axes.flat, results.items(), strict=False):
+        _worst_view(ax, name, result)
+    for ax in axes.flat[len(results) :]:
+        ax.set_visible(False)
+    fig.alt = "Residuals in the worst view of each session: " + "; ".join(
+        f"{name}, RMS of all views {r.rms_px:.2f} px, of the worst one "
+        f"{r.per_view_rms_px.max():.2f} px"
+        for name, r in results.items()
+    )
+    return fig
+
+
+def _worst_view(ax: Any, name: str, result: IntrinsicsResult) -> None:
+    """The corners of one view with their residuals, the longest as long as corners are apart."""
+    worst = int(np.argmax(result.per_view_rms_px))
+    pixels, errors = result.detections[worst].pixels, result.residuals[worst]
+    apart = np.sqrt(np.prod(np.ptp(pixels, axis=0)) / len(pixels))
+    times = float(f"{1.2 * apart / np.linalg.norm(errors, axis=1).max():.1g}")
+    ax.plot(*pixels.T, ".", ms=4, color=COLORS["model"])
+    _arrows(ax, pixels, errors, times, width=0.006)
+    low, high = pixels.min(axis=0) - 1.2 * apart, pixels.max(axis=0) + 1.2 * apart
+    ax.set(xlim=(low[0], high[0]), ylim=(high[1], low[1]), aspect="equal",
+           xlabel="u (px)", ylabel="v (px)")  # fmt: skip
+    ax.set_title(
+        f"{name}\nRMS {result.per_view_rms_px[worst]:.2f} px here, x{times:g}", fontsize=10
+    )
+
+
+def power(table: Mapping[str, Mapping[str, Any]]) -> LessonFigure:
+    """The share of sessions in which `diagnose` names an effect, against the effect's size.
+
+    table: by effect: `unit`, `sizes`, `named` (counts) and `sessions` (their number).
+    """
+    fig = figure(9.6, 3.2)
+    axes = fig.subplots(1, len(table), sharey=True, squeeze=False)[0]
+    texts = []
+    for ax, (effect, row) in zip(axes, table.items(), strict=True):
+        share = np.asarray(row["named"]) / row["sessions"]
+        ax.plot(row["sizes"], share, "o-", color=COLORS["model"])
+        ax.set(xscale="log", ylim=(-0.03, 1.03), xlabel=f"{effect} ({row['unit']})")
+        texts.append(
+            f"{effect}: "
+            + ", ".join(
+                f"{100 * s:.0f} % at {x:g} {row['unit']}"
+                for x, s in zip(row["sizes"], share, strict=True)
+            )
+        )
+    axes[0].set_ylabel("share named (1)")
+    fig.alt = "Share of sessions in which the cause is named. " + "; ".join(texts)
+    return fig
+
+
+# --- against the factory ---
+
+
+def difference(comparison: Comparison) -> LessonFigure:
+    """By how many pixels, and by how many millimetres, a fit and the factory disagree.
+
+    Pixels after the best motion of the camera, millimetres without it; see `intrinsics.compare`.
+    """
+    fig = figure(9.6, 3.9)
+    axes = fig.subplots(1, 2, sharey=True)
+    pixels, shift_mm = comparison.difference_px, 1000 * comparison.shift_m
+    width, height = comparison.size
+    for ax, values, label in (
+        (axes[0], pixels, "difference (px), camera turned to fit"),
+        (axes[1], shift_mm, f"shift at {comparison.range_m:g} m (mm)"),
+    ):
+        u, v = np.linspace(0, width - 1, values.shape[1]), np.linspace(0, height - 1, len(values))
+        shown = ax.pcolormesh(u, v, values, shading="gouraud", cmap="cividis", vmin=0)
+        fig.colorbar(shown, ax=ax, label=label, shrink=0.9)
+        _frame(ax, width, height)
+        ax.label_outer()
+    fig.alt = (
+        f"The fit against the factory over the image: {np.nanmin(pixels):.2f} to "
+        f"{np.nanmax(pixels):.2f} px, and {np.nanmin(shift_mm):.2f} to "
+        f"{np.nanmax(shift_mm):.2f} mm at {comparison.range_m:g} m."
+    )
+    return fig

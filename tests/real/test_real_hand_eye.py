@@ -1,0 +1,86 @@
+"""Hand-eye data that MoveIt publishes with its calibration plugin, and the answer in its tests."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import coursekit.hand_eye as he
+from coursekit.boards import Board, detect
+from coursekit.geometry import Intrinsics
+
+pytestmark = pytest.mark.real
+
+PUBLISHED_M = np.array([0.659, -0.249, 0.830])
+PUBLISHED_EULER = (0.230, -2.540, 1.950)  # about x, then the new y, then the new z
+BOARD_M = np.array([0.0975, 0.1028, 0.3256])
+
+
+@pytest.fixture(scope="module")
+def folder():
+    if not os.environ.get("COURSEKIT_REAL_DATA"):
+        pytest.skip("COURSEKIT_REAL_DATA is not set: it names the folder of real data")
+    return Path(os.environ["COURSEKIT_REAL_DATA"]) / "moveit_hand_eye"
+
+
+@pytest.fixture(scope="module")
+def pairs(folder):
+    """T_base_gripper and T_camera_board, (50, 4, 4) each; the camera stands beside the arm."""
+    samples = np.array(json.loads((folder / "pose_samples.json").read_text()))
+    return samples[:, 0], samples[:, 1]
+
+
+@pytest.mark.parametrize("method", he.METHODS)
+def test_every_solver_finds_the_published_camera(pairs, method):
+    result = he.solve(*pairs, "eye_to_hand", method)
+    np.testing.assert_allclose(result.X[:3, 3], PUBLISHED_M, rtol=0.01)
+    published = Rotation.from_euler("XYZ", PUBLISHED_EULER)
+    off = Rotation.from_matrix(result.X[:3, :3]) * published.inv()
+    assert off.magnitude() < 0.01
+    assert result.spread_board_mm == pytest.approx(4.6, abs=0.05)
+    assert result.free == ()
+
+
+def test_the_interval_of_the_refinement_holds_all_solvers(pairs):
+    result = he.solve(*pairs, "eye_to_hand")
+    for method in he.CLOSED_FORMS:
+        assert result.holds(he.solve(*pairs, "eye_to_hand", method).X).all()
+    free = he.solve(*pairs, "eye_to_hand", free_scale=True)
+    assert abs(free.scale - 1) < 2 * free.sigma("scale") < 0.005
+
+
+def test_a_free_scale_finds_a_board_that_is_said_five_percent_too_large(pairs):
+    arm, seen = pairs
+    seen = seen.copy()
+    seen[:, :3, 3] *= 1.05
+    free = he.solve(arm, seen, "eye_to_hand", free_scale=True)
+    assert free.scale == pytest.approx(1 / 1.05, abs=0.004)
+    np.testing.assert_allclose(free.X[:3, 3], PUBLISHED_M, rtol=0.01)
+
+
+def test_forty_poses_predict_the_other_ten(pairs):
+    arm, seen = pairs
+    result = he.solve(arm[10:], seen[10:], "eye_to_hand")
+    gap = he.held_out(result, arm[:10], seen[:10])
+    assert 1e3 * np.median(gap.gap_m) < 6.0
+
+
+@pytest.mark.parametrize(("old_origin", "off_m"), [(True, 0.0), (False, 0.197)])
+def test_the_published_pose_of_the_board_has_the_old_origin(folder, old_origin, off_m):
+    image = cv2.imread(str(folder / "test_charuco_board_detection.jpg"))
+    board = Board("charuco", (5, 7), 0.1971 / 7, 0.0176, "DICT_5X5_250", old_origin=old_origin)
+    lens = Intrinsics(
+        640, 480, 590.6972, 592.8468, 322.3310, 247.4003,
+        "brown_conrady", (0.15405, -0.24917, 0.0035079, -0.0011004, 0.0),
+    )  # fmt: skip
+    pose = he.board_pose(detect(image, board), board, lens)
+    away = np.linalg.norm(pose.T_camera_board[:3, 3] - BOARD_M)
+    assert away == pytest.approx(off_m, abs=2e-3)
+    assert pose.rms_px < 0.4
+    assert not pose.ambiguous

@@ -1,0 +1,451 @@
+"""The arm against its maker's own parameters, SciPy, numerical derivatives and Monte Carlo."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from coursekit import arm as arms
+from coursekit.arm import ArmErrors, SimulatedArm, fk_covariance, fk_error, pose_difference, widowx
+from coursekit.boards import Board
+from coursekit.geometry import project, transform_points
+from coursekit.simulation import hand_eye_poses as poses
+from coursekit.specifications import device
+
+NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
+UNITS = 400 if NIGHTLY else 60
+NONE = ArmErrors(0.0, 0.0, 0.0, 0.0)
+BOARD = Board("charuco", (9, 6), 0.025)
+LINK_NAMES = [f"link_{i}" for i in range(1, 7)]
+
+
+@pytest.fixture(scope="module")
+def anywhere() -> np.ndarray:
+    arm = widowx()
+    return np.random.default_rng(3).uniform(arm.limits[:, 0], arm.limits[:, 1], (500, 6))
+
+
+# --- forward kinematics against three other descriptions ---
+
+
+def makers_table(q: np.ndarray) -> np.ndarray:
+    """T_base_flange by the classic Denavit-Hartenberg table in the maker's documentation.
+
+    github.com/TrossenRobotics/trossen_arm, docs/specifications/wxai.rst at commit
+    37f63d339e5481d8ffb920f84003661c0697a537; its flange has z where the robot's description has x.
+    """
+    far = np.hypot(0.245, 0.06)
+    table = [
+        (0.1035, q[0], 0.02, -np.pi / 2),
+        (0.0, q[1] + np.pi, 0.264, np.pi),
+        (0.0, q[2] - np.pi / 2 - np.arctan(0.245 / 0.06), far, 0.0),
+        (0.0, q[3] - np.arctan(0.06 / 0.245), 0.06775, np.pi / 2),
+        (0.0, q[4] + np.pi / 2, 0.0, np.pi / 2),
+        (0.02895, q[5], 0.0, np.pi / 2),
+        (0.0, np.pi / 2, 0.0, 0.0),
+    ]
+    T = np.eye(4)
+    for d, theta, a, alpha in table:
+        c, s, ca, sa = np.cos(theta), np.sin(theta), np.cos(alpha), np.sin(alpha)
+        T = T @ np.array(
+            [
+                [c, -s * ca, s * sa, a * c],
+                [s, c * ca, -c * sa, a * s],
+                [0, sa, ca, d],
+                [0, 0, 0, 1],
+            ]
+        )
+    return T
+
+
+def test_forward_is_the_makers_table(anywhere: np.ndarray) -> None:
+    ours = widowx().forward(anywhere, "flange")
+    theirs = np.stack([makers_table(q) for q in anywhere])
+    assert np.abs(ours[:, :3, 3] - theirs[:, :3, 3]).max() < 1e-12
+    # one fixed turn of the frame between the two, the same in every pose
+    between = np.swapaxes(theirs[:, :3, :3], 1, 2) @ ours[:, :3, :3]
+    assert np.abs(between - between[0]).max() < 1e-12
+    assert np.abs(np.abs(between[0]) - np.eye(3)[np.abs(between[0]).argmax(1)]).max() < 1e-12
+
+
+def test_forward_is_scipys_chain(anywhere: np.ndarray) -> None:
+    arm = widowx()
+    for q, T in zip(anywhere[:50], arm.forward(anywhere[:50]), strict=True):
+        R, t = Rotation.identity(), np.zeros(3)
+        for origin, axis, angle in zip(arm.origins, arm.axes, q, strict=True):
+            t = t + R.apply(origin[:3, 3].copy())  # SciPy takes no read-only array
+            R = R * Rotation.from_matrix(origin[:3, :3]) * Rotation.from_rotvec(angle * axis)
+        t = t + R.apply([0.156062, 0.0, 0.0])
+        assert np.abs(T[:3, 3] - t).max() < 1e-14
+        assert np.abs(T[:3, :3] - R.as_matrix()).max() < 1e-14
+
+
+def test_forward_is_the_product_of_exponentials(anywhere: np.ndarray) -> None:
+    arm = widowx()
+    home = arm.link_frames(np.zeros(6))
+    at_zero = arm.forward(np.zeros(6))
+    for q, T in zip(anywhere[:50], arm.forward(anywhere[:50]), strict=True):
+        product = np.eye(4)
+        for j in range(6):
+            axis = home[j + 1, :3, :3] @ arm.axes[j]
+            xi = np.zeros((4, 4))
+            xi[:3, :3] = np.cross(axis, np.eye(3)).T
+            xi[:3, 3] = -np.cross(axis, home[j + 1, :3, 3])
+            product = product @ expm(q[j] * xi)
+        assert np.abs(product @ at_zero - T).max() < 1e-13
+
+
+def test_reach_is_the_published_one(anywhere: np.ndarray) -> None:
+    """0.7699 m from joint_0's axis; the maker's table says 0.769 m."""
+    arm = widowx()
+
+    def radius(q: np.ndarray) -> float:
+        return float(-np.hypot(*arm.forward(q)[:2, 3]))
+
+    T = arm.forward(anywhere)
+    starts = anywhere[np.argsort(-np.hypot(T[:, 0, 3], T[:, 1, 3]))[:5]]
+    farthest = max(-minimize(radius, q, bounds=arm.limits).fun for q in starts)
+    assert farthest == pytest.approx(0.7699, abs=1e-4)
+
+
+def test_the_wrist_camera_is_where_the_description_puts_it() -> None:
+    """The same transform as that of the maker's chain, multiplied out elsewhere."""
+    arm = widowx()
+    T = arm.T_flange_gripper @ arm.T_gripper_camera
+    assert T[:3, 3] == pytest.approx([0.05865016595536615, 0.009, 0.054272138451420565], abs=1e-14)
+    tilt = np.radians(20)
+    assert T[:3, 2] == pytest.approx([np.cos(tilt), 0.0, -np.sin(tilt)], abs=1e-12)
+    assert T[:3, 0] == pytest.approx([0.0, -1.0, 0.0], abs=1e-12)
+
+
+@pytest.mark.parametrize("tool", ["gripper", "flange"])
+def test_jacobian_is_the_numerical_one(tool: arms.kinematics.Tool, anywhere: np.ndarray) -> None:
+    arm, step = widowx(), 1e-6
+    J = arm.jacobian(anywhere, tool)
+    for j in range(6):
+        change = step * np.eye(6)[j]
+        ahead, behind = arm.forward(anywhere + change, tool), arm.forward(anywhere - change, tool)
+        assert np.abs(J[..., j] - pose_difference(behind, ahead) / (2 * step)).max() < 1e-8
+
+
+def test_batches_are_single_poses(anywhere: np.ndarray) -> None:
+    arm = widowx()
+    block = anywhere[:24].reshape(2, 3, 4, 6)
+    assert np.array_equal(arm.forward(block)[1, 2, 3], arm.forward(block[1, 2, 3]))
+    assert arm.jacobian(block).shape == (2, 3, 4, 6, 6)
+    assert arm.is_free(block).shape == arm.within_limits(block).shape == (2, 3, 4)
+    assert arm.forward(np.zeros((0, 6))).shape == (0, 4, 4)
+
+
+def test_inverse_meets_the_pose_or_says_so() -> None:
+    arm = widowx()
+    q = arm.random(np.random.default_rng(1), 300)
+    q[:, 0] = np.clip(q[:, 0], -1.5, 1.5)
+    found, reached = arm.inverse(arm.forward(q))
+    assert reached.mean() > 0.85
+    miss = pose_difference(arm.forward(found[reached]), arm.forward(q[reached]))
+    assert np.abs(miss).max() < 1e-8
+    assert arm.within_limits(found).all()
+    far = arm.forward(q[0])
+    far[:3, 3] = [1.0, 0.0, 0.3]
+    assert not arm.inverse(far)[1]
+    near, again = arm.inverse(arm.forward(q), start=q + 0.01)
+    assert again.mean() > 0.99
+    assert np.median(np.abs(near - q)) < 1e-6
+
+
+def test_random_configurations_are_free() -> None:
+    arm = widowx()
+    q = arm.random(np.random.default_rng(0), 500, clearance_m=0.05)
+    assert q.shape == (500, 6)
+    assert (arm.check(q) == q).all()
+    camera = (arm.forward(q) @ arm.T_gripper_camera)[:, 2, 3]
+    assert min(arm.forward(q)[:, 2, 3].min(), camera.min()) >= 0.05
+    assert np.array_equal(q, arm.random(np.random.default_rng(0), 500, clearance_m=0.05))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda a: a.forward(np.zeros(5)), r"q: got shape \(5,\), want \(\.\.\., 6\)"),
+        (lambda a: a.forward([0, 0, np.nan, 0, 0, 0]), r"q: the angle at index \[2\]"),
+        (lambda a: a.forward(np.zeros(6), "wrist"), "tool: got 'wrist'"),
+        (lambda a: a.check([[0.0] * 6, [0, 0, 0, 1.6, 0, 0]]), r"q\[1\]: joint_3 is at 1.6000 rad"),
+        (lambda a: a.check([0, 40.0, 0, 0, 0, 0]), "joint_1 .*are these degrees"),
+        (lambda a: a.random(np.random.default_rng(0), 0), "n: got 0"),
+        (lambda a: a.random(np.random.default_rng(0), 5, clearance_m=2.0), "clearance_m: got 2.0"),
+        (lambda a: a.inverse(np.diag([1.0, 1, -1, 1])), "T_base_gripper: .* a reflection"),
+        (lambda a: ArmErrors(play_rad=-1.0), "play_rad: got -1.0"),
+        (lambda a: SimulatedArm(0).move(np.full(6, 3.0)), "joint_2 is at 3.0000 rad"),
+        (lambda a: SimulatedArm(0).move(np.zeros((2, 2, 6))), r"want \(6,\) or \(n, 6\)"),
+    ],
+)
+def test_bad_input_is_named(call: Callable[[arms.Arm], object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        call(widowx())
+
+
+# --- the simulated arm ---
+
+
+def test_an_arm_without_errors_is_the_drawing() -> None:
+    arm = widowx()
+    q = arm.random(np.random.default_rng(2), 30)
+    robot = SimulatedArm(7, NONE)
+    read = robot.move(q)
+    assert np.abs(robot.true_pose() - arm.forward(read)).max() < 1e-12
+    assert 0 < np.abs(read - q).max() < 5e-3  # it stops near the command, and reads where
+
+
+def test_fk_error_is_2_to_4_mm_and_depends_on_the_pose() -> None:
+    """Over units and the workspace: the mean, and how much one unit's own error varies."""
+    arm = widowx()
+    rng = np.random.default_rng(5)
+    flange, gripper = [], []
+    for unit in range(UNITS):
+        robot = SimulatedArm(unit)
+        read = robot.move(arm.random(rng, 100))
+        flange.append(fk_error(robot.true_pose("flange"), arm.forward(read, "flange"))[0])
+        gripper.append(fk_error(robot.true_pose(), arm.forward(read))[0])
+    for errors_m in (np.array(flange), np.array(gripper)):
+        assert 2e-3 < errors_m.mean() < 4e-3
+        assert 2e-3 < np.median(errors_m) < 4e-3
+        low, high = np.percentile(errors_m, [5, 95], axis=1)
+        assert np.mean(high / low) > 2.5  # within one unit
+
+
+def test_the_sizes_of_the_errors_are_the_stated_ones() -> None:
+    truths = [SimulatedArm(seed).reveal() for seed in range(400)]
+    size = ArmErrors()
+
+    def rms(values: list[np.ndarray]) -> float:
+        return float(np.sqrt(np.mean(np.square(values))))
+
+    assert rms([t.offset_rad for t in truths]) == pytest.approx(size.offset_rad, rel=0.05)
+    assert rms([t.play_rad for t in truths]) == pytest.approx(size.play_rad, rel=0.05)
+    assert min(t.play_rad.min() for t in truths) >= 0
+    assert rms([t.link[:, 3:] for t in truths]) == pytest.approx(size.link_m, rel=0.05)
+    assert rms([t.link[:, :3] for t in truths]) == pytest.approx(size.link_rad, rel=0.05)
+    assert "joint offsets" in repr(truths[0])
+    assert max(map(len, repr(truths[0]).splitlines())) <= 92
+
+
+def test_gravity_turns_a_joint_the_way_its_weight_sinks(anywhere: np.ndarray) -> None:
+    arm = widowx()
+
+    def height(q: np.ndarray) -> np.ndarray:
+        return (arm.forward(q, "flange")[:, 2, 3] + arm.forward(q)[:, 2, 3]) / 2
+
+    side = arms.load_side(arm, anywhere)
+    assert not side[:, [0, 5]].any()  # vertical, and through the weight
+    for j in range(1, 5):
+        step = 1e-6 * np.eye(6)[j]
+        sinks = -(height(anywhere + step) - height(anywhere - step)) / 2e-6
+        loaded = side[:, j] != 0
+        assert loaded.mean() > 0.5
+        assert np.array_equal(np.sign(sinks[loaded]), side[loaded, j])
+        assert np.abs(sinks[~loaded]).max() <= arms.errors.LOAD_ARM_M + 1e-6
+
+
+def test_play_trails_the_last_move_of_an_unloaded_joint() -> None:
+    robot = SimulatedArm(3, ArmErrors(0.0, 2e-3, 0.0, 0.0))
+    arm, play = robot.nominal, robot.reveal().play_rad[0]
+    turns = []
+    for direction in (1, -1):
+        robot.move(np.array(arms.HOME) - direction * np.eye(6)[0])
+        read = robot.move(arms.HOME)
+        miss = pose_difference(arm.forward(read, "flange"), robot.true_pose("flange"))
+        read = robot.move(arms.HOME)  # no move: the joint stays on its side
+        stayed = pose_difference(arm.forward(read, "flange"), robot.true_pose("flange"))
+        assert stayed[2] == pytest.approx(miss[2], abs=1e-5)
+        turns.append(miss[2])
+    assert turns[1] - turns[0] == pytest.approx(2 * play, abs=1e-5)  # it trails to either side
+
+
+def test_a_seed_names_a_unit_and_its_moves() -> None:
+    q = widowx().random(np.random.default_rng(0), 4)
+    one, same, other = SimulatedArm(1), SimulatedArm(1), SimulatedArm(2)
+    assert np.array_equal(one.move(q), same.move(q))
+    assert np.array_equal(one.true_pose(), same.true_pose())
+    assert not np.array_equal(one.reveal().offset_rad, other.reveal().offset_rad)
+    singly = SimulatedArm(1)
+    for pose, wanted in zip(q, one.true_pose(), strict=True):
+        singly.move(pose)
+        assert np.abs(singly.true_pose() - wanted).max() < 1e-12
+
+
+# --- what a fit may know ---
+
+
+@pytest.mark.parametrize("tool", ["gripper", "flange"])
+def test_shared_columns_are_numerical_derivatives(tool: arms.kinematics.Tool) -> None:
+    arm = widowx()
+    q = arm.random(np.random.default_rng(4), 20)
+    model = fk_covariance(q, tool=tool)
+    assert model.shared.shape == (20, 6, len(model.names))
+    assert model.sigma.shape == (len(model.names),)
+    side = arms.load_side(arm, q)
+    by_joint = arm.jacobian(q, tool)
+    assert np.array_equal(model.shared[..., :6], by_joint)
+    assert np.array_equal(model.shared[..., 6:12], by_joint * side[:, None, :])
+    step = 1e-6
+    for entry in range(42):
+        link = step * np.eye(42)[entry].reshape(7, 6)
+        ahead, behind = (arms.errors.with_link_errors(arm, s * link) for s in (1, -1))
+        slope = pose_difference(behind.forward(q, tool), ahead.forward(q, tool)) / (2 * step)
+        assert np.abs(model.shared[..., 13 + entry] - slope).max() < 1e-8, model.names[13 + entry]
+
+
+def test_covariance_is_that_of_many_units() -> None:
+    """Spread and correlation over poses of units drawn at random, arriving from anywhere."""
+    arm, n = widowx(), 1500
+    q = arm.random(np.random.default_rng(1), 3)
+    model = fk_covariance(q)
+    misses = np.empty((n, 3, 6))
+    for unit in range(n):
+        rng = np.random.default_rng([unit, 9])
+        robot = SimulatedArm(unit)
+        for i in rng.permutation(3):
+            robot.move(rng.uniform(arm.limits[:, 0], arm.limits[:, 1]))
+            read = robot.move(q[i])
+            misses[unit, i] = pose_difference(arm.forward(read), robot.true_pose())
+    drawn = np.sqrt((misses**2).mean(axis=0))
+    stated = np.sqrt(np.einsum("nii->ni", model.covariance))
+    assert drawn == pytest.approx(stated, rel=0.09)
+    chi2 = np.mean([m.ravel() @ np.linalg.solve(model.joint_covariance, m.ravel()) for m in misses])
+    assert chi2 / 18 == pytest.approx(1.0, abs=0.07)
+    separate = np.linalg.slogdet(model.joint_covariance)[1]
+    alone = sum(np.linalg.slogdet(c)[1] for c in model.covariance)
+    assert separate < alone - 3  # the poses' errors are correlated: they do not average
+
+
+# --- poses for calibration sessions ---
+
+
+def setups() -> dict[str, poses.Setup]:
+    arm = widowx()
+    return {
+        "eye_in_hand": poses.Setup(
+            arm, "eye_in_hand", arm.T_gripper_camera, poses.board_on_table(BOARD),
+            device("D405").unit.color, BOARD,
+        ),
+        "eye_to_hand": poses.Setup(
+            arm, "eye_to_hand", poses.over_the_shoulder(), poses.board_in_gripper(BOARD),
+            device("D435").unit.color, BOARD,
+        ),
+    }  # fmt: skip
+
+
+MOUNTS = ("eye_in_hand", "eye_to_hand")
+
+
+def check_allowed(setup: poses.Setup, q: np.ndarray) -> None:
+    """By other means than the sampler's: corner by corner and chain by chain."""
+    arm, lens = setup.arm, setup.intrinsics
+    arm.check(q)
+    for T in arm.forward(q):
+        assert T[2, 3] >= poses.CLEARANCE_M
+        if setup.mount == "eye_in_hand":
+            T_base_camera, T_base_board = T @ setup.X, setup.Y
+            assert T_base_camera[2, 3] >= poses.CLEARANCE_M
+        else:
+            T_base_camera, T_base_board = setup.X, T @ setup.Y
+            assert transform_points(T_base_board, BOARD.points)[:, 2].min() >= poses.CLEARANCE_M
+        T_camera_board = np.linalg.inv(T_base_camera) @ T_base_board
+        pixels = project(transform_points(T_camera_board, BOARD.points), lens.K, lens.dist)
+        assert ((pixels > 0) & (pixels < np.array(lens.size) - 1)).all()
+        eye = np.linalg.inv(T_camera_board)[:3, 3]
+        assert eye[2] < 0  # in front of the pattern
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_careful_poses_see_the_board_and_turn_far(mount: str) -> None:
+    setup = setups()[mount]
+    make = poses.eye_in_hand_poses if mount == "eye_in_hand" else poses.eye_to_hand_poses
+    first, second = (setup.Y, setup.X) if mount == "eye_in_hand" else (setup.X, setup.Y)
+    rng = np.random.default_rng(0)
+    q = make(setup.arm, first, second, setup.intrinsics, BOARD, rng, 20)
+    assert q.shape == (20, 6)
+    check_allowed(setup, q)
+    R = Rotation.from_matrix(setup.arm.forward(q)[:, :3, :3])
+    pairs = (R[0].inv() * R).as_rotvec()
+    assert np.linalg.svd(pairs, compute_uv=False)[1] / np.sqrt(20) > np.radians(10)
+    assert poses.half_turns(setup.arm.forward(q))[1] >= np.radians(30)
+    again = poses.careful_poses(setup, np.random.default_rng(1), 10, pool=q)
+    assert {tuple(row) for row in again} <= {tuple(row) for row in q}
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_translation_grid_keeps_the_orientation(mount: str) -> None:
+    setup = setups()[mount]
+    q = poses.translation_grid(setup, np.random.default_rng(0))
+    check_allowed(setup, q)
+    T = setup.arm.forward(q)
+    assert np.abs(T[:, :3, :3] - T[0, :3, :3]).max() < 1e-7
+    assert np.ptp(T[:, :3, 3], axis=0) == pytest.approx([0.1, 0.1, 0.0], abs=1e-7)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_single_axis_turns_about_that_axis_only(mount: str) -> None:
+    setup = setups()[mount]
+    q = poses.single_axis_poses(setup, np.random.default_rng(0), 15)
+    check_allowed(setup, q)
+    R = Rotation.from_matrix(setup.arm.forward(q)[:, :3, :3])
+    turns = (R * R[7].inv()).as_rotvec()
+    assert np.abs(turns[:, :2]).max() < 1e-7
+    assert np.abs(turns[[0, -1], 2]) == pytest.approx(np.radians(30), abs=1e-7)
+    assert setup.arm.forward(q)[:, :3, 3].std(axis=0).min() > 3e-3
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_small_rotations_stay_small(mount: str) -> None:
+    setup = setups()[mount]
+    q = poses.small_rotations(setup, np.random.default_rng(0), 15)
+    check_allowed(setup, q)
+    R = Rotation.from_matrix(setup.arm.forward(q)[:, :3, :3])
+    largest = (R[0].inv() * R).magnitude().max()
+    assert np.radians(1) < largest <= np.radians(6) + 1e-7
+    assert setup.arm.forward(q)[:, :3, 3].std(axis=0).min() > 3e-3
+
+
+def test_the_default_places_are_what_they_say() -> None:
+    T = poses.board_on_table(BOARD, (0.4, 0.1), turn_rad=0.3)
+    assert transform_points(T, BOARD.points.mean(axis=0)) == pytest.approx([0.4, 0.1, 0.0])
+    assert T[:3, 2] == pytest.approx([0, 0, -1])  # into the table
+    T = poses.over_the_shoulder()
+    assert T[:3, 0][2] == pytest.approx(0.0)  # level
+    assert T[:3, 1][2] < 0  # image down is down
+    held = poses.board_in_gripper(BOARD)
+    nearest = transform_points(held, BOARD.points)[:, 0].min()
+    assert nearest == pytest.approx(poses.FINGERS_M + BOARD.square_m)
+    assert held[:3, 2] == pytest.approx([0, -1, 0])
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_setup_goes_there_and_back(mount: str) -> None:
+    setup = setups()[mount]
+    T = setup.arm.forward(setup.arm.random(np.random.default_rng(0), 5))
+    assert np.abs(setup.T_base_gripper(setup.T_camera_board(T)) - T).max() < 1e-12
+
+
+def test_setups_that_cannot_be_are_named() -> None:
+    setup = setups()["eye_in_hand"]
+    parts = (setup.X, setup.Y, setup.intrinsics, BOARD)
+    with pytest.raises(ValueError, match="mount: got 'wrist'"):
+        poses.Setup(setup.arm, "wrist", *parts)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="share: got 0"):
+        poses.Setup(setup.arm, "eye_in_hand", *parts, share=0)
+    with pytest.raises(ValueError, match="n: got 2, want at least 3"):
+        poses.careful_poses(setup, np.random.default_rng(0), 2)
+    far = poses.board_on_table(BOARD, (2.0, 0.0))
+    away = poses.Setup(setup.arm, "eye_in_hand", setup.X, far, setup.intrinsics, BOARD)
+    with pytest.raises(ValueError, match=r"only 0 of .* have the board in"):
+        poses.random_poses(away, np.random.default_rng(0), 3)
+    with pytest.raises(ValueError, match=r"axis: got \[0.0, 0.0, 0.0\]"):
+        poses.single_axis_poses(setup, np.random.default_rng(0), 5, axis=(0, 0, 0))

@@ -1,0 +1,136 @@
+"""What notebook 03 teaches, against OpenCV, ranks of Jacobians and simulated sessions."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+import coursekit as ck
+from coursekit.geometry import Intrinsics, make_transform
+from coursekit.intrinsics.derivatives import project_with_derivatives, twist_columns
+from coursekit.lessons import intrinsics as lesson
+from coursekit.plots import intrinsics as figures
+from coursekit.simulation.sessions import Effects, corner_session
+
+BOARD = ck.boards.Board("charuco", squares=(9, 6), square_m=0.025)
+CHECKERBOARD = ck.boards.Board("checkerboard", squares=(10, 7), square_m=0.025)
+LENS = ck.specifications.device("D435").unit.color
+PINHOLE = Intrinsics(640, 480, 600.0, 610.0, 322.0, 236.0)
+
+
+def tilted(x_deg: float, y_deg: float, z_m: float) -> np.ndarray:
+    """A pose of the checkerboard, its middle on the optical axis."""
+    rotation = Rotation.from_euler("xy", (x_deg, y_deg), degrees=True)
+    middle = CHECKERBOARD.points.mean(axis=0)
+    return make_transform(rotation, [0, 0, z_m] - rotation.apply(middle))
+
+
+def jacobian(poses: list[np.ndarray]) -> np.ndarray:
+    """d pixels / d (fx, fy, cx, cy, and six a view), without distortion, columns of length 1."""
+    shared, blocks = [], []
+    for T in poses:
+        at = CHECKERBOARD.points @ T[:3, :3].T + T[:3, 3]
+        _, by_parameter, by_point = project_with_derivatives(at, PINHOLE)
+        shared.append(by_parameter[..., :4].reshape(-1, 4))
+        blocks.append(twist_columns(at, by_point).reshape(-1, 6))
+    J = np.zeros((sum(map(len, blocks)), 4 + 6 * len(poses)))
+    J[:, :4] = np.concatenate(shared)
+    for i, block in enumerate(blocks):
+        J[i * len(block) : (i + 1) * len(block), 4 + 6 * i : 10 + 6 * i] = block
+    return J / np.linalg.norm(J, axis=0)
+
+
+def rank(J: np.ndarray) -> int:
+    return int(np.linalg.matrix_rank(J, tol=1e-9 * len(J)))
+
+
+def test_one_view_has_eight_numbers_to_give_and_two_are_enough() -> None:
+    views = [tilted(30, 5, 0.5), tilted(-10, 35, 0.45)]
+    assert rank(jacobian(views[:1])) == 8 < 4 + 6
+    assert rank(jacobian(views)) == 4 + 12
+    assert lesson.CHECKPOINTS[0].value == 2
+
+
+def test_square_on_leaves_f_and_the_distances_free() -> None:
+    J = jacobian([tilted(0, 0, z) for z in np.linspace(0.3, 0.8, 12)])
+    free = J.shape[1] - rank(J)
+    # f with all the Z, and cx, cy each with the boards' tilt and shift
+    _, _, directions = np.linalg.svd(J)
+    along = directions[-free:]
+    reach = np.linalg.norm(along[:, :4], axis=0)  # how much of each of K lies in what is free
+    assert free >= 1
+    assert reach[0] > 0.1
+    assert reach[1] > 0.1
+    assert rank(jacobian([tilted(30, 5, 0.5), tilted(-10, 35, 0.45)])) == 16
+
+
+def test_the_exercises_give_opencvs_numbers() -> None:
+    found, _ = corner_session(CHECKERBOARD, LENS, seed=3, views=12)
+    objects = [CHECKERBOARD.points[d.ids].astype(np.float32) for d in found]
+    images = [d.pixels.astype(np.float32) for d in found]
+    rms, K, dist, rotations, shifts, sigmas, *_ = cv2.calibrateCameraExtended(
+        objects, images, LENS.size, None, None
+    )
+    predicted = [
+        cv2.projectPoints(o, r, t, K, dist)[0][:, 0]
+        for o, r, t in zip(objects, rotations, shifts, strict=True)
+    ]
+    numbers = lesson.REPROJECTION_RMS.model()(np.concatenate(images), np.concatenate(predicted))
+    assert numbers[2] == pytest.approx(rms, abs=1e-5)
+
+    result = ck.intrinsics.calibrate(found, CHECKERBOARD)
+    J, blocks = result.jacobian
+    whole = np.zeros((len(J), J.shape[1] + 6 * len(blocks)))
+    whole[:, : J.shape[1]] = J
+    row = 0
+    for i, block in enumerate(blocks):
+        column = J.shape[1] + 6 * i
+        whole[row : row + len(block), column : column + 6] = block
+        row += len(block)
+    scale = np.linalg.norm(whole, axis=0)  # k3 and metres differ by powers of ten
+    sigma = lesson.FOCAL_SIGMA.model()(whole / scale, np.concatenate(result.residuals).ravel())
+    assert sigma / scale[0] == pytest.approx(float(sigmas[0, 0]), rel=0.01)
+    assert sigma / scale[0] == pytest.approx(result.sigma("fx"), rel=1e-6)
+
+
+def test_a_wrong_square_size_leaves_all_but_the_distances() -> None:
+    found, truth = corner_session(BOARD, LENS, seed=5)
+    small = ck.boards.Board("charuco", squares=(9, 6), square_m=0.024)
+    right, wrong = (ck.intrinsics.calibrate(found, board) for board in (BOARD, small))
+    assert wrong.rms_px == pytest.approx(right.rms_px, abs=1e-6)
+    assert wrong.intrinsics.fx == pytest.approx(right.intrinsics.fx, abs=0.01)
+    ratio = wrong.T_camera_board[:, 2, 3] / right.T_camera_board[:, 2, 3]
+    assert ratio == pytest.approx(0.96, abs=1e-4)
+    assert right.T_camera_board[:, 2, 3] == pytest.approx(truth.T_camera_board[:, 2, 3], rel=0.02)
+
+
+def test_a_bowed_board_spoils_fx_and_not_the_rms() -> None:
+    found, _ = corner_session(BOARD, LENS, seed=5, effects=Effects(bow_m=0.001))
+    result = ck.intrinsics.calibrate(found, BOARD)
+    off = result.intrinsics.fx / LENS.fx - 1
+    assert result.rms_px < 0.4
+    assert 0.015 < abs(off) < 0.035
+    assert abs(result.intrinsics.fx - LENS.fx) > 10 * result.sigma("fx")
+
+
+def test_the_smallest_rms_is_that_of_scipys_fit() -> None:
+    X, Y = (a.ravel() for a in np.meshgrid(np.linspace(-0.1, 0.1, 9), np.linspace(-0.06, 0.06, 6)))
+
+    def predict(f: float, Z: float, tilt: float) -> np.ndarray:
+        depth = Z + X * np.sin(tilt)
+        return np.concatenate([f * X * np.cos(tilt) / depth, f * Y / depth])
+
+    noise = np.random.default_rng(0).normal(0, 0.1, 2 * X.size)
+    for tilt in (0.0, 5.0, 20.0, 45.0):
+        seen = predict(600, 0.5, np.radians(tilt)) + noise
+        rms = figures._best_rms(X, Y, seen)
+        for k in (0, 60, 120):
+            f = figures.F_PX[k]
+            cost = min(
+                least_squares(lambda p, f=f, s=seen: s - predict(f, *p), [f * 0.5 / 600, a]).cost
+                for a in (0.05, 0.4, 0.8)
+            )
+            assert rms[k] == pytest.approx(np.sqrt(4 * cost / seen.size), rel=1e-3)
