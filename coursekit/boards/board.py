@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 Kind = Literal["checkerboard", "charuco"]
 FEWEST_SQUARES = 3
 FEWEST_CHECKERBOARD = 4  # OpenCV finds none with fewer than 3x3 inner corners
+SMALLEST_M, LARGEST_M = 0.0005, 1.0  # of a square or marker: who gives millimetres is told so
 MARKER_SHARE = 0.75  # of a square's side, unless the board says otherwise
 DICTIONARIES = tuple(
     name for name in sorted(vars(cv2.aruco)) if name.startswith("DICT_") and name == name.upper()
@@ -248,4 +249,8 @@ def _length(name: str, value: object) -> float:
     number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
     if not number or not math.isfinite(value) or value <= 0:  # type: ignore[arg-type,operator]
         raise ValueError(f"{name}: got {value!r}, want a positive number of metres")
+    if not SMALLEST_M <= value <= LARGEST_M:  # type: ignore[operator]
+        raise ValueError(
+            f"{name}: got {value!r} m; want {SMALLEST_M} to {LARGEST_M} m (25 mm is 0.025)"
+        )
     return float(value)  # type: ignore[arg-type]

@@ -223,7 +223,7 @@ def _other_markers(markers: _Markers, board: Board) -> str:
                 change = f"squares={squares}" if squares != board.squares else ""
                 if old != board.old_origin and squares[1] % 2 == 0:
                     change += f"{', ' if change else ''}old_origin={old}"
-                return f"{count} as on a board of {_squares(squares)}: use {change}"
+                return f"{count} as on a board of {_squares(squares)} or more: use {change}"
     return f"{count} that lie as on no board of up to {LARGEST}x{LARGEST} squares"
 
 

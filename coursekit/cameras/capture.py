@@ -76,14 +76,15 @@ def capture(
     if lens is None:
         raise CameraError(f"the {camera.name} has no colour stream to calibrate")
     album = Album(results.folder() / FOLDER if folder is None else folder, camera, board, overwrite)
-    if len(album.views) < views:
+    before = len(album.views)
+    if before < views:
         try:
             with screen_for(board, lens, views) as screen:
                 _fill(album, _shots(camera, lens, board, album, timeout_s, screen), views)
         except KeyboardInterrupt:
             if not album.views:
                 raise
-    print(_summary(camera, album, views))
+    print(_summary(camera, album, views, before))
     return Detections(album.views, album.skipped)
 
 
@@ -129,7 +130,12 @@ def _fill(album: Album, shots: Generator[Shot, None, None], views: int) -> None:
         raise CameraError(f"{error}. {kept}", error.frames) from error
 
 
-def _summary(camera: Camera, album: Album, views: int) -> str:
+def _summary(camera: Camera, album: Album, views: int, before: int) -> str:
+    if len(album.views) == before:
+        return (
+            f"{before} views of the {camera.name} were in {album.folder.name} already, none was "
+            "taken: ask for more, or start again with overwrite=True."
+        )
     count = f"{len(album.views)} views"
     if len(album.views) < views:
         count = f"{len(album.views)} of {views} views"

@@ -498,7 +498,11 @@ def _check_detections(
 ) -> tuple[int, int]:
     """The images' size, or the ValueError that names the view which cannot be used."""
     if len(detections) < MIN_VIEWS:
-        raise ValueError(f"detections: got {len(detections)} views, want at least {MIN_VIEWS}")
+        skipped = getattr(detections, "skipped", ())
+        raise ValueError(
+            f"detections: got {len(detections)} views, want at least {MIN_VIEWS}"
+            + (f"; {len(skipped)} not used, the first: {skipped[0]!r}" if skipped else "")
+        )
     width, height = detections[0].size if size is None else size
     for index, detection in enumerate(detections):
         trouble = next(_troubles(detection, points, (width, height)), "")

@@ -42,7 +42,8 @@ def _build_rms(steps: Mapping[str, Step]) -> Model:
         residuals = steps["difference"](observed, predicted)
         axes = steps["axis"](residuals)
         both = steps["both"](residuals, axes)
-        return steps["order"](steps["shown"](residuals, axes), both)
+        result = steps["order"](steps["shown"](residuals, axes), both)
+        return steps["whole"](residuals, result)
 
     return reprojection_rms
 
@@ -71,6 +72,7 @@ REPROJECTION_RMS = Exercise(
         "both": _both_axes,
         "shown": _as_they_are,
         "order": _u_v_both,
+        "whole": _as_they_are,
     },
     cases=[
         (np.array([[103.0, 54.0], [201.0, 50.0]]), np.array([[100.0, 50.0], [200.0, 50.0]])),
@@ -225,6 +227,25 @@ def norm_of_everything(residuals: Array, axes: Array) -> float:
 
 
 @REPROJECTION_RMS.mistake(
+    "whole",
+    "no root is taken: all three are in px²",
+    "What is the unit of your result, and which one is wanted?",
+)
+def squares_everywhere(residuals: Array, result: Array) -> Array:
+    return result**2
+
+
+@REPROJECTION_RMS.mistake(
+    "whole",
+    "these are mean distances, in u, in v and in two dimensions, not root mean squares",
+    "The letters of RMS, from the right: square, mean, root. Which of them does yours lack?",
+)
+def mean_distances_everywhere(residuals: Array, result: Array) -> Array:
+    distance = np.linalg.norm(residuals, axis=1)
+    return np.array([*np.abs(residuals).mean(axis=0), distance.mean()])
+
+
+@REPROJECTION_RMS.mistake(
     "order",
     "u and v are swapped",
     "Columns of the array: which of them is u?",
@@ -367,6 +388,24 @@ def noise_not_squared(residuals: Array, freedom: float) -> float:
 )
 def noise_summed(residuals: Array, freedom: float) -> float:
     return float(residuals @ residuals)
+
+
+@FOCAL_SIGMA.mistake(
+    "noise",
+    "the noise is taken as the standard deviation of the residuals: no parameter is counted",
+    "Ten residuals and ten fitted parameters: how large is the standard deviation of what is left?",
+)
+def spread_of_residuals(residuals: Array, freedom: float) -> float:
+    return float(np.var(residuals))
+
+
+@FOCAL_SIGMA.mistake(
+    "noise",
+    "the noise is the 2-D RMS, and J has a row for each coordinate",
+    "A corner that is 0.1 px off in u and in v is 0.14 px off. Which of the two belongs to a row?",
+)
+def two_dimensional_rms(residuals: Array, freedom: float) -> float:
+    return float(2 * np.mean(residuals**2))
 
 
 @FOCAL_SIGMA.mistake(
@@ -521,9 +560,10 @@ CHECKPOINTS = (
                 "say whether another f would have fitted them just as well.",
             ),
             Option(
-                "P's: its smallest and largest residuals are no worse, and its views are sharper",
-                "Square-on views are the easiest to detect, and say the least. What did you learn "
-                "from the valley?",
+                "P's: its smallest and largest residuals are no worse, and its boards look more "
+                "regular",
+                "Square-on views look neat, are easy to detect, and say the least. What did you "
+                "learn from the valley?",
             ),
             Option(
                 "Q's: its boards are tilted, so f and distance are not interchangeable",
@@ -554,9 +594,10 @@ CHECKPOINTS = (
                 "always points the same way. That is a bias, not noise.",
             ),
             Option(
-                "RMS stays below 0.4 px, but fx is wrong by two percent and k1 with it",
-                "The fit has no parameter for the bow, so it uses the ones it has: a larger fx, "
-                "another k1. Both come with small stated sigmas, and are many of them wrong.",
+                "RMS stays below 0.4 px, but fx is wrong by two to three percent, and k1 with it",
+                "The fit has no parameter for the bow, so it uses the ones it has: a smaller fx (a "
+                "larger one if the board is hollow), another k1. fx comes with a small stated "
+                "sigma, and is many of them wrong.",
                 right=True,
             ),
             Option(
@@ -596,20 +637,18 @@ CHECKPOINTS = (
 )
 
 OBJECTIVES = (
+    Objective("say what a calibration fits, and why tilt makes f known", ("intrinsics.square_on",)),
     Objective(
-        "say what a calibration fits, how many views it takes, and why tilt makes f known",
-        ("intrinsics.two_views", "intrinsics.square_on"),
+        "say which kind of reprojection error a number is (deeper: and compute it)",
+        ("intrinsics.rms_axes", "intrinsics.reprojection_rms"),
+    ),
+    Objective("tell a good calibration from a bad one of the same RMS", ("intrinsics.which_one",)),
+    Objective(
+        "(deeper) say where the uncertainty of fx comes from, and how many views it takes",
+        ("intrinsics.two_views", "intrinsics.focal_sigma"),
     ),
     Objective(
-        "compute the reprojection error, and say which of its kinds a number is",
-        ("intrinsics.reprojection_rms", "intrinsics.rms_axes"),
-    ),
-    Objective(
-        "tell a good calibration from a bad one of the same RMS",
-        ("intrinsics.which_one", "intrinsics.focal_sigma"),
-    ),
-    Objective(
-        "recognise what spoils a calibration, and say what no image can show",
+        "(deeper) recognise what spoils a calibration, and say what no image can show",
         ("intrinsics.bowed_board", "intrinsics.square_size"),
     ),
 )

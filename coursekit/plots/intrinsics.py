@@ -36,15 +36,16 @@ def best_fits(X: Floats, Y: Floats, seen: Mapping[str, Floats], f_px: float) -> 
     fig = figure(8.0, 4.2)
     ax = fig.subplots()
     texts = []
-    for style, (name, pixels) in zip(("-", "--", "-.", ":"), seen.items(), strict=False):
+    styles = zip(("-", "--", "-.", ":"), ("model", "cube", "color", "measured"), strict=True)
+    for (style, color), (name, pixels) in zip(styles, seen.items(), strict=False):
         rms = _best_rms(X, Y, pixels)
-        ax.plot(F_PX, rms, style, label=name)
+        ax.plot(F_PX, rms, style, color=COLORS[color], label=name)
         good = F_PX[rms < 1.1 * rms.min()]
         texts.append(f"{name}: within a tenth of the best from {good[0]:.0f} to {good[-1]:.0f} px")
     ax.axvline(f_px, color=COLORS["truth"], lw=1.5, label="true f")
     ax.set(xlim=(F_PX[0], F_PX[-1]), ylim=(0, 3), xlabel="assumed focal length f (px)",
            ylabel="smallest RMS (px)")  # fmt: skip
-    ax.legend(loc="upper left")
+    fig.legend(loc="outside right upper")
     fig.alt = f"The smallest RMS against the assumed focal length. {'; '.join(texts)}."
     return fig
 
@@ -101,6 +102,9 @@ def board(board: Board) -> LessonFigure:
 def views(folder: Path, detections: Sequence[Detection]) -> LessonFigure:
     """The images of a folder with the corners that were found in them."""
     import cv2
+
+    if not len(detections):
+        raise ValueError("detections: there are none to show; print them to see why")
 
     columns = 3
     rows = -(-len(detections) // columns)
@@ -256,8 +260,11 @@ def outlines(result: IntrinsicsResult) -> list[Floats]:
 
 
 def rules(rows: Mapping[str, IntrinsicsResult], range_m: float) -> LessonFigure:
-    """What each capture rule buys: sigma of fx, and the worst pixel's sigma, of some sessions."""
-    names = list(rows)
+    """What each capture rule buys: sigma of fx, and the worst pixel's sigma, of some sessions.
+
+    Behind each name stands the session's RMS.
+    """
+    names = [f"{name} ({r.rms_px:.2f} px)" for name, r in rows.items()]
     fx = [100 * r.sigma("fx") / r.intrinsics.fx for r in rows.values()]
     worst = [float(r.uncertainty_map(range_m, (12, 16)).max()) for r in rows.values()]
     fig = figure(9.0, 0.55 * len(names) + 1.4)
@@ -330,7 +337,11 @@ def power(table: Mapping[str, Mapping[str, Any]]) -> LessonFigure:
     for ax, (effect, row) in zip(axes, table.items(), strict=True):
         share = np.asarray(row["named"]) / row["sessions"]
         ax.plot(row["sizes"], share, "o-", color=COLORS["model"])
-        ax.set(xscale="log", ylim=(-0.03, 1.03), xlabel=f"{effect} ({row['unit']})")
+        ax.set(xscale="log", ylim=(-0.03, 1.03),
+               xlabel=f"{effect.replace('_', ' ')} ({row['unit']})")  # fmt: skip
+        ticks = row["sizes"][::3]
+        ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
+        ax.set_xticks([], minor=True)
         texts.append(
             f"{effect}: "
             + ", ".join(
@@ -356,12 +367,12 @@ def difference(comparison: Comparison) -> LessonFigure:
     pixels, shift_mm = comparison.difference_px, 1000 * comparison.shift_m
     width, height = comparison.size
     for ax, values, label in (
-        (axes[0], pixels, "difference (px), camera turned to fit"),
-        (axes[1], shift_mm, f"shift at {comparison.range_m:g} m (mm)"),
+        (axes[0], pixels, "px, the camera turned to fit"),
+        (axes[1], shift_mm, f"mm at {comparison.range_m:g} m, the camera not turned"),
     ):
         u, v = np.linspace(0, width - 1, values.shape[1]), np.linspace(0, height - 1, len(values))
         shown = ax.pcolormesh(u, v, values, shading="gouraud", cmap="cividis", vmin=0)
-        fig.colorbar(shown, ax=ax, label=label, shrink=0.9)
+        fig.colorbar(shown, ax=ax, location="bottom", label=label, shrink=0.9)
         _frame(ax, width, height)
         ax.label_outer()
     fig.alt = (

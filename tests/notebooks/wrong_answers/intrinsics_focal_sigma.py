@@ -41,6 +41,18 @@ def norm_of_the_residuals(J, residuals):
     return np.linalg.norm(residuals) * np.sqrt(np.linalg.inv(J.T @ J)[0, 0])
 
 
+@wrong("spread_of_residuals", "numpy's own")
+def standard_deviation_of_the_residuals(J, residuals):
+    return np.std(residuals) * np.sqrt(np.linalg.inv(J.T @ J)[0, 0])
+
+
+@wrong("two_dimensional_rms", "vectorised")
+def opencvs_rms_for_sigma(J, residuals):
+    du, dv = residuals[0::2], residuals[1::2]
+    rms = np.sqrt(np.mean(du**2 + dv**2))
+    return rms * np.linalg.norm(np.linalg.pinv(J)[0])
+
+
 @wrong("others_known", "vectorised")
 def only_its_own_column(J, residuals):
     s2 = residuals @ residuals / (len(J) - J.shape[1])

@@ -124,6 +124,21 @@ def frobenius(observed, predicted):
 # --- what is returned ----------------------------------------------------------------------------
 
 
+@wrong("squares_everywhere", "vectorised")
+def mean_squares_only(observed, predicted):
+    squares = np.mean((observed - predicted) ** 2, axis=0)
+    return squares[0], squares[1], squares.sum()
+
+
+@wrong("mean_distances_everywhere", "loop over lists")
+def how_far_off_on_average(observed, predicted):
+    n = len(observed)
+    off = [(o[0] - p[0], o[1] - p[1]) for o, p in zip(observed, predicted, strict=True)]
+    u = sum(abs(a) for a, _ in off) / n
+    v = sum(abs(b) for _, b in off) / n
+    return u, v, sum(math.hypot(a, b) for a, b in off) / n
+
+
 @wrong("v_before_u", "vectorised")
 def rows_before_columns(observed, predicted):
     u, v = np.sqrt(np.mean((observed - predicted) ** 2, axis=0))

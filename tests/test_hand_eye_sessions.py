@@ -1,0 +1,366 @@
+"""Simulated hand-eye sessions against their own truth, and sessions in folders."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from coursekit.arm import ArmErrors, fk_error, pose_difference, widowx
+from coursekit.boards import detect
+from coursekit.geometry import invert_transform
+from coursekit.hand_eye import observability
+from coursekit.hand_eye.poses import camera_board
+from coursekit.hand_eye.session import HandEyeSession
+from coursekit.simulation.hand_eye_sessions import (
+    SECONDS,
+    HandEyeMistakes,
+    hand_eye_session,
+    rendered_session,
+    truth_of,
+)
+from coursekit.specifications import DATA
+from tools import make_data
+
+MOUNTS = ("eye_in_hand", "eye_to_hand")
+SHIPPED = [DATA / f"hand_{mount}" for mount in MOUNTS]
+
+
+def seen_by_opencv(truth, view: int) -> np.ndarray:
+    """All corners (N, 2) of a view by another implementation of the projection."""
+    T, lens = truth.T_camera_board[view], truth.setup.intrinsics
+    points = truth.setup.board.points * truth.mistakes.square_scale
+    pixels, _ = cv2.projectPoints(points, cv2.Rodrigues(T[:3, :3])[0], T[:3, 3], lens.K, lens.dist)
+    return pixels[:, 0]
+
+
+# --- what is simulated ---
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_corners_are_where_opencv_projects_them(mount) -> None:
+    session, truth = hand_eye_session(mount, 3, corner_noise_px=0.1, arm_errors=ArmErrors())
+    off = [d.pixels - seen_by_opencv(truth, i)[d.ids] for i, d in enumerate(session.seen)]
+    assert np.std(np.concatenate(off)) == pytest.approx(0.1, rel=0.05)
+    assert np.abs(np.mean(np.concatenate(off), axis=0)).max() < 0.02
+    exact, truth = hand_eye_session(mount, 3, corner_noise_px=0.0)
+    for i, d in enumerate(exact.seen):
+        np.testing.assert_allclose(d.pixels, seen_by_opencv(truth, i)[d.ids], atol=1e-6)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_truth_closes_the_loop_and_the_report_is_off_by_what_the_arm_errs(mount) -> None:
+    session, truth = hand_eye_session(mount, 5, arm_errors=ArmErrors())
+    expected = camera_board(truth.T_base_gripper, truth.X, truth.setup.Y, mount)
+    np.testing.assert_allclose(truth.T_camera_board, expected, atol=1e-12)
+    np.testing.assert_allclose(session.T_base_gripper, widowx().forward(session.q), atol=1e-12)
+    shift, _ = fk_error(truth.T_base_gripper, session.T_base_gripper)
+    assert 5e-4 < np.median(shift) < 8e-3
+    exact, truth = hand_eye_session(mount, 5)
+    np.testing.assert_allclose(exact.T_base_gripper, truth.T_base_gripper, atol=1e-12)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_solve_finds_X(mount) -> None:
+    session, truth = hand_eye_session(mount, 6)
+    off = pose_difference(truth.X, session.solve().X)
+    assert np.abs(off[3:]).max() < 3e-4
+    assert np.abs(off[:3]).max() < np.radians(0.05)
+    closed = pose_difference(truth.X, session.solve("park").X)
+    assert np.abs(closed[3:]).max() < 3e-3
+
+
+def test_the_same_seed_gives_the_same_session_and_another_one_another() -> None:
+    one, first = hand_eye_session("eye_in_hand", 8, arm_errors=ArmErrors())
+    two, second = hand_eye_session("eye_in_hand", 8, arm_errors=ArmErrors())
+    np.testing.assert_array_equal(one.q, two.q)
+    np.testing.assert_array_equal(one.seen[4].pixels, two.seen[4].pixels)
+    np.testing.assert_array_equal(first.X, second.X)
+    _, other = hand_eye_session("eye_in_hand", 9, arm_errors=ArmErrors())
+    assert np.abs(other.X - first.X).max() > 1e-3
+
+
+def test_a_mistake_leaves_the_rest_of_the_session_as_it_is() -> None:
+    healthy, truth = hand_eye_session("eye_to_hand", 10)
+    slipped, moved = hand_eye_session("eye_to_hand", 10, mistakes=HandEyeMistakes(slip_m=0.01))
+    np.testing.assert_array_equal(healthy.q, slipped.q)
+    at = moved.slipped_at
+    assert at is not None
+    np.testing.assert_array_equal(truth.T_camera_board[:at], moved.T_camera_board[:at])
+    shift = np.linalg.norm(moved.Y[at:, :3, 3] - moved.setup.Y[:3, 3], axis=1)
+    np.testing.assert_allclose(shift, 0.01, atol=1e-12)
+
+
+def test_each_mistake_does_what_it_says() -> None:
+    def made(**mistake):
+        return hand_eye_session("eye_in_hand", 11, mistakes=HandEyeMistakes(**mistake))
+
+    healthy, truth = made()
+    T = healthy.T_base_gripper
+    np.testing.assert_allclose(made(inverted_poses=True)[0].T_base_gripper, invert_transform(T))
+    np.testing.assert_allclose(
+        made(inverted_detections=True)[0].seen, invert_transform(healthy.T_camera_board)
+    )
+    assert made(wrong_mount=True)[0].mount == "eye_to_hand"
+    np.testing.assert_allclose(
+        made(millimetres="arm")[0].T_base_gripper[:, :3, 3], 1e3 * T[:, :3, 3]
+    )
+    np.testing.assert_allclose(
+        made(millimetres="board")[0].seen[:, :3, 3], 1e3 * healthy.T_camera_board[:, :3, 3]
+    )
+    degrees = made(degrees="joints")[0]
+    np.testing.assert_allclose(degrees.q, np.degrees(healthy.q))
+    np.testing.assert_allclose(degrees.T_base_gripper, widowx().forward(degrees.q))
+    turned = made(degrees="rotation_vectors")[0].T_base_gripper
+    given, wrong = cv2.Rodrigues(T[3, :3, :3])[0], cv2.Rodrigues(turned[3, :3, :3])[0]
+    length = np.degrees(np.linalg.norm(given))
+    away = np.linalg.norm(wrong) - length
+    back = np.linalg.norm(wrong) + length  # a vector longer than pi comes out along the other way
+    assert min(abs(np.sin(away / 2)), abs(np.sin(back / 2))) < 1e-9
+    assert abs(np.linalg.norm(np.cross(given.ravel(), wrong.ravel()))) < 1e-9
+
+    late, truth = made(late_s=0.05)
+    np.testing.assert_allclose(
+        late.q, widowx_angles(late, truth) + 0.05 * late.dq, atol=1e-9)  # fmt: skip
+    zero, truth = made(joint_offset_deg=2.0)
+    assert truth.joint in {1, 2, 3, 4}
+    off = np.linalg.norm(pose_difference(zero.T_base_gripper, truth.T_base_gripper)[:, :3], axis=1)
+    np.testing.assert_allclose(np.degrees(off), 2.0, atol=1e-6)
+    larger, truth = made(square_scale=1.05)
+    np.testing.assert_allclose(
+        larger.solve(free_scale=True).scale, 1.05, atol=0.001)  # fmt: skip
+    np.testing.assert_allclose(healthy.times, SECONDS * np.arange(25))
+
+
+def widowx_angles(session, truth) -> np.ndarray:
+    """The joint angles (n, 6) at the images, by inverse kinematics near the reported ones."""
+    q, reached = widowx().inverse(truth.T_base_gripper, session.q, elsewhere=False)
+    assert reached.all()
+    return q
+
+
+@pytest.mark.parametrize("by", [1, -1, 2])
+def test_shifted_by(by: int) -> None:
+    healthy, _ = hand_eye_session("eye_in_hand", 12, n=15)
+    shifted, _ = hand_eye_session(
+        "eye_in_hand", 12, n=15, mistakes=HandEyeMistakes(shifted_by=by)
+    )  # fmt: skip
+    assert len(shifted) == 15 - abs(by)
+    for i in range(len(shifted)):
+        image = healthy.names.index(shifted.names[i])
+        np.testing.assert_allclose(
+            shifted.T_base_gripper[i], healthy.T_base_gripper[image - by], atol=1e-12)  # fmt: skip
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_degenerate_designs_leave_free_what_they_should(mount) -> None:
+    def free(design: str) -> tuple[str, ...]:
+        session, _ = hand_eye_session(mount, 1, mistakes=HandEyeMistakes(design=design))
+        return observability(session.T_base_gripper, mount).free
+
+    assert free("careful") == ()
+    assert free("grid") == ("translation along all axes is free",)
+    axis = free("single_axis")
+    assert any("translation along the common axis" in words for words in axis)
+
+
+def test_arguments_are_checked() -> None:
+    with pytest.raises(ValueError, match="design: got 'circle'"):
+        HandEyeMistakes(design="circle")
+    with pytest.raises(ValueError, match="square_scale: got 0"):
+        HandEyeMistakes(square_scale=0.0)
+    with pytest.raises(ValueError, match="late_s: got nan"):
+        HandEyeMistakes(late_s=float("nan"))
+    with pytest.raises(ValueError, match="corner_noise_px"):
+        hand_eye_session("eye_in_hand", 0, corner_noise_px=-1)
+    with pytest.raises(ValueError, match="mount: got 'on_the_ceiling'"):
+        hand_eye_session("on_the_ceiling", 0)
+
+
+def test_rendered_images_agree_with_the_corners() -> None:
+    session, truth, images = rendered_session("eye_in_hand", 2, n=8)
+    assert len(images) == len(session) == 8
+    for i, d in enumerate(session.seen):
+        off = d.pixels - seen_by_opencv(truth, i)[d.ids]
+        assert np.sqrt(np.mean(off**2)) < 0.15
+
+
+# --- sessions in memory ---
+
+
+def test_a_session_checks_what_belongs_together() -> None:
+    session, _ = hand_eye_session("eye_in_hand", 0, n=10)
+    with pytest.raises(ValueError, match="seen: got 9, T_base_gripper has 10"):
+        replace(session, seen=session.seen.pick(range(9)), names=())
+    with pytest.raises(ValueError, match="q: got shape"):
+        replace(session, q=session.q[:5])
+    q = session.q.copy()
+    q[3, 2] = np.nan
+    with pytest.raises(ValueError, match=r"q\[3\]: has NaN"):
+        replace(session, q=q)
+    with pytest.raises(ValueError, match="dq: velocities need"):
+        replace(session, q=None, dq=session.q)
+    with pytest.raises(ValueError, match="board: got None"):
+        replace(session, board=None)
+    T = session.T_base_gripper.copy()
+    T[4, :3, 0] *= -1
+    with pytest.raises(ValueError, match=r"T_base_gripper\[4\].*reflection"):
+        replace(session, T_base_gripper=T)
+    with pytest.raises(ValueError, match="mount"):
+        replace(session, mount="eye_on_hand")
+
+
+def test_pick_and_repr() -> None:
+    session, _ = hand_eye_session("eye_in_hand", 0, n=10)
+    part = session.pick([7, 2])
+    assert part.names == ("view_07", "view_02")
+    np.testing.assert_array_equal(part.q, session.q[[7, 2]])
+    np.testing.assert_array_equal(part.seen[0].pixels, session.seen[7].pixels)
+    assert "10 arm poses and images, joint angles, times" in repr(session)
+
+
+# --- sessions in a folder ---
+
+
+@pytest.fixture(scope="module")
+def shipped() -> list[HandEyeSession]:
+    return [HandEyeSession.from_folder(folder, progress=False) for folder in SHIPPED]
+
+
+@pytest.fixture
+def small(tmp_path) -> Path:
+    """A folder with the first six views of a shipped session."""
+    lines = (SHIPPED[0] / "poses.csv").read_text("utf-8").splitlines(keepends=True)
+    (tmp_path / "poses.csv").write_text("".join(lines[:7]))
+    for name in ["session.json", *(f"view_{i:02d}.jpg" for i in range(6))]:
+        shutil.copy(SHIPPED[0] / name, tmp_path / name)
+    return tmp_path
+
+
+def read(folder: Path, **options) -> HandEyeSession:
+    return HandEyeSession.from_folder(folder, progress=False, **options)
+
+
+def test_shipped_sessions_are_what_make_data_makes(shipped) -> None:
+    for folder, session in zip(SHIPPED, shipped, strict=True):
+        assert len(session) == make_data.HAND_EYE_VIEWS
+        assert session.skipped == ()
+        assert sum(path.stat().st_size for path in folder.iterdir()) < 1.6e6
+        truth = truth_of(folder)
+        assert truth.mount == session.mount
+        seed, _ = make_data.HAND_EYE[session.mount]
+        made, _ = hand_eye_session(session.mount, seed, len(session), 0.0, ArmErrors())
+        np.testing.assert_allclose(session.q, made.q, atol=1e-7)
+        np.testing.assert_allclose(session.T_base_gripper, made.T_base_gripper, atol=1e-7)
+        off = [
+            seen.pixels - exact.pixels[np.isin(exact.ids, seen.ids)]
+            for seen, exact in zip(session.seen, made.seen, strict=True)
+            if np.isin(seen.ids, exact.ids).all()
+        ]
+        assert len(off) > 10
+        assert np.sqrt(np.mean(np.concatenate(off) ** 2)) < 0.1
+
+
+def test_shipped_sessions_show_the_error_of_the_arm(shipped) -> None:
+    """X is off by more than its interval says: that is what the notebook is about."""
+    outside = 0
+    for folder, session in zip(SHIPPED, shipped, strict=True):
+        truth, result = truth_of(folder), session.solve()
+        off = pose_difference(truth.X, result.X)
+        assert 3e-4 < np.linalg.norm(off[3:]) < 6e-3
+        outside += int(np.sum(~result.holds(truth.X)))
+        text = (folder / "session.json").read_text("utf-8")
+        assert f"{truth.X[0, 3]:.4f}" not in text
+    assert outside >= 6  # of 12 numbers, where honest intervals would miss 0.6
+
+
+def test_truth_is_only_for_simulated_sessions(small) -> None:
+    card = json.loads((small / "session.json").read_text())
+    (small / "session.json").write_text(json.dumps(card | {"source": "my arm"}))
+    with pytest.raises(ValueError, match="nobody knows its X"):
+        truth_of(small)
+    with pytest.raises(ValueError, match=r"has no session\.json"):
+        truth_of(small / "nowhere")
+
+
+def test_save_and_read_again(small, tmp_path) -> None:
+    session = read(small)
+    folder = tmp_path / "copy"
+    images = {name: (small / name).read_bytes() for name in session.names}
+    session.save(folder, images, {"origin": "a test"})
+    again = read(folder)
+    np.testing.assert_allclose(again.T_base_gripper, session.T_base_gripper, atol=1e-7)
+    np.testing.assert_allclose(again.q, session.q, atol=1e-7)
+    np.testing.assert_allclose(again.times, session.times)
+    assert again.board == session.board
+    assert again.intrinsics == session.intrinsics
+    assert json.loads((folder / "session.json").read_text())["origin"] == "a test"
+    with pytest.raises(ValueError, match=r"images: no 'view_00.jpg'"):
+        session.save(folder, {})
+
+
+def test_joint_angles_alone_are_enough(small) -> None:
+    lines = (small / "poses.csv").read_text().splitlines()
+    drop = set(range(1, 8))
+    kept = [",".join(c for i, c in enumerate(line.split(",")) if i not in drop) for line in lines]
+    (small / "poses.csv").write_text("\ufeff" + "\r\n".join(kept))  # as Excel on Windows saves
+    session = read(small)
+    np.testing.assert_allclose(session.T_base_gripper, widowx().forward(session.q))
+
+
+def test_bad_rows_are_named_and_the_rest_is_used(small) -> None:
+    lines = (small / "poses.csv").read_text().splitlines()
+    cells = [line.split(",") for line in lines]
+    cells[1][1] = "0,3"  # becomes two cells: a decimal comma
+    cells[2][4] = "2.0"
+    cells[3][8] = "nan"
+    rows = [",".join(row) for row in cells]
+    rows += ["view_99.jpg" + rows[4][len("view_03.jpg") :], rows[5], "," + rows[5].split(",", 1)[1]]
+    shutil.copy(small / "view_05.jpg", small / "view_06.jpg")
+    rows.append("view_06.jpg" + rows[6][len("view_05.jpg") :])
+    (small / "view_05.jpg").write_bytes(b"")
+    (small / "poses.csv").write_text("\n".join(rows))
+    session = read(small)
+    assert session.names == ("view_03.jpg", "view_04.jpg", "view_06.jpg")
+    said = {skip.name: skip.reason for skip in session.skipped}
+    assert "length" in said["poses.csv, line 3 (view_01.jpg)"]
+    assert "time is nan" in said["poses.csv, line 4 (view_02.jpg)"]
+    assert "no such file" in said["poses.csv, line 8 (view_99.jpg)"]
+    assert "a row already" in said["poses.csv, line 9 (view_04.jpg)"]
+    assert said["poses.csv, line 10"] == "no file is named"
+    assert "empty" in said["view_05.jpg"]
+    assert any(name.startswith("poses.csv, line 2") for name in said)
+    assert "not used: poses.csv, line 3" in repr(session)
+
+
+def test_folders_that_are_no_session(small, tmp_path) -> None:
+    with pytest.raises(ValueError, match="want a folder that exists"):
+        read(tmp_path / "nowhere")
+    (tmp_path / "bare").mkdir()
+    with pytest.raises(ValueError, match="mount: neither given nor in"):
+        read(tmp_path / "bare")
+    session = read(small)
+    known = {"mount": session.mount, "board": session.board, "intrinsics": session.intrinsics}
+    with pytest.raises(ValueError, match=r"has no poses.csv"):
+        read(tmp_path / "bare", **known)
+    (small / "session.json").unlink()
+    assert len(read(small, **known)) == 6
+    text = (small / "poses.csv").read_text()
+    (small / "poses.csv").write_text(text.replace("qw", "w").replace("q5", "joint_5"))
+    with pytest.raises(ValueError, match="no column 'qw'"):
+        read(small, **known)
+    (small / "poses.csv").write_text("\n".join(text.splitlines()[:3]))
+    with pytest.raises(ValueError, match="2 usable pairs"):
+        read(small, **known)
+
+
+def test_detection_of_a_shipped_image_is_what_the_session_holds(shipped) -> None:
+    session = shipped[1]
+    image = cv2.imread(str(SHIPPED[1] / "view_03.jpg"), cv2.IMREAD_GRAYSCALE)
+    alone = detect(image, session.board)
+    np.testing.assert_array_equal(alone.pixels, session.seen[3].pixels)
