@@ -176,6 +176,12 @@ def write_json(path: Path, content: Any) -> None:
         part.write_text(text, encoding="utf-8")
 
 
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file beside `path`, then rename it: never half a file."""
+    with _whole(path) as part:
+        part.write_bytes(content)
+
+
 @contextlib.contextmanager
 def _whole(path: Path) -> Iterator[Path]:
     """A file to write beside `path`, which becomes `path` if all goes well."""

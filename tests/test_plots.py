@@ -11,10 +11,17 @@ from matplotlib.colors import to_rgb
 
 from coursekit import boards, geometry, plots, specifications
 from coursekit.geometry import Intrinsics
+from coursekit.hand_eye import error_study
 from coursekit.intrinsics import calibrate, compare, stored_power
-from coursekit.plots import depth_noise, intrinsics, pinhole
+from coursekit.plots import depth_noise, hand_eye, intrinsics, pinhole
 from coursekit.plots.interactive import label
-from coursekit.simulation import Effects, corner_session, tabletop
+from coursekit.simulation import (
+    Effects,
+    corner_session,
+    default_setup,
+    hand_eye_session,
+    tabletop,
+)
 
 D435 = specifications.device("D435").unit
 LENSES = {n: specifications.lens(n).intrinsics for n in ("opencv_left", "d405_color")}
@@ -302,3 +309,46 @@ def test_maps_of_two_sessions_share_their_scale() -> None:
     axes = INTRINSICS_FIGURES["uncertainty"].axes
     limits = [ax.collections[0].get_clim() for ax in axes[:2]]
     assert limits[0] == limits[1]
+
+
+# --- notebook 04 ---
+
+
+def hand_eye_figures() -> dict[str, plots.LessonFigure]:
+    rigs = {
+        "eye-in-hand": default_setup("eye_in_hand"),
+        "eye-to-hand": default_setup("eye_to_hand"),
+    }
+    joints = dict.fromkeys(rigs, (0.0, 0.7, 1.3, 0.7, 0.0, 0.0))
+    session, _ = hand_eye_session("eye_in_hand", 7, n=6)
+    counts = (12, 25)
+    return {
+        "mounts": hand_eye.mounts(rigs, joints),
+        "diversity": hand_eye.diversity({"this session": session.T_base_gripper}),
+        "study": hand_eye.study(error_study(trials=5)),
+        "more_poses": hand_eye.more_poses(counts, {"a": [3.0, 2.9]}, {"a": [1.0, 0.7]}),
+        "gaps": hand_eye.gaps([1.0, 2.0], [2.0]),
+        "touched": hand_eye.touched([[1.0, -1.0, 0.5], [2.0, 0.0, 0.1]]),
+    }
+
+
+HAND_EYE_FIGURES = hand_eye_figures()
+
+
+@pytest.mark.parametrize("name", HAND_EYE_FIGURES)
+def test_hand_eye_figures_have_labels_and_words(name: str) -> None:
+    check_labels_and_words(HAND_EYE_FIGURES[name])
+
+
+def test_the_rig_is_drawn_where_forward_kinematics_puts_it() -> None:
+    q = np.array([0.0, 0.7, 1.3, 0.7, 0.0, 0.0])
+    rig = default_setup("eye_in_hand")
+    chain = HAND_EYE_FIGURES["mounts"].axes[0].lines[0]
+    x, z = chain.get_xdata()[-1], chain.get_ydata()[-1]
+    assert (x, z) == pytest.approx(tuple(rig.arm.forward(q)[[0, 2], 3]))
+
+
+def test_gaps_say_their_root_mean_squares() -> None:
+    assert "rms 1.58 mm over 2 fitted poses, 2.00 mm over 1 held out" in (
+        HAND_EYE_FIGURES["gaps"].alt
+    )

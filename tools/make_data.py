@@ -5,16 +5,21 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 
 import cv2
 import numpy as np
 
 import coursekit as ck
+from coursekit.arm import ArmErrors
 from coursekit.boards import Board
-from coursekit.cameras.capture import SESSION, session_card, write_whole
+from coursekit.boards.folder import SESSION
+from coursekit.cameras.capture import session_card
 from coursekit.cameras.simulated import SimulatedCamera
+from coursekit.hand_eye.poses import Mount
 from coursekit.intrinsics.power import STORED, power
-from coursekit.results import write_json
+from coursekit.results import write_bytes, write_json
+from coursekit.simulation.hand_eye_sessions import SIMULATED, rendered_session
 from coursekit.simulation.sessions import Effects, view_poses
 from coursekit.specifications import DATA
 
@@ -26,6 +31,16 @@ FEWEST_CORNERS, BORDER_PX = 22, 15.0
 ORIGIN = (
     "Rendered by tools/make_data.py: the colour camera of the simulated camera of this device and "
     "seed looks at the board from random places, as a hand would hold it. No real camera took it."
+)
+
+# The seed, which names the arm too (one arm carries both), and whose lens.
+HAND_EYE: dict[Mount, tuple[int, str]] = {"eye_in_hand": (1, "D405"), "eye_to_hand": (1, "D435")}
+HAND_EYE_VIEWS = 20
+HAND_EYE_ORIGIN = (
+    "Rendered by tools/make_data.py: a WidowX AI with hidden errors, its seed as given, stops at "
+    "each pose; the lens is this device's colour camera, and the intrinsics given are the true "
+    "ones. The table behind a board in the gripper goes along with it. No real arm or camera took "
+    "it. Where the camera really is, coursekit.simulation.hand_eye_sessions.truth_of tells."
 )
 
 
@@ -42,9 +57,9 @@ def intrinsics_session() -> None:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     for number, image in enumerate(session_views()):
-        write_whole(folder / f"view_{number:02d}.jpg", image)
+        write_bytes(folder / f"view_{number:02d}.jpg", image)
     card = session_card(SimulatedCamera(seed=SEED), BOARD) | {"seed": SEED, "origin": ORIGIN}
-    write_whole(folder / SESSION, (json.dumps(card, indent=1) + "\n").encode())
+    write_bytes(folder / SESSION, (json.dumps(card, indent=1) + "\n").encode())
 
 
 def session_views() -> Iterator[bytes]:
@@ -68,9 +83,9 @@ def _is_fair(T_camera_board: np.ndarray, lens: ck.geometry.Intrinsics) -> bool:
     return bool(near and np.sum(room > BORDER_PX) >= FEWEST_CORNERS)
 
 
-def _jpeg(image: np.ndarray) -> bytes:
+def _jpeg(image: np.ndarray, quality: int = 95) -> bytes:
     # Optimised and progressive: the same pixels in a tenth less space.
-    options = [cv2.IMWRITE_JPEG_QUALITY, 95]
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality]
     options += [cv2.IMWRITE_JPEG_OPTIMIZE, 1, cv2.IMWRITE_JPEG_PROGRESSIVE, 1]
     return cv2.imencode(".jpg", image, options)[1].tobytes()
 
@@ -98,12 +113,33 @@ def diagnosis_power() -> None:
     write_json(STORED, {"origin": origin, "causes": causes})
 
 
+def hand_eye_sessions() -> None:
+    """data/hand_eye_in_hand/, data/hand_eye_to_hand/: the sessions of notebook 04, without X."""
+    for mount, (seed, device) in HAND_EYE.items():
+        folder = DATA / f"hand_{mount}"
+        shutil.rmtree(folder, ignore_errors=True)
+        session, _, images = rendered_session(mount, seed, HAND_EYE_VIEWS, ArmErrors())
+        files = {
+            f"{name}.jpg": _jpeg(image, 92)
+            for name, image in zip(session.names, images, strict=True)
+        }
+        about = {
+            "camera": f"Simulated {device}",
+            "source": SIMULATED,
+            "seed": seed,
+            "views": HAND_EYE_VIEWS,
+            "origin": HAND_EYE_ORIGIN,
+        }
+        replace(session, names=tuple(files)).save(folder, files, about)
+
+
 if __name__ == "__main__":
     ck.cameras.conventions.store()
     readme_picture()
     intrinsics_session()
     diagnosis_power()
+    hand_eye_sessions()
     print(
         "data/vendor_models.json, data/readme.png, data/intrinsics_session/, "
-        "data/diagnosis_power.json"
+        "data/diagnosis_power.json, data/hand_eye_in_hand/, data/hand_eye_to_hand/"
     )

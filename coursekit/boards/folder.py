@@ -19,7 +19,7 @@ from coursekit.boards.detection import BoardNotFound, Detection, Detections, Ski
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-NOT_IMAGES = ("session.json",)  # written beside the images by the course itself
+SESSION = "session.json"  # written beside the images by the course itself
 
 
 def detect_all(
@@ -64,7 +64,7 @@ def _sources(images: Any) -> list[tuple[str, Any]]:
         if not folder.is_dir():
             raise ValueError(f"images: got {os.fspath(images)!r}, want a folder that exists")
         files = [path for path in folder.iterdir() if path.is_file()]
-        files = [p for p in files if p.name not in NOT_IMAGES and not p.name.startswith(".")]
+        files = [p for p in files if p.name != SESSION and not p.name.startswith(".")]
         if not files:
             raise ValueError(f"images: {os.fspath(images)!r} holds no files")
         return [(path.name, path) for path in sorted(files, key=_natural)]

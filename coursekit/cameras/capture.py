@@ -19,6 +19,7 @@ from coursekit import results
 from coursekit.boards import Board, BoardNotFound, Detection, Detections, Skipped, detect
 from coursekit.boards.detect import FEWEST_CORNERS
 from coursekit.boards.find import find
+from coursekit.boards.folder import SESSION
 from coursekit.cameras.camera import Camera, CameraError, check_count
 from coursekit.cameras.guidance import guidance, middle_of
 from coursekit.cameras.live_view import Screen, screen_for
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
     Shot = tuple[NDArray[np.uint8], Detection]
 
-FOLDER, SESSION = "03_views", "session.json"
+FOLDER = "03_views"
 STILL_FRAMES = 5  # over so many frames in a row ...
 STILL_SIGMAS = 5.0  # ... the corners moved less than so many times what noise alone makes of them
 STILL_LEAST_PX = 0.3  # nobody's hand is steadier
@@ -332,9 +333,9 @@ class Album:
     def add(self, image: NDArray[np.uint8], detection: Detection) -> None:
         """Save an image (H, W) under the next name; a reader sees all of it or nothing."""
         if self._next == 0:
-            write_whole(self.folder / SESSION, json.dumps(self._session, indent=1).encode())
+            results.write_bytes(self.folder / SESSION, json.dumps(self._session, indent=1).encode())
         path = self.folder / f"view_{self._next:03d}.png"
-        write_whole(path, cv2.imencode(".png", image)[1].tobytes())
+        results.write_bytes(path, cv2.imencode(".png", image)[1].tobytes())
         self._next += 1
         self.views.append(replace(detection, name=path.name))
 
@@ -348,13 +349,3 @@ def session_card(camera: Camera, board: Board) -> dict[str, object]:
         "size": list(camera.color.size) if camera.color else None,
         "board": asdict(board) | {"squares": list(board.squares)},
     }
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file in one step: under another name first, which is then changed."""
-    part = path.with_name(f".{path.name}.part")
-    try:
-        part.write_bytes(content)
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)

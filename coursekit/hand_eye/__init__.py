@@ -17,11 +17,13 @@ from coursekit.hand_eye.closed_form import (
     rotation_half,
     translation_half,
 )
+from coursekit.hand_eye.diagnose import diagnose
 from coursekit.hand_eye.judge import HeldOut, held_out
 from coursekit.hand_eye.next_pose import NextPose, candidate_joints, next_pose
 from coursekit.hand_eye.observability import Observability, observability
 from coursekit.hand_eye.poses import MOUNTS
 from coursekit.hand_eye.result import HandEyeResult
+from coursekit.hand_eye.session import HandEyeSession
 from coursekit.hand_eye.solve import METHODS, solve
 from coursekit.hand_eye.study import StudyPoint, error_study
 
@@ -31,6 +33,7 @@ __all__ = [
     "MOUNTS",
     "BoardPose",
     "HandEyeResult",
+    "HandEyeSession",
     "HeldOut",
     "NextPose",
     "NotDetermined",
@@ -40,6 +43,7 @@ __all__ = [
     "board_pose",
     "board_poses",
     "candidate_joints",
+    "diagnose",
     "error_study",
     "held_out",
     "motions",

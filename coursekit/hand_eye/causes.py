@@ -36,14 +36,17 @@ if TYPE_CHECKING:
 SCALE, LATE, SLIP, OUTLIER, OFFSET = (
     "wrong_square_size", "late_time_stamps", "slipping_board", "outlier_pose", "arm_error",
 )  # fmt: skip
+SMOOTH = (SCALE, LATE, OFFSET)  # one number that acts on all pairs
 # At most 2 % of healthy sessions may get a finding, and five kinds of test at this level make
 # 0.05 %; the rest is for arms whose errors are not quite normal.
 LEVEL = 1e-4
 # What careful people have, and no finding: squares measured with a ruler, a driver's own delay, a
 # board that settles, a pose in which the arm still swings, a zero that a jig sets.
-NORMAL = {SCALE: 0.01, LATE: 5e-3, SLIP: 1e-3, OUTLIER: 5e-3, OFFSET: np.radians(0.6)}
-NORMAL_TURN_RAD = {SLIP: np.radians(0.3), OUTLIER: np.radians(1.0)}
-ROUGH = 3.0  # times as much, where no image says how well it knows its board pose
+NORMAL = {SCALE: 0.01, LATE: 5e-3, SLIP: 2e-3, OUTLIER: 5e-3, OFFSET: np.radians(0.6)}
+NORMAL_TURN_RAD = {SLIP: np.radians(0.5), OUTLIER: np.radians(1.0)}
+# Times as much, where no image says how well it knows its board pose, or no joint angles what the
+# arm may be wrong by: some pose of a healthy one is off by four times the typical error.
+ROUGH = 3.0
 # Times the typical residual, where no joint angles say which errors poses share: those of the arm
 # then look like a slip of their own size.
 SLIP_OVER_USUAL, OUTLIER_OVER_USUAL = 2.5, 4.0
@@ -117,6 +120,7 @@ class Search:
     delay_s: float = 0.0
     offsets: Floats = field(default_factory=lambda: np.zeros(6))
     accepted: list[Accepted] = field(default_factory=list)
+    refused: set[tuple[str, int]] = field(default_factory=set)
 
 
 def search(pairs: Pairs, arms: Arms, fit: Fit) -> Search:
@@ -128,17 +132,19 @@ def search(pairs: Pairs, arms: Arms, fit: Fit) -> Search:
         best = min(_significant(state), key=lambda test: test.log_p, default=None)
         if best is None:
             break
-        _accept(state, best)
+        after = _with(state, best)
+        if best.cause in SMOOTH and after.fit.better_than(state.fit) <= 1.0:
+            state.refused.add((best.cause, best.at))  # linear, it fitted; in full it does not
+        else:
+            state = after
     return state
 
 
 def _significant(state: Search) -> Iterator[Tested]:
-    done = {accepted.test.cause for accepted in state.accepted}
-    odd = sum(accepted.test.cause == OUTLIER for accepted in state.accepted)
-    for test in _tests(state):
+    done = {(one.test.cause, one.test.at) for one in state.accepted if one.test.cause in SMOOTH}
+    odd = sum(one.test.cause == OUTLIER for one in state.accepted)
+    for test in _tests(state, without=done | state.refused):
         if test.log_p > np.log(LEVEL) or not _matters(state, test):
-            continue
-        if test.cause in (SCALE, LATE) and test.cause in done:
             continue
         if test.cause == OUTLIER and odd >= (len(state.fit.pairs) + odd) // 4:
             continue
@@ -159,7 +165,8 @@ def _matters(state: Search, test: Tested) -> bool:
 
 def _least(state: Search, cause: str) -> tuple[float, float]:
     """The smallest turn (rad) and shift (m) of a slip or an odd pose that matters."""
-    rough = 1.0 if state.fit.pairs.image.any() else ROUGH
+    known = state.fit.pairs.image.any() and state.arms.q is not None
+    rough = 1.0 if known else ROUGH
     turn, shift = rough * NORMAL_TURN_RAD[cause], rough * NORMAL[cause]
     if state.arms.q is None:
         usual = SLIP_OVER_USUAL if cause == SLIP else OUTLIER_OVER_USUAL
@@ -171,15 +178,21 @@ def _least(state: Search, cause: str) -> tuple[float, float]:
 # --- the tests ---
 
 
-def _tests(state: Search) -> list[Tested]:
-    """All suspected causes, each with its most likely size of the arm's errors."""
+def _tests(state: Search, without: set[tuple[str, int]]) -> list[Tested]:
+    """All suspected causes, each with its most likely size of the arm's errors.
+
+    without: those that were accepted or refused. Smooth ones that were accepted are fitted along.
+    """
     fit = state.fit
-    suspects = list(_suspects(state))
+    every = list(_suspects(state))
+    accepted = {(one.test.cause, one.test.at) for one in state.accepted}
+    along = [block for cause, at, _, block in every if cause in SMOOTH and (cause, at) in accepted]
+    suspects = [suspect for suspect in every if suspect[:2] not in without]
     best = np.full(len(suspects), np.inf)
     found: list[tuple[Floats, Floats]] = [(np.zeros(0), np.zeros(0))] * len(suspects)
     plain = np.inf
     residuals = fit.twists.ravel()
-    columns = fit.columns.reshape(len(residuals), -1)
+    columns = np.hstack([fit.columns.reshape(len(residuals), -1), *along])
     for covariance in _covariances(state):
         information, log_det = _inverse(covariance)
         weighted = information @ columns
@@ -191,8 +204,10 @@ def _tests(state: Search) -> list[Tested]:
         for number, (_, _, rows, block) in enumerate(suspects):
             inner = block.T @ P[np.ix_(rows, rows)] @ block
             right = block.T @ seen[rows]
-            inverse = np.linalg.pinv(inner, rcond=1e-9, hermitian=True)
-            size = inverse @ right
+            inverse: Floats = np.asarray(
+                np.linalg.pinv(inner, rcond=1e-9, hermitian=True), np.float64
+            )
+            size: Floats = np.asarray(inverse @ right, np.float64)
             now = deviance - float(right @ size)
             if now < best[number]:
                 best[number], found[number] = now, (size, inverse)
@@ -237,7 +252,7 @@ def _covariances(state: Search) -> Iterator[Floats]:
         shared = by_arm @ errors.shared * errors.sigma
         shared = shared.reshape(6 * n, -1)
         arm = shared @ shared.T + _diagonal(by_arm @ errors.each @ np.swapaxes(by_arm, 1, 2))
-        factors = FACTORS
+        factors: tuple[float, ...] = FACTORS
     else:
         turn = max(state.fit.turn_rad / MEDIAN_3D, LEAST_RAD)
         shift = max(state.fit.shift_m / MEDIAN_3D, LEAST_M)
@@ -296,36 +311,39 @@ def _suspects(state: Search) -> Iterator[tuple[str, int, NDArray[np.intp], Float
 # --- taking a cause in ---
 
 
-def _accept(state: Search, test: Tested) -> None:
-    """Put the data right, fit again, and note the fits before and after."""
+def _with(state: Search, test: Tested) -> Search:
+    """The search with the data put right for a cause, and fitted again."""
     before, pairs = state.fit, state.fit.pairs
     view = int(pairs.view[test.at]) if test.cause in (SLIP, OUTLIER) else test.at
-    X, Y = before.X, before.Y
+    size = float(test.size[0])
+    new, start = replace(state), None
     if test.cause == SCALE:
-        state.scale *= 1.0 + float(test.size[0])
-        pairs = pairs.scaled(1.0 + float(test.size[0]))
+        new.scale = state.scale * (1.0 + size)
+        pairs = pairs.scaled(1.0 + size)
     elif test.cause == OUTLIER:
         pairs = pairs.keep(np.arange(len(pairs)) != test.at)
     elif test.cause == SLIP:
         segment = pairs.segment.copy()
-        mine = segment == segment[test.at]
-        segment[mine & (np.arange(len(pairs)) >= test.at)] = len(Y)
-        Y = np.concatenate([Y, turned(Y[pairs.segment[test.at]], test.size)[None]])
+        moved = turned(before.Y[segment[test.at]], test.size)
+        segment[(segment == segment[test.at]) & (np.arange(len(pairs)) >= test.at)] = len(before.Y)
+        start = (before.X, np.concatenate([before.Y, moved[None]]))
         pairs = replace(pairs, segment=segment)
     elif test.cause == LATE:
         assert state.arms.velocity is not None
-        state.delay_s += float(test.size[0])
-        velocity = state.arms.velocity[pairs.row]
-        pairs = replace(pairs, T_base_gripper=turned(
-            pairs.T_base_gripper, -float(test.size[0]) * velocity))  # fmt: skip
+        new.delay_s = state.delay_s + size
+        pairs = _moved(pairs, -size * state.arms.velocity[pairs.row])
     else:
+        change = size * np.eye(6)[test.at]
         assert state.arms.arm is not None
         assert state.arms.q is not None
-        change = np.zeros(6)
-        change[test.at] = float(test.size[0])
-        rates = state.arms.arm.jacobian(state.arms.q[pairs.row] + state.offsets)
-        state.offsets = state.offsets + change
-        pairs = replace(pairs, T_base_gripper=turned(pairs.T_base_gripper, rates @ change))
-    start = (X, Y) if test.cause == SLIP else None
-    state.fit = robust_fit(pairs, start)
-    state.accepted.append(Accepted(test, view, before, state.fit))
+        q = state.arms.q[pairs.row] + state.offsets
+        new.offsets = state.offsets + change
+        pairs = _moved(pairs, state.arms.arm.jacobian(q) @ change)
+    new.fit = robust_fit(pairs, start)
+    new.accepted = [*state.accepted, Accepted(test, view, before, new.fit)]
+    return new
+
+
+def _moved(pairs: Pairs, twists: Floats) -> Pairs:
+    """The pairs with their arm poses moved by twists (n, 6)."""
+    return replace(pairs, T_base_gripper=turned(pairs.T_base_gripper, twists))

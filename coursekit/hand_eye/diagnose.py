@@ -15,10 +15,9 @@ import numpy as np
 from coursekit.arm import widowx
 from coursekit.boards import Detections
 from coursekit.findings import Finding, Findings
-from coursekit.hand_eye import causes, misread
-from coursekit.hand_eye.causes import Accepted, Arms, Search
+from coursekit.hand_eye import causes, misread, mistakes
+from coursekit.hand_eye.causes import Arms
 from coursekit.hand_eye.closed_form import FEWEST
-from coursekit.hand_eye.misread import Reading
 from coursekit.hand_eye.pairs import Fit, Pairs, robust_fit
 from coursekit.hand_eye.poses import camera_board, mean_pose
 from coursekit.hand_eye.session import HandEyeSession
@@ -39,11 +38,13 @@ NEAR = 2e-3  # nor do either stay within 2 mm: metres had been divided by 1,000
 STILL_DEG, SMALL_DEG, SINGLE_DEG = 0.5, 6.0, 4.0
 AS_COMPUTED_M = 1e-3  # a pose is that of the joint angles given with it, within rounding
 POOR_RAD, POOR_M = np.radians(2.0), 0.02  # residuals that no working arm has
+HOPELESS_RAD = np.radians(10.0)  # beyond any slip, delay or wrong zero
 STEP_M, STEP_RAD = 0.1, np.radians(20.0)  # between images, for velocities from positions
 
 LOOKED_FOR = (
     "millimetres for metres", "degrees for radians",
-    "poses that do not turn, or about one axis, or by a few degrees", "images with the arm pose of another image",
+    "poses that do not turn, or about one axis, or by a few degrees",
+    "images with the arm pose of another image",
     "inverted arm poses, inverted detections or another mount", "late time stamps",
     "a board that slipped", "single poses that are off", "a wrong square size",
     "a joint whose zero is off",
@@ -143,17 +144,16 @@ class _Case:
             ("arm", "the gripper is", "T_base_gripper"),
             ("camera", "the board is seen", "T_camera_board"),
         ):
-            T = getattr(self.pairs, name).copy()
-            far = float(np.median(np.linalg.norm(T[:, :3, 3], axis=1)))
+            far = float(np.median(np.linalg.norm(getattr(self.pairs, name)[:, :3, 3], axis=1)))
             factor = 1e-3 if far > FAR else 1e3 if far < NEAR else 1.0
             if factor != 1.0:
-                T[:, :3, 3] *= factor
-                self.pairs = replace(self.pairs, **{name: T})
+                arm = side == "arm"
+                self.pairs = self.pairs.arm_scaled(factor) if arm else self.pairs.scaled(factor)
                 sides.append(side)
                 evidence.append(f"typically {what} {far:.4g} m away")
         if sides:
             after = robust_fit(self.pairs)
-            self.found.append(_millimetres(sides, "; ".join(evidence), given, after))
+            self.found.append(mistakes.millimetres(sides, "; ".join(evidence), given, after))
 
     def joints_in_degrees(self) -> None:
         """Degrees in q, by size alone; and the arm poses that were computed from them."""
@@ -166,7 +166,7 @@ class _Case:
         if np.abs(computed - self.pairs.T_base_gripper).max() < AS_COMPUTED_M:
             self.pairs = replace(self.pairs, T_base_gripper=self.arm.forward(self.q))
             suspected = robust_fit(self.pairs)
-        self.found.append(_degrees(
+        self.found.append(mistakes.degrees(
             f"joint angles up to {largest:.0f}, where no joint turns by more than {2 * np.pi:.1f}",
             given, suspected,
         ))  # fmt: skip
@@ -180,11 +180,11 @@ class _Case:
         if seen[0] > SMALL_DEG and seen[0] > 5 * turns[0]:
             return False  # the camera saw larger turns than the arm tells of: a matter of units
         if turns[0] < STILL_DEG:
-            self.found.append(_pure_translation(largest))
+            self.found.append(mistakes.pure_translation(largest))
         elif turns[0] < SMALL_DEG:
-            self.found.append(_small_rotations(turns, largest))
+            self.found.append(mistakes.small_rotations(turns, largest))
         elif turns[1] < SINGLE_DEG:
-            self.found.append(_single_axis(turns, axis))
+            self.found.append(mistakes.single_axis(turns, axis))
         else:
             return False
         return True
@@ -194,24 +194,29 @@ class _Case:
     def readings(self) -> None:
         """Another pairing, convention or unit of angles with which arm and camera agree."""
         given = robust_fit(self.pairs)
-        better = misread.better_readings(given, misread.other_pairing(self.pairs))
+        other = misread.other_pairing(self.pairs)
+        better = misread.better_readings(given, other, misread.MENDED)
         if better and better[0].name.startswith("off_by_one"):
-            self.found.append(_off_by_one(better[0], given))
+            self.found.append(mistakes.off_by_one(better[0], given))
             self.pairs = better[0].fit.pairs
         elif better:
             options = misread.candidates(better[0].fit, *self._view())
+            self.pairs = better[0].fit.pairs
             if self._computed_from_joints():
                 against = (*options[0].against, "the arm poses are those of the joint angles")
                 options[0] = replace(options[0], against=against)
-            self.found.append(_inconsistent(options, given, better[0].fit))
-            self.pairs = better[0].fit.pairs
+                # The same equation, with arm poses that still belong to their joint angles.
+                self.pairs = replace(
+                    self.pairs, T_base_gripper=given.pairs.T_base_gripper, mount=_other(given)
+                )
+            self.found.append(mistakes.inconsistent(options, given, better[0].fit))
         elif given.turn_rad > POOR_RAD:
             self._rotations(given)
         elif given.shift_m < POOR_M:
             asked, *others = misread.declared(given, *self._view())
             others = [other for other in others if not other.against]
             if asked.against and others:
-                self.found.append(_exchanged(asked, others))
+                self.found.append(mistakes.exchanged(asked, others))
 
     def _view(self) -> tuple[Floats, Floats | None, bool]:
         """The board's middle, half the field of view as tangents, whether images were given."""
@@ -223,9 +228,10 @@ class _Case:
         return middle, limit, self.session.detections is not None
 
     def _computed_from_joints(self) -> bool:
+        """Whether the session's arm poses are those of its joint angles."""
         if self.q is None:
             return False
-        off = self.arm.forward(self.q) - self.pairs.T_base_gripper
+        off = self.arm.forward(self.q) - self.session.T_base_gripper
         return bool(np.abs(off).max() < AS_COMPUTED_M)
 
     def _rotations(self, given: Fit) -> None:
@@ -238,17 +244,21 @@ class _Case:
             if not places.agree:
                 continue
             fit = robust_fit(pairs)
-            better = misread.better_readings(fit, misread.other_rotations(pairs))
+            other = misread.other_rotations(pairs)
+            better = misread.better_readings(fit, other, misread.KEPT)
             reading = better[0] if better else misread.undo_degrees(fit, places.expected)
             if reading is None:
                 continue
-            self.found.append(_rotations(side, places, fit, reading))
-            name = "T_base_gripper" if side == "arm" else "T_camera_board"
+            self.found.append(mistakes.rotations(side, places, fit, reading))
             mended = reading.fit.pairs.T_base_gripper
-            self.pairs = replace(self.pairs, **{name: mended})
+            if side == "arm":
+                self.pairs = replace(self.pairs, T_base_gripper=mended)
+            else:
+                self.pairs = replace(self.pairs, T_camera_board=mended)
             return
-        self.hopeless = True
-        self.found.append(_nothing_fits(given))
+        if given.turn_rad > HOPELESS_RAD:
+            self.hopeless = True
+            self.found.append(mistakes.nothing_fits(given))
 
     # --- residuals ---
 
@@ -275,7 +285,7 @@ class _Case:
         velocity = self._velocity(q)
         arms = Arms(self.arm, self.errors, q, velocity)
         state = causes.search(self.pairs, arms, robust_fit(self.pairs))
-        self.found += _from_residuals(state, self.session)
+        self.found += mistakes.from_residuals(state, self.session)
         unseen = [MOTION_UNSEEN] if velocity is None else []
         return self.findings(*unseen, *([JOINTS_UNSEEN] if q is None else []))
 
@@ -294,6 +304,10 @@ class _Case:
         if self.session.times is None:
             return None
         return _by_differences(self.session.T_base_gripper, self.session.times)
+
+
+def _other(fit: Fit) -> Mount:
+    return "eye_to_hand" if fit.pairs.mount == "eye_in_hand" else "eye_in_hand"
 
 
 def _by_differences(T: Floats, times: Floats) -> Floats | None:
@@ -321,240 +335,3 @@ def _turns(T: Floats) -> tuple[Floats, Floats, float]:
     cosine = (np.einsum("nij,nij->n", T[i, :3, :3], T[j, :3, :3]).min() - 1) / 2
     axis = mean_pose(T)[:3, :3] @ axes[0]
     return values / np.sqrt(len(T)), axis, float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-
-
-# --- in words ---
-
-
-def _change(given: Fit, suspected: Fit) -> str:
-    """The typical disagreement of arm and camera, before and after."""
-    return f"arm and camera disagree by {given.says()} as given, by {suspected.says()} as suspected"
-
-
-def _millimetres(sides: list[str], evidence: str, given: Fit, suspected: Fit) -> Finding:
-    whose = " and ".join(f"the {side}'s" for side in sides)
-    return Finding(
-        "millimetres",
-        f"{_first_upper(whose)} translations are off by a factor of 1,000: metres are wanted, and "
-        "millimetres were given (or metres divided once too often).",
-        f"{evidence}. {_sentence(_change(given, suspected))}",
-        f"Convert {whose} translations where they come in (for the board: give square_m in "
-        "metres), and keep metres inside the program.",
-    )
-
-
-def _degrees(evidence: str, given: Fit, suspected: Fit, reading: str = "") -> Finding:
-    how = f" (suspected: {reading})" if reading else ""
-    return Finding(
-        "degrees",
-        "Angles are in one unit and were taken as the other: degrees and radians.",
-        f"{evidence}. {_first_upper(_change(given, suspected))}{how}",
-        "Look in the driver's manual which unit it gives and convert where the number comes in: "
-        "np.radians(angle), or Rotation.from_euler(..., degrees=True).",
-    )
-
-
-def _pure_translation(largest: float) -> Finding:
-    return Finding(
-        "pure_translation",
-        "The gripper never turns: with R_A = 1 the mount's translation drops out of the equation.",
-        f"the largest turn between two poses is {largest:.2f} deg; t_X is free in all directions, "
-        "whatever the number of poses (the shifts do determine R_X)",
-        "Turn the wrist by 30 deg or more to either side about two axes; 15 such poses are enough.",
-    )
-
-
-def _small_rotations(turns: Floats, largest: float) -> Finding:
-    return Finding(
-        "small_rotations",
-        "The gripper turns so little that noise decides where the camera is.",
-        f"turned by {turns[0]:.1f}, {turns[1]:.1f} and {turns[2]:.1f} deg (rms) about three axes, "
-        f"at most {largest:.0f} deg between two poses",
-        "Turn the wrist by 30 deg or more to either side about two axes: the error of t_X goes "
-        "with one over the angle.",
-    )
-
-
-def _single_axis(turns: Floats, axis: Floats) -> Finding:
-    axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
-    text = "({:.2f}, {:.2f}, {:.2f})".format(*(axis + 0.0))
-    return Finding(
-        "single_axis",
-        "All poses turn about one axis: rotation about it and translation along it are free.",
-        f"turned by {turns[0]:.1f} deg (rms) about {text} in the base, by {turns[1]:.1f} deg about "
-        "any other axis",
-        "Turn the wrist about a second axis across this one, by 30 deg or more to either side.",
-    )
-
-
-def _off_by_one(best: Reading, given: Fit) -> Finding:
-    return Finding(
-        "off_by_one",
-        f"Arm poses and images are paired wrongly: each image belongs to {best.says}.",
-        _change(given, best.fit),
-        "Store pose and image together when they are taken, under one number. In these data shift "
-        "one list against the other, and drop what is left over at the ends; look for an image "
-        "that was skipped.",
-    )
-
-
-def _inconsistent(options: list[misread.Candidate], given: Fit, suspected: Fit) -> Finding:
-    left = [option for option in options if not option.against]
-    if len(left) == 1:
-        choice = f"Only one is plausible: {left[0].name}."
-    elif left:
-        names = " or ".join(option.name for option in left)
-        choice = f"Plausible: {names}; as the mount is declared, the first."
-        if left[0].mount == options[0].mount == left[-1].mount:
-            choice = f"The data do not decide between {names}."
-    else:
-        choice = "None of them looks plausible; look at the units and at the frames."
-    return Finding(
-        "inconsistent_convention",
-        "Arm poses, board poses or the mount are the other way round: one of three mistakes that "
-        "obey the same equation.",
-        f"{_change(given, suspected)}. Candidates: "
-        + "; ".join(f"({n}) {option.says()}" for n, option in enumerate(options, 1))
-        + f". {choice}",
-        "T_base_gripper takes gripper coordinates to base coordinates: its translation is where "
-        "the gripper is in the base. T_camera_board's translation has a positive z, the distance. "
-        "Check both on one pose, and the mount.",
-    )
-
-
-def _rotations(side: str, places: misread.Places, given: Fit, reading: Reading) -> Finding:
-    evidence = (
-        f"the {side}'s positions agree with the other side (within {1e3 * places.gap_m:.1f} mm), "
-        "its rotations do not"
-    )
-    if reading.name == "degrees":
-        return _degrees(evidence, given, reading.fit, reading.says)
-    return Finding(
-        "inconsistent_convention",
-        f"The {side}'s rotations follow another convention than they are read by.",
-        f"{evidence}. {_sentence(_change(given, reading.fit))} Suspected: {reading.says}",
-        "Look in the driver's manual for the order of the quaternion or of the Euler angles, and "
-        "check one pose with your eyes: where does the gripper's x axis point?",
-    )
-
-
-def _exchanged(asked: misread.Candidate, others: list[misread.Candidate]) -> Finding:
-    listed = "; ".join(f"({n}) {option.says()}" for n, option in enumerate(others, 1))
-    return Finding(
-        "inconsistent_convention",
-        "Arm and camera agree, but on a camera that cannot be where this says: two things are the "
-        "other way round, and cancel in the equation.",
-        f"{asked.says()}. Candidates: {listed}",
-        "T_base_gripper takes gripper coordinates to base coordinates: its translation is where "
-        "the gripper is in the base. T_camera_board's translation has a positive z, the distance. "
-        "Check both on one pose, and the mount.",
-    )
-
-
-def _nothing_fits(given: Fit) -> Finding:
-    return Finding(
-        "inconsistent_convention",
-        "Arm and camera contradict each other, and no reading that was tried makes them agree.",
-        f"with the best X they disagree by {given.says()} in a typical pose; tried: pairs shifted "
-        "by one or two, either side inverted, degrees, orders of quaternions and of Euler angles",
-        "Check that pose and image belong together (sorted by name or by number?), that the board "
-        "and the camera are the right ones, and what frames and units the driver gives.",
-    )
-
-
-def _sentence(text: str) -> str:
-    return _first_upper(text) + "."
-
-
-def _first_upper(text: str) -> str:
-    return text[0].upper() + text[1:]
-
-
-def _from_residuals(state: Search, session: HandEyeSession) -> list[Finding]:
-    """The accepted causes as findings, outliers together in one."""
-    write = {causes.SCALE: _scale, causes.LATE: _late, causes.SLIP: _slip, causes.OFFSET: _offset}
-    found = []
-    odd = [one for one in state.accepted if one.test.cause == causes.OUTLIER]
-    for one in state.accepted:
-        if one.test.cause in write:
-            found.append(write[one.test.cause](one, state, session))
-        elif one is odd[0]:
-            found.append(_outliers(odd, session))
-    return found
-
-
-def _scale(one: Accepted, state: Search, session: HandEyeSession) -> Finding:
-    half = 1.96 * one.test.sigma
-    size = ""
-    if session.board is not None:
-        square = 1e3 * session.board.square_m
-        size = f": squares of {state.scale * square:.2f} mm, not {square:.2f} mm"
-    return Finding(
-        causes.SCALE,
-        "The board is not as large as it says, so the camera's distances are off by that factor.",
-        f"with the size left free the board is {state.scale:.4f} ± {half:.4f} (95 %) times as "
-        f"large{size}. {_sentence(_change(one.before, one.after))}",
-        "Measure ten squares of the print with a caliper and give their size to the board; print "
-        "at 100 %, not fitted to the page.",
-        one.test.p_value,
-    )
-
-
-def _late(one: Accepted, state: Search, session: HandEyeSession) -> Finding:
-    delay, half = 1e3 * state.delay_s, 1.96e3 * one.test.sigma
-    when = "after" if delay > 0 else "before"
-    return Finding(
-        causes.LATE,
-        f"The arm's poses were read {when} the images were taken, while the arm moved.",
-        f"{abs(delay):.0f} ± {half:.0f} ms (95 %) {when} the image. "
-        + _sentence(_change(one.before, one.after)),
-        "Let the arm stop before each image (half a second), or give pose and image the time "
-        "stamps of their own devices and interpolate the poses.",
-        one.test.p_value,
-    )
-
-
-def _slip(one: Accepted, state: Search, session: HandEyeSession) -> Finding:
-    turn, shift = np.linalg.norm(one.test.size[:3]), np.linalg.norm(one.test.size[3:])
-    return Finding(
-        causes.SLIP,
-        "The board (or the camera's mount) moved once during the session: before and after it are "
-        "two calibrations.",
-        f"from {session.names[one.view]} on the board is {1e3 * shift:.1f} mm and "
-        f"{np.degrees(turn):.2f} deg from where it was. "
-        + _sentence(_change(one.before, one.after)),
-        "Fasten board and camera and take the session again; or use only the longer part.",
-        one.test.p_value,
-    )
-
-
-def _offset(one: Accepted, state: Search, session: HandEyeSession) -> Finding:
-    joint = one.test.at
-    size, half = np.degrees(state.offsets[joint]), np.degrees(1.96 * one.test.sigma)
-    return Finding(
-        causes.OFFSET,
-        f"The zero of joint_{joint} is off, so the arm is not where its joint angles say.",
-        f"{size:+.2f} ± {half:.2f} deg (95 %) to be added to joint_{joint}. "
-        + _sentence(_change(one.before, one.after)),
-        "Set the joint's zero with the maker's jig; or estimate the offsets together with X "
-        "(solve(..., arm=..., q=...)) and use them wherever the arm's pose is computed.",
-        one.test.p_value,
-    )
-
-
-def _outliers(odd: list[Accepted], session: HandEyeSession) -> Finding:
-    names = []
-    for one in odd:
-        turn, shift = np.linalg.norm(one.test.size[:3]), np.linalg.norm(one.test.size[3:])
-        names.append(
-            f"{session.names[one.view]} ({1e3 * shift:.0f} mm, {np.degrees(turn):.1f} deg)"
-        )
-    return Finding(
-        causes.OUTLIER,
-        "One pair of arm pose and image or a few do not fit the others.",
-        f"{', '.join(names)} off where the other pairs put the board; those disagree by "
-        f"{odd[-1].after.says()}",
-        "Look at the image (blurred, board cut off, still swinging?) and at the row of the table; "
-        "leave the pair out, or take it again after the arm has stopped.",
-        odd[0].test.p_value,
-    )

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coursekit.geometry import invert_transform
-from coursekit.hand_eye.pairs import Fit, Pairs, robust_fit
+from coursekit.hand_eye.pairs import LEAST_M, Fit, Pairs, robust_fit
 from coursekit.hand_eye.poses import nearest_rotation
 
 if TYPE_CHECKING:
@@ -25,12 +25,13 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 PER_RADIAN = 180.0 / np.pi
+MENDED, KEPT = 0.5, 1.5  # most displacement left over: of pairs put right, of rotations alone
 GOLD = 4.0  # times smaller residuals: by chance a wrong reading is better by 1.5 at most
 PLACES_AGREE = 0.15  # of the positions' spread; in degrees taken as radians positions stay true
-LIKE_CHANCE = np.radians(75.0)  # median angle of a decoding; random rotations are 130 deg apart
-CLOSE = np.radians(80.0)  # noise in degrees taken as radians grows 57-fold
+LIKE_CHANCE = np.radians(80.0)  # median angle of a decoding; random rotations are 130 deg apart
+CLOSE = np.radians(85.0)  # noise in degrees taken as radians grows 57-fold
 WITNESSES = 6  # poses that a candidate must pass before all of them are asked
-FIRST_TRIES = 5  # poses that candidates are taken from
+FIRST_TRIES = 8  # poses that candidates are taken from
 EULER = ("xyz", "XYZ")  # about fixed axes (roll, pitch, yaw), and about the body's own
 
 
@@ -43,10 +44,20 @@ class Reading:
     fit: Fit
 
 
-def better_readings(given: Fit, readings: Iterator[tuple[str, str, Pairs]]) -> list[Reading]:
-    """The readings that make residuals GOLD times smaller, the best first."""
+def better_readings(
+    given: Fit, readings: Iterator[tuple[str, str, Pairs]], most_shift: float
+) -> list[Reading]:
+    """The readings that make residuals GOLD times smaller, the best first.
+
+    most_shift: how large the displacements left over may be, in units of those as given; a wrong
+    reading may mend the rotations alone.
+    """
     fits = [Reading(name, says, robust_fit(pairs)) for name, says, pairs in readings]
-    good = [reading for reading in fits if reading.fit.better_than(given) > GOLD]
+    good = [
+        reading for reading in fits
+        if reading.fit.better_than(given) > GOLD
+        and reading.fit.shift_m < most_shift * given.shift_m + LEAST_M
+    ]  # fmt: skip
     return sorted(good, key=lambda reading: -reading.fit.better_than(given))
 
 
@@ -160,10 +171,19 @@ def undo_degrees(given: Fit, expected: Floats) -> Reading | None:
         if R is None:
             continue
         fit = robust_fit(with_rotations(given.pairs, R))
+        # `expected` leans on positions alone; with X and Y a pose's neighbours are told apart
+        R = _nearest(given.pairs.T_base_gripper[:, :3, :3], _arm_rotations(fit), kind)
+        fit = robust_fit(with_rotations(given.pairs, R))
         if fit.better_than(given) > GOLD:
             what = kind if kind not in EULER else f"Euler angles ({kind})"
             return Reading("degrees", f"the {what} read as degrees", fit)
     return None
+
+
+def _arm_rotations(fit: Fit) -> Floats:
+    """The arm's rotations (n, 3, 3) that the camera, X and Y imply."""
+    M = fit.X @ fit.pairs.T_camera_board @ invert_transform(fit.Y[0])
+    return (M if fit.pairs.mount == "eye_to_hand" else invert_transform(M))[:, :3, :3]
 
 
 def _decoded(given: Floats, expected: Floats, kind: str) -> Rotation | None:

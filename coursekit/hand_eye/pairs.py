@@ -76,6 +76,12 @@ class Pairs:
         image[:, :, 3:] *= factor
         return replace(self, T_camera_board=T, image=image)
 
+    def arm_scaled(self, factor: float) -> Pairs:
+        """With the arm's translations times `factor`."""
+        T = self.T_base_gripper.copy()
+        T[:, :3, 3] *= factor
+        return replace(self, T_base_gripper=T)
+
     def exchanged(self) -> Pairs:
         """Camera and arm with their parts exchanged, as eye-to-hand: C Y^-1 = X^-1 M."""
         M = carrier_stand(self.T_base_gripper, self.mount)
@@ -144,7 +150,7 @@ def robust_fit(pairs: Pairs, start: tuple[Floats, Floats] | None = None) -> Fit:
     fit = _at(pairs, X, Y)
     for _ in range(STEPS):
         rows, right = _weighted(fit)
-        step = np.linalg.lstsq(rows, right, rcond=1e-10)[0]
+        step: Floats = np.asarray(np.linalg.lstsq(rows, right, rcond=1e-10)[0], np.float64)
         X, Y = turned(fit.X, step[:6]), turned(fit.Y, step[6:].reshape(-1, 6))
         fit = _at(pairs, X, Y)
         if np.abs(step).max() < ARRIVED:

@@ -26,13 +26,14 @@ import numpy as np
 
 from coursekit.boards import Board, Detections, detect_all
 from coursekit.boards.detection import Skipped
-from coursekit.cameras.capture import SESSION, write_whole
+from coursekit.boards.folder import SESSION
 from coursekit.geometry import Intrinsics, make_transform
 from coursekit.hand_eye.board_pose import BoardPose, board_poses
 from coursekit.hand_eye.closed_form import FEWEST
 from coursekit.hand_eye.poses import Mount, check_mount, check_poses
 from coursekit.hand_eye.result import HandEyeResult
 from coursekit.hand_eye.solve import solve
+from coursekit.results import write_bytes
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -121,7 +122,7 @@ class HandEyeSession:
     def pick(self, which: Sequence[int] | NDArray[np.intp]) -> HandEyeSession:
         """The pairs with these numbers, in this order."""
         which = np.asarray(which, int)
-        rows = {
+        rows: dict[str, Any] = {
             name: None if getattr(self, name) is None else getattr(self, name)[which]
             for name in ("T_base_gripper", "q", "dq", "times")
         }
@@ -216,15 +217,15 @@ class HandEyeSession:
         place = Path(folder)
         place.mkdir(parents=True, exist_ok=True)
         for name in self.names:
-            write_whole(place / name, images[name])
-        write_whole(place / POSES, self._csv().encode())
+            write_bytes(place / name, images[name])
+        write_bytes(place / POSES, self._csv().encode())
         card = {
             "mount": self.mount,
             "board": asdict(self.board) | {"squares": list(self.board.squares)},
             "intrinsics": self.intrinsics.to_dict(),
             **(about or {}),
         }
-        write_whole(place / SESSION, (json.dumps(card, indent=1) + "\n").encode())
+        write_bytes(place / SESSION, (json.dumps(card, indent=1) + "\n").encode())
 
     def _csv(self) -> str:
         from scipy.spatial.transform import Rotation

@@ -8,10 +8,13 @@ what is true is in `HandEyeTruth`, and both can be made again from the seed.
 
 from __future__ import annotations
 
+import json
+import os
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
@@ -19,9 +22,9 @@ from scipy.spatial.transform import Rotation
 
 from coursekit.arm import ArmErrors, SimulatedArm, widowx
 from coursekit.boards import Board, BoardNotFound, Detection, Detections, detect
+from coursekit.boards.folder import SESSION
 from coursekit.geometry import invert_transform, project, transform_points
 from coursekit.hand_eye.poses import Mount, camera_board, check_mount, turned
-from coursekit.hand_eye.session import HandEyeSession
 from coursekit.simulation.board_images import render_board
 from coursekit.simulation.hand_eye_poses import (
     BORDER_PX,
@@ -29,7 +32,6 @@ from coursekit.simulation.hand_eye_poses import (
     board_in_gripper,
     board_on_table,
     careful_poses,
-    half_turns,
     over_the_shoulder,
     random_poses,
     single_axis_poses,
@@ -40,6 +42,8 @@ from coursekit.specifications import device
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from coursekit.hand_eye.session import HandEyeSession
 
     Floats = NDArray[np.float64]
 
@@ -55,6 +59,9 @@ Y_JITTER = np.repeat([np.radians(4.0), 8e-3], 3)
 SECONDS = 4.0  # from one image to the next
 DEGENERATE_VARIANTS = 4  # of each degenerate set in a default setup: their search takes a second
 MIN_CORNERS = 6
+TRIES = 20  # places of camera and board before the default ones are taken
+PARTIAL = 0.6  # of the corners in view are enough in a degenerate session
+SIMULATED = "simulated"  # what session.json calls its source
 
 
 @dataclass(frozen=True)
@@ -205,6 +212,23 @@ def rendered_session(
     return session, truth, images
 
 
+def truth_of(folder: str | os.PathLike[str]) -> HandEyeTruth:
+    """The truth behind a session that this module made and that was saved with its seed.
+
+    Nothing of it is in the folder: it is made again from `seed` and `views` in session.json, as
+    for `rendered_session(mount, seed, views, ArmErrors())`. Raises ValueError where they are not
+    there, as in a session with a real arm.
+    """
+    path = Path(folder) / SESSION
+    if not path.is_file():
+        raise ValueError(f"folder: {os.fspath(folder)!r} has no {SESSION}")
+    card = json.loads(path.read_text("utf-8"))
+    if card.get("source") != SIMULATED:
+        raise ValueError(f"folder: {path.parent.name} is no simulated session; nobody knows its X")
+    mount, seed, views = check_mount(card["mount"]), int(card["seed"]), int(card["views"])
+    return _poses(mount, seed, views, ArmErrors(), HandEyeMistakes())[0]
+
+
 def images_of(truth: HandEyeTruth, seed: int) -> Iterator[NDArray[np.uint8]]:
     """The rendered pictures (h, w) of a session, one after the other."""
     rng = _stream(seed, b"images")
@@ -230,8 +254,10 @@ def _poses(
 ) -> tuple[HandEyeTruth, Floats, Floats]:
     """The truth, and the joint angles and velocities (n, 6) that the encoders read."""
     rng = _stream(seed, b"poses")
-    rig = _jittered(default_setup(setup), rng) if isinstance(setup, str) else setup
-    q = _configurations(rig, setup if isinstance(setup, str) else None, rng, n, mistakes.design)
+    if isinstance(setup, str):
+        rig, q = _default_session(setup, rng, n, mistakes.design)
+    else:
+        rig, q = setup, _configurations(setup, rng, n, mistakes.design)
     offsets, joint = _joint_zero(seed, mistakes)
     arm = SimulatedArm(seed, errors or ArmErrors(0.0, 0.0, 0.0, 0.0))
     dq = np.zeros_like(q)
@@ -268,6 +294,16 @@ def _in_place(setup: Setup) -> Floats:
     return np.ones(6)
 
 
+def _configurations(setup: Setup, rng: np.random.Generator, n: int, design: Design) -> Floats:
+    """Joint configurations (n, 6), or (25, 6) of the grid."""
+    if design == "careful":
+        return careful_poses(setup, rng, n)
+    if design == "grid":
+        return translation_grid(setup, rng)
+    poses = single_axis_poses if design == "single_axis" else small_rotations
+    return poses(setup, rng, n)
+
+
 @cache
 def _pool(mount: Mount) -> Floats:
     return random_poses(default_setup(mount), np.random.default_rng(0), POOL)
@@ -275,32 +311,27 @@ def _pool(mount: Mount) -> Floats:
 
 @cache
 def _degenerate(mount: Mount, design: Design, n: int, variant: int) -> Floats:
-    return _degenerate_set(default_setup(mount), np.random.default_rng([variant, 1]), n, design)
+    return _configurations(default_setup(mount), np.random.default_rng([variant, 1]), n, design)
 
 
-def _degenerate_set(setup: Setup, rng: np.random.Generator, n: int, design: Design) -> Floats:
-    if design == "grid":
-        return translation_grid(setup, rng)
-    if design == "single_axis":
-        return single_axis_poses(setup, rng, n)
-    return small_rotations(setup, rng, n)
-
-
-def _configurations(
-    setup: Setup, mount: Mount | None, rng: np.random.Generator, n: int, design: Design
-) -> Floats:
-    """Joint configurations (n, 6); of a default setup's pool those that its moved rig allows."""
-    if design != "careful":
-        if mount is None:
-            return _degenerate_set(setup, rng, n, design)
-        return _degenerate(mount, design, n, int(rng.integers(DEGENERATE_VARIANTS)))
-    if mount is None:
-        return careful_poses(setup, rng, n)
-    pool = _pool(mount)
-    pool = pool[setup.sees(setup.arm.forward(pool))]
-    if len(pool) < n or half_turns(setup.arm.forward(pool))[1] < np.radians(30):
-        return careful_poses(setup, rng, n)
-    return careful_poses(setup, rng, n, pool)
+def _default_session(
+    mount: Mount, rng: np.random.Generator, n: int, design: Design
+) -> tuple[Setup, Floats]:
+    """A default setup moved a little, and configurations that were searched for once and kept."""
+    for _ in range(TRIES):
+        rig = _jittered(default_setup(mount), rng)
+        if design != "careful":
+            q = _degenerate(mount, design, n, int(rng.integers(DEGENERATE_VARIANTS)))
+            if replace(rig, share=PARTIAL).sees(rig.arm.forward(q)).all():
+                return rig, q
+            continue
+        pool = _pool(mount)
+        pool = pool[rig.sees(rig.arm.forward(pool))]
+        try:
+            return rig, careful_poses(rig, rng, n, pool)
+        except ValueError:  # too few are left, or they turn too little: another place then
+            continue
+    return default_setup(mount), _configurations(default_setup(mount), rng, n, design)
 
 
 def _joint_zero(seed: int, mistakes: HandEyeMistakes) -> tuple[Floats, int | None]:
@@ -353,12 +384,15 @@ def _reported(
     truth: HandEyeTruth, q: Floats, dq: Floats, seen: Detections
 ) -> tuple[HandEyeSession, HandEyeTruth]:
     """The session as a student has it, mistakes and all."""
+    from coursekit.hand_eye.session import HandEyeSession  # imports this room, by intrinsics.power
+
     setup, mistakes = truth.setup, truth.mistakes
     if mistakes.degrees == "joints":
-        q = np.degrees(q)
+        q = np.asarray(np.degrees(q), np.float64)
+    times: Floats = np.arange(len(q)) * np.float64(SECONDS)
     session = HandEyeSession(
         setup.mount, setup.arm.forward(q), seen, setup.board, setup.intrinsics, q,
-        dq if dq.any() else None, SECONDS * np.arange(len(q)), tuple(view.name for view in seen),
+        dq if dq.any() else None, times, tuple(view.name for view in seen),
     )  # fmt: skip
     session = replace(session, T_base_gripper=_arm_poses(session.T_base_gripper, mistakes))
     if mistakes.inverted_poses or mistakes.degrees == "rotation_vectors":

@@ -1,0 +1,103 @@
+"""What notebook 04 teaches, against OpenCV and simulated sessions."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import coursekit as ck
+from coursekit.lessons import hand_eye as lesson
+from coursekit.simulation.hand_eye_sessions import HandEyeMistakes, hand_eye_session
+
+BY_NAME = {c.name.partition(".")[2]: c for c in lesson.CHECKPOINTS}
+
+
+def pairs_of(session):
+    T, C = session.T_base_gripper, session.T_camera_board
+    return [(T[i], T[j], C[i], C[j]) for i, j in ((0, 1), (3, 7), (5, 2))]
+
+
+def test_motion_pairs_of_a_session_solve_ax_xb() -> None:
+    session, truth = hand_eye_session("eye_in_hand", 3, n=8, corner_noise_px=0.0)
+    for pair in pairs_of(session):
+        A, B = lesson.MOTION_PAIR.model()(*pair)
+        assert pytest.approx(A @ truth.X, abs=1e-6) == truth.X @ B
+
+
+def test_the_right_option_is_the_eye_to_hand_equation() -> None:
+    session, truth = hand_eye_session("eye_to_hand", 3, n=8, corner_noise_px=0.0)
+    for T_i, T_j, C_i, C_j in pairs_of(session):
+        B = C_j @ np.linalg.inv(C_i)
+        right = T_j @ np.linalg.inv(T_i)
+        as_before = np.linalg.inv(T_j) @ T_i
+        assert pytest.approx(right @ truth.X, abs=1e-6) == truth.X @ B
+        assert np.abs(truth.X @ B - as_before @ truth.X).max() > 0.01
+    options = BY_NAME["eye_to_hand"].lettered()
+    assert options["B"].right
+    assert "T_base_gripper(j) inverse(T_base_gripper(i))" in options["B"].text
+
+
+def test_the_rotation_half_is_opencvs_for_motions_without_noise() -> None:
+    session, truth = hand_eye_session("eye_in_hand", 3, n=8, corner_noise_px=0.0)
+    T, C = session.T_base_gripper, session.T_camera_board
+    pairs = [lesson.MOTION_PAIR.model()(T[i], T[i + 1], C[i], C[i + 1]) for i in range(7)]
+    R_A, R_B = (np.array([p[k][:3, :3] for p in pairs]) for k in (0, 1))
+    R_X = lesson.ROTATION_HALF.model()(R_A, R_B)
+    R, _ = cv2.calibrateHandEye(
+        T[:, :3, :3], T[:, :3, 3], C[:, :3, :3], C[:, :3, 3], method=cv2.CALIB_HAND_EYE_PARK
+    )
+    assert pytest.approx(R, abs=1e-4) == R_X
+    assert pytest.approx(truth.X[:3, :3], abs=1e-4) == R_X
+
+
+def test_inverted_poses_leave_centimetres_and_are_not_the_inverse() -> None:
+    session, truth = hand_eye_session(
+        "eye_in_hand", 3, n=20, mistakes=HandEyeMistakes(inverted_poses=True)
+    )
+    result = session.solve()
+    assert result.spread_gripper_mm > 20
+    assert result.spread_gripper_deg > 2
+    inverse = np.linalg.inv(truth.X)
+    for X in (truth.X, inverse):
+        assert np.linalg.norm(result.X[:3, 3] - X[:3, 3]) > 0.02
+    assert BY_NAME["inverted_poses"].lettered()["B"].right
+
+
+def test_the_grid_fixes_the_rotation_and_leaves_the_translation_free() -> None:
+    grid, truth = hand_eye_session("eye_in_hand", 7, mistakes=HandEyeMistakes(design="grid"))
+    R_X = ck.hand_eye.rotation_from_shifts(grid.T_base_gripper, grid.T_camera_board, "eye_in_hand")
+    off = Rotation.from_matrix(R_X.T @ truth.X[:3, :3]).magnitude()
+    assert np.degrees(off) < 0.5
+    known = ck.hand_eye.observability(grid.T_base_gripper, "eye_in_hand")
+    assert not known.determined
+    assert "translation" in known.free[0]
+    with pytest.raises(ValueError, match="t_X drops out"):
+        grid.solve("closed_form")
+    off_mm = [1000 * np.linalg.norm(grid.solve(m).X[:3, 3] - truth.X[:3, 3])
+              for m in ("park", "horaud", "andreff", "daniilidis")]  # fmt: skip
+    assert min(off_mm) > 50
+
+
+def test_the_lever_is_what_a_rotation_does() -> None:
+    turned = Rotation.from_euler("y", 0.3, degrees=True).apply([0, 0, 0.4])
+    assert BY_NAME["lever"].value == pytest.approx(
+        1000 * np.linalg.norm(turned - [0, 0, 0.4]), 1e-4
+    )
+
+
+def test_more_poses_shrink_the_interval_and_not_the_error() -> None:
+    """Over a dozen arms: four times the poses, half the sigma, and no less error to speak of."""
+    few, many = [], []
+    for seed in range(12):
+        for n, kept in ((25, few), (100, many)):
+            session, truth = hand_eye_session(
+                "eye_in_hand", seed, n=n, arm_errors=ck.arm.ArmErrors()
+            )
+            result = session.solve()
+            kept.append([np.linalg.norm(result.X[:3, 3] - truth.X[:3, 3]),
+                         np.linalg.norm(result.sigma_mm)])  # fmt: skip
+    (error_few, sigma_few), (error_many, sigma_many) = np.median(few, 0), np.median(many, 0)
+    assert 0.4 < sigma_many / sigma_few < 0.62
+    assert error_many / error_few > 0.6
