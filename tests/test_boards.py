@@ -22,6 +22,7 @@ from coursekit.boards import (
     detect_all,
     save_sheet,
 )
+from coursekit.boards.blur import blur_covariance
 from coursekit.boards.find import find
 from coursekit.boards.refine import noise_levels
 
@@ -666,3 +667,13 @@ def test_the_largest_square_that_is_offered_fits(tmp_path):
     save_sheet(Board("charuco", (12, 9), 0.020), tmp_path / "a.pdf")
     with pytest.raises(ValueError, match="does not fit"):
         save_sheet(Board("charuco", (12, 9), 0.0201), tmp_path / "b.pdf")
+
+
+def test_corners_without_neighbours_tell_no_blur():
+    """A view may show a corner here and one there: a detection all the same, without a blur."""
+    ids = np.array([0, 10, 20, 30])  # no two side by side on 8x5 corners
+    pixels = np.array([[100.0, 100.0], [160.0, 130.0], [220.0, 160.0], [280.0, 190.0]])
+    steps = np.tile(np.array([[30.0, 0.0], [0.0, 30.0]]), (4, 1, 1))
+    grey = np.full((300, 400), 120, np.uint8)
+    board = Board("charuco", (9, 6), 0.025)
+    assert blur_covariance(grey, pixels, ids, steps, board) is None

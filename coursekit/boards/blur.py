@@ -157,7 +157,7 @@ def _edges(
     marker, reach = _marker_and_reach(square, board)
     on_line = start[:, None, None] + ALONG[:, None, None] * line[:, None, None]
     spots = on_line + (reach[:, None] * ACROSS)[:, None, :, None] * normal[:, None, None]
-    spots = np.rint(spots).astype(int).reshape(len(start), -1, 2)
+    spots = np.rint(spots).astype(int).reshape(len(start), ALONG.size * ACROSS.size, 2)
     inside = ((spots >= 0) & (spots < grey.shape[::-1])).all(axis=(1, 2))
     spots, normal = spots[inside], normal[inside]
     distance = np.einsum("emi,ei->em", spots - start[inside, None], normal)

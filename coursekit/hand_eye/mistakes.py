@@ -259,7 +259,7 @@ def _outliers(odd: list[Accepted], session: HandEyeSession) -> Finding:
         "One pair of arm pose and image or a few do not fit the others.",
         f"{', '.join(names)} off where the other pairs put the board; those disagree by "
         f"{odd[-1].after.says()}",
-        "Look at the image (blurred, board cut off, still swinging?) and at the row of the table; "
-        "leave the pair out, or take it again after the arm has stopped.",
+        "Look at the image (blurred, board cut off, still swinging?) and at the row of the table "
+        "(two rows exchanged?); leave the pair out, or take it again after the arm has stopped.",
         odd[0].test.p_value,
     )

@@ -63,7 +63,7 @@ def _session_pair(seed: int, plain: bool = False) -> tuple[Array, ...]:
     i, j = _pose(rng), _pose(rng)
     if plain:  # turns by quarter of a circle and whole centimetres, to work by hand
         X = make_transform(np.eye(3), (0.0, 0.0, 0.1))
-        board = make_transform(np.eye(3), (0.3, 0.0, 0.0))
+        board = make_transform(np.eye(3), (0.3, 0.0, 0.9))
         i = make_transform(np.eye(3), (0.3, 0.0, 0.4))
         j = make_transform(Rotation.from_euler("z", 90, degrees=True), (0.4, 0.1, 0.5))
     seen = (np.linalg.inv(pose @ X) @ board for pose in (i, j))
@@ -83,7 +83,7 @@ MOTION_PAIR = Exercise(
     },
     cases=[_session_pair(0, plain=True), *(_session_pair(seed) for seed in range(1, 5))],
     per_row=0,
-    unit="(rotation, m)",
+    unit="m",
     tolerance=1e-9,
     describe=lambda args: (
         "the gripper at "
@@ -91,6 +91,8 @@ MOTION_PAIR = Exercise(
         + " m in the base, the board at "
         + " and ".join(str(T[:3, 3].round(3).tolist()) for T in args[2:])
         + " m before the camera"
+        + ", the second arm pose turned by 90 degrees about z"
+        * bool(args[1][0, 0] == args[1][1, 1] and abs(args[1][0, 0]) < 1e-9)
     ),
     show=lambda row: (
         "translations of A and B "
@@ -194,7 +196,9 @@ def _used(a: Array, b: Array) -> Pair:
 
 
 def _turn(a: Array, b: Array) -> Array:
-    """The rotation that takes each b to its a: Kabsch's."""
+    """The rotation that takes each b to its a: Kabsch's; the smallest one for a single pair."""
+    if len(a) == 1:
+        return np.asarray(Rotation.align_vectors(a, b)[0].as_matrix())
     U, _, Vt = np.linalg.svd(a.T @ b)
     return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
 
@@ -279,6 +283,35 @@ def first_motion_only(a: Array, b: Array) -> Pair:
     return a[:1], b[:1]
 
 
+@ROTATION_HALF.mistake(
+    "result",
+    "its sign is wrong: -R solves the equation as well, and is no rotation",
+    "Print the determinant. A null vector has no sign of its own: how do you choose it?",
+)
+def negative(R: Array) -> Array:
+    return -R
+
+
+@ROTATION_HALF.mistake(
+    "result",
+    "it is a rotation but for a factor",
+    "A null vector of length 1 has nine entries, and a rotation matrix has three rows of length 1. "
+    "What is missing?",
+)
+def not_scaled(R: Array) -> Array:
+    return R / np.sqrt(3)
+
+
+@ROTATION_HALF.mistake(
+    "result",
+    "it is a rotation but for a factor and the sign",
+    "A null vector of length 1 has no sign of its own, and nine entries. Print the determinant of "
+    "your result, and that of a rotation.",
+)
+def not_scaled_and_negative(R: Array) -> Array:
+    return -R / np.sqrt(3)
+
+
 EXERCISES = (MOTION_PAIR, ROTATION_HALF)
 
 
@@ -327,7 +360,7 @@ CHECKPOINTS = (
                 "another matrix, and no X solves that equation.",
             ),
             Option(
-                "It returns some X, and the residuals are large: centimetres and degrees",
+                "It returns some X, and the residuals are large: many centimetres and degrees",
                 "With inverted poses A is the motion seen from the base. That is the equation of "
                 "a camera that stands still, and no constant X solves it on these data. The "
                 "solver minimises all the same, and returns what is least wrong.",
@@ -335,7 +368,8 @@ CHECKPOINTS = (
             ),
             Option(
                 "It stops with an error: the data contradict each other",
-                "Solvers do not look at what they leave over. You have to.",
+                "One or the other may stop (OpenCV's Park can end in a mirror image). Most do not "
+                "look at what they leave over. You have to.",
             ),
             Option(
                 "Nothing: the inverse of a pose is as good as the pose",
@@ -372,8 +406,8 @@ CHECKPOINTS = (
     ),
     Number(
         name="hand_eye.lever",
-        question="The rotation of X is wrong by 0.3 degrees. By how much is a point 0.40 m in "
-        "front of the camera misplaced for that, in mm?",
+        question="The rotation of X is wrong by 0.3 degrees. By how much, at most, is a point "
+        "0.40 m in front of the camera misplaced for that, in mm?",
         value=1000 * 0.40 * float(np.radians(0.3)),
         unit="mm",
         why="An angle is a length at the end of a lever: 0.3 degrees are 5.2 mrad, times 400 mm. "
@@ -398,7 +432,7 @@ CHECKPOINTS = (
                 "That is what noise does. An offset of a joint is the same in all 100 poses.",
             ),
             Option(
-                "Its stated sigma halves, its error hardly changes",
+                "Its stated sigma halves, its error falls far less",
                 "The covariance believes that residuals are independent. These are not: they "
                 "share the joints' offsets. So the interval shrinks around a wrong value, unless "
                 "the fit is told about the arm.",
@@ -418,16 +452,18 @@ CHECKPOINTS = (
 )
 
 OBJECTIVES = (
-    Objective(
-        "derive AX = XB for both mounts, and build A and B",
-        ("hand_eye.motion_pair", "hand_eye.eye_to_hand", "hand_eye.inverted_poses"),
-    ),
+    Objective("derive AX = XB for both mounts", ("hand_eye.eye_to_hand",)),
     Objective(
         "say which poses determine X, and which part of it others leave free",
-        ("hand_eye.translation_grid", "hand_eye.rotation_half"),
+        ("hand_eye.translation_grid",),
+    ),
+    Objective("say in millimetres how good an X is", ("hand_eye.lever",)),
+    Objective(
+        "(deeper) build A and B, and solve the equation",
+        ("hand_eye.motion_pair", "hand_eye.rotation_half"),
     ),
     Objective(
-        "say in millimetres how good an X is, and what more poses do not cure",
-        ("hand_eye.lever", "hand_eye.more_poses"),
+        "(deeper) say what the arm's own error does, and name mistakes by their evidence",
+        ("hand_eye.more_poses", "hand_eye.inverted_poses"),
     ),
 )

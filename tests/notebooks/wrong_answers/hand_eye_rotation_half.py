@@ -41,11 +41,36 @@ def any_matrix_that_fits(R_A, R_B):
     return (np.linalg.pinv(b) @ a).T
 
 
-@wrong("first_motion_only", "svd")
+@wrong("first_motion_only", "rodrigues")
 def one_motion(R_A, R_B):
-    a, b = _axis_times_angle(R_A[:1]), _axis_times_angle(R_B[:1])
-    U, _, Vt = np.linalg.svd(a.T @ b)
-    return U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+    a, b = (_axis_times_angle(R[:1])[0] for R in (R_A, R_B))
+    a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
+    x, y, z = np.cross(b, a)
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + K + K @ K / (1 + a @ b)
+
+
+def _null_vector(R_A, R_B):
+    eye = np.eye(3)
+    rows = [np.kron(A, eye) - np.kron(eye, B.T) for A, B in zip(R_A, R_B, strict=True)]
+    x = np.linalg.svd(np.concatenate(rows))[2][-1].reshape(3, 3)
+    return x * np.sign(np.linalg.det(x))
+
+
+@wrong("negative", "kronecker")
+def sign_left_to_chance(R_A, R_B):
+    U, _, Vt = np.linalg.svd(-_null_vector(R_A, R_B))
+    return U @ Vt
+
+
+@wrong("not_scaled", "kronecker")
+def null_vector_as_it_is(R_A, R_B):
+    return _null_vector(R_A, R_B)
+
+
+@wrong("not_scaled_and_negative", "kronecker")
+def null_vector_the_other_way(R_A, R_B):
+    return -_null_vector(R_A, R_B)
 
 
 @wrong(None, "direct")
