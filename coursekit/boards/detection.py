@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-LISTED = 40  # lines that a repr shows at most
+LISTED, LISTED_SKIPPED = 6, 20  # lines that a repr shows at most
 
 
 class BoardNotFound(ValueError):
@@ -138,9 +138,9 @@ class Detections(Sequence[Detection]):
         lines += [f"  {view!r}" for view in self._views[:LISTED]]
         if len(self) > LISTED:
             lines.append(f"  and {len(self) - LISTED} more")
-        lines += [f"  not used: {skip!r}" for skip in self.skipped[:LISTED]]
-        if len(self.skipped) > LISTED:
-            lines.append(f"  and {len(self.skipped) - LISTED} more not used")
+        lines += [f"  not used: {skip!r}" for skip in self.skipped[:LISTED_SKIPPED]]
+        if len(self.skipped) > LISTED_SKIPPED:
+            lines.append(f"  and {len(self.skipped) - LISTED_SKIPPED} more not used")
         return "\n".join(lines)
 
 

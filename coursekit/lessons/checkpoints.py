@@ -175,7 +175,7 @@ class Number(Checkpoint):
     def input_widget(self) -> Any:
         import ipywidgets
 
-        return ipywidgets.Text(placeholder=f"a number in {self.unit}")
+        return ipywidgets.Text(placeholder=f"a number ({self.unit})")
 
 
 EXAMPLES = "0.37 or 150"  # of numbers, and no checkpoint's answer

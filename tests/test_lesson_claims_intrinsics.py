@@ -1,0 +1,270 @@
+"""Rows I1 to I8 of data/claims.csv: intrinsic calibration.
+
+Sessions are simulated at the corners. COURSEKIT_NIGHTLY=1 takes more of them.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from lesson_claims import ROWS, claim
+from scipy.spatial.transform import Rotation
+
+from coursekit import intrinsics
+from coursekit.boards import Board, BoardNotFound, Detection, Detections, detect
+from coursekit.geometry import Intrinsics, make_transform, project, transform_points
+from coursekit.intrinsics.fit import evaluate
+from coursekit.simulation.sessions import Effects, bowed, corner_session
+
+SEEDS = range(9000, 9000 + (60 if os.environ.get("COURSEKIT_NIGHTLY") == "1" else 6))
+LENS = Intrinsics(
+    640, 480, 612.0, 610.0, 322.0, 238.0, "brown_conrady", (0.08, -0.18, 0.0007, -0.0004, 0.05)
+)
+CHARUCO = Board("charuco", (9, 6), 0.025)
+CHECKERBOARD = Board("checkerboard", (10, 7), 0.025)  # 9 x 6 inner corners
+
+
+def fits(board: Board, **session) -> list[intrinsics.IntrinsicsResult]:
+    return [
+        intrinsics.calibrate(corner_session(board, LENS, seed, **session)[0], board)
+        for seed in SEEDS
+    ]
+
+
+def facing(R: Rotation, z_m: float, across_m: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
+    """T_camera_board with the checkerboard's middle at (across_m, z_m)."""
+    centre = CHECKERBOARD.points.mean(axis=0)
+    return make_transform(R, np.array([*across_m, z_m]) - R.apply(centre))
+
+
+# --- I1: the bow ---
+
+
+@claim("I1", "wrong")
+def test_i1_a_bow_moves_corners_little_and_the_focal_length_much() -> None:
+    refitted = []
+    for focal, text in ((600.0, "0.4 / 0.9 / 1.0 px at"), (900.0, "0.5 / 1.3 / 1.6 at f 900")):
+        K, moved = np.array([[focal, 0, 320], [0, focal, 240], [0, 0, 1]]), []
+        for tilt in (15, 45, 60):
+            T = facing(Rotation.from_euler("x", tilt, degrees=True), 0.5)
+            flat = project(transform_points(T, CHECKERBOARD.points), K)
+            bent = project(transform_points(T, bowed(CHECKERBOARD, 0.001)), K)
+            moved.append(np.linalg.norm(bent - flat, axis=1).max())
+            _, r, t = cv2.solvePnP(CHECKERBOARD.points, bent, K, None)
+            again = cv2.projectPoints(CHECKERBOARD.points, r, t, K, None)[0][:, 0]
+            refitted.append(np.linalg.norm(again - bent, axis=1).max())
+        assert max(moved) < 2  # not several px
+        ROWS["I1"].says(text)
+        written = [float(word) for word in text.replace("/", " ").split()[:3]]
+        np.testing.assert_allclose(moved, written, atol=0.07)
+    assert max(refitted) == pytest.approx(0.9, abs=0.05)
+
+    bias, k1, rms = {}, {}, {}
+    for board in (CHECKERBOARD, CHARUCO):
+        for noise in (0.08, 0.12, 0.2):
+            found = fits(board, noise_px=noise, effects=Effects(bow_m=0.001))
+            key = board.kind, noise
+            bias[key] = 100 * np.mean([r.value("fx") / LENS.fx - 1 for r in found])
+            k1[key] = np.mean([(r.value("k1") - 0.08) / r.sigma("k1") for r in found])
+            rms[key] = np.mean([r.rms_px for r in found])
+    ROWS["I1"].says("-1.7 % (checkerboard) to -2.9 % (ChArUco)", "2-4 of its stated sigmas")
+    assert bias["checkerboard", 0.08] == pytest.approx(-1.7, abs=0.15)
+    assert bias["charuco", 0.08] == pytest.approx(-2.9, abs=0.15)
+    assert all(-4.2 < k1[kind, 0.08] < -1.8 for kind in ("checkerboard", "charuco"))
+    ROWS["I1"].says("RMS is 0.19 px (0.22-0.31 px with 0.12-0.2 px of noise)")
+    for kind in ("checkerboard", "charuco"):
+        for noise, wanted in ((0.08, 0.19), (0.12, 0.225), (0.2, 0.31)):
+            assert rms[kind, noise] == pytest.approx(wanted, abs=0.015)
+
+
+# --- I2 and I3: what images do not say ---
+
+FAR_LENS = Intrinsics(1280, 720, 900.0, 900.0, 640.0, 360.0)
+
+
+@claim("I2", "right")
+def test_i2_tilt_makes_the_focal_length_known() -> None:
+    """Exact sigmas of fx, and that residuals do not show them: useless fits with a small RMS."""
+    percent = {1: 41.0, 2: 10.0, 5: 1.8, 10: 0.52, 20: 0.20, 45: 0.10}
+    ROWS["I2"].says(" / ".join(f"{p:.2f}" if p < 1 else f"{p:g}" for p in percent.values()))
+    names = ("fx", "fy", "cx", "cy")
+    for tilt, wanted in percent.items():
+        azimuths = 2 * np.pi * np.arange(12) / 12
+        axes = np.stack([np.cos(azimuths), np.sin(azimuths), np.zeros(12)], axis=1)
+        poses = np.stack([facing(Rotation.from_rotvec(math.radians(tilt) * a), 0.5) for a in axes])
+        clean = [
+            Detection(
+                np.arange(54), project(transform_points(T, CHECKERBOARD.points), FAR_LENS.K),
+                FAR_LENS.size,
+            )
+            for T in poses
+        ]  # fmt: skip
+        exact = evaluate(FAR_LENS, poses, clean, CHECKERBOARD, CHECKERBOARD.points, names, "none")
+        sigma = 0.2 * math.sqrt(exact.equations.shared_covariance[0, 0])
+        assert 100 * sigma / FAR_LENS.fx == pytest.approx(wanted, rel=0.15)
+    flat = fits(CHECKERBOARD, effects=Effects(max_tilt_deg=3.0))
+    tilted = fits(CHECKERBOARD)
+    for useless, useful in zip(flat, tilted, strict=True):
+        assert useless.rms_px == pytest.approx(useful.rms_px, rel=0.05)
+        assert useless.sigma("fx") > 25 * useful.sigma("fx")
+
+
+def stretched_session(roll_deg: float, stretch: float, seed: int) -> Detections:
+    """Twenty tilted views, rolled by up to roll_deg, of a board whose x is stretched."""
+    rng, views = np.random.default_rng(seed), []
+    points = CHECKERBOARD.points * [stretch, 1, 1]
+    for i in range(20):
+        azimuth, tilt = 2 * np.pi * i / 20, math.radians(rng.uniform(20, 45))
+        lean = Rotation.from_rotvec(tilt * np.array([math.cos(azimuth), math.sin(azimuth), 0]))
+        roll = Rotation.from_euler("z", rng.uniform(-roll_deg, roll_deg), degrees=True)
+        T = facing(lean * roll, rng.uniform(0.4, 0.6), (rng.uniform(-0.08, 0.08), 0.0))
+        pixels = project(transform_points(T, points), LENS.K, LENS.dist)
+        noise = rng.normal(0, 0.1, pixels.shape)
+        views.append(Detection(np.arange(54), pixels + noise, LENS.size, f"{i:02d}"))
+    return Detections(views)
+
+
+@claim("I3", "right")
+def test_i3_a_wrong_square_size_leaves_no_trace_in_the_image() -> None:
+    views, truth = corner_session(CHARUCO, LENS, 5)
+    right = intrinsics.calibrate(views, CHARUCO)
+    wrong_board = replace(CHARUCO, square_m=0.024, marker_m=0.018)
+    wrong = intrinsics.calibrate(views, wrong_board)
+    assert wrong.rms_px == pytest.approx(right.rms_px, abs=1e-7)
+    assert wrong.value("fx") == pytest.approx(right.value("fx"), abs=1e-3)
+    shorter = wrong.T_camera_board[:, 2, 3] / right.T_camera_board[:, 2, 3]
+    np.testing.assert_allclose(shorter, 24 / 25, rtol=1e-5)
+    assert "wrong_square_size" not in intrinsics.diagnose(views, wrong_board).names
+    witness = intrinsics.diagnose(views, wrong_board, depth_m=truth.depth_m)
+    assert witness.names == ("wrong_square_size",)
+
+    rms, aspect = {}, {}
+    for roll in (0, 45, 90):
+        for stretch in (1.0, 1.01):
+            fit = intrinsics.calibrate(stretched_session(roll, stretch, 1), CHECKERBOARD)
+            rms[roll, stretch] = fit.rms_px
+            aspect[roll, stretch] = fit.value("fx") / fit.value("fy") * LENS.fy / LENS.fx
+    ROWS["I3"].says("RMS .14 to .19-.22", "rolls up to 45-90 deg", ".140 both times", "1.2 % apart")
+    for roll in (0, 45, 90):
+        assert rms[roll, 1.0] == pytest.approx(0.140, abs=0.002)
+    assert rms[0, 1.01] == pytest.approx(0.140, abs=0.002)
+    assert rms[45, 1.01] == pytest.approx(0.19, abs=0.01)
+    assert rms[90, 1.01] == pytest.approx(0.22, abs=0.01)
+    assert aspect[0, 1.01] - aspect[0, 1.0] == pytest.approx(0.012, abs=0.002)
+
+
+# --- I4 to I6: judging, rules, time ---
+
+
+@claim("I4", "imprecise")
+def test_i4_rms_is_no_quality() -> None:
+    per_axis = [value / math.sqrt(2) for value in (0.15, 0.3)]
+    ROWS["I4"].says(f"{per_axis[0]:.2f}-{per_axis[1]:.2f} px per axis", "0.15-0.3; 0.5; 1 px")
+    useless = fits(CHECKERBOARD, noise_px=0.1, effects=Effects(max_tilt_deg=2.0))
+    useful = fits(CHECKERBOARD, noise_px=0.1)
+    for one, other in zip(useless, useful, strict=True):
+        assert one.rms_px < 0.15  # better than "careful"
+        assert one.rms_px == pytest.approx(math.hypot(one.rms_u_px, one.rms_v_px))
+        assert one.rms_px == pytest.approx(other.rms_px, rel=0.02)
+        assert one.verdict().startswith("Not good enough")
+        assert not other.verdict().startswith("Not")
+    off = np.sqrt(np.mean([(r.value("fx") - LENS.fx) ** 2 for r in useless]))
+    assert 20 < off < 200  # tens of px
+    assert np.mean([r.rms_px for r in useless]) == pytest.approx(0.14, abs=0.005)
+    assert max(abs(r.value("fx") - LENS.fx) for r in useful) < 3
+
+
+@claim("I5", "right")
+def test_i5_what_each_rule_buys() -> None:
+    """Broken one at a time, each rule costs sigma_f or the projection at the worst pixel."""
+
+    def cost(**session) -> tuple[float, float]:
+        found = fits(CHARUCO, **session)
+        sigma = np.mean([r.sigma("fx") for r in found])
+        return float(sigma), float(np.mean([r.uncertainty_map(0.45).max() for r in found]))
+
+    sigma, worst = cost()
+    assert cost(views=6)[0] > 2 * sigma
+    assert cost(views=20)[0] > cost(views=40)[0]
+    by_tilt = [cost(effects=Effects(max_tilt_deg=tilt))[0] for tilt in (10, 30, 45)]
+    assert by_tilt[0] > 5 * by_tilt[1] > 5 * by_tilt[2]
+    inner_sigma, inner_worst = cost(effects=Effects(inner_only=0.15))
+    assert inner_sigma < 1.5 * sigma  # corners in the image corners do little for fx
+    assert inner_worst > 10 * worst  # and everything for the border
+    ROWS["I5"].says("sigma_f and in projection uncertainty")
+
+
+@claim("I6", "right")
+def test_i6_a_calibration_is_a_small_problem() -> None:
+    """No clock: the number of steps that suffice, times the multiplications of one."""
+    board, views = CHARUCO, corner_session(CHARUCO, LENS, 6)[0]
+    objects = [board.points[v.ids].astype(np.float32) for v in views]
+    corners = [v.pixels.astype(np.float32) for v in views]
+
+    def focal(steps: int) -> float:
+        criteria = (cv2.TERM_CRITERIA_COUNT, steps, 0)
+        _, K, *_ = cv2.calibrateCamera(objects, corners, LENS.size, None, None, criteria=criteria)
+        return float(K[0, 0])
+
+    result = intrinsics.calibrate(views, board)
+    assert focal(30) == pytest.approx(focal(200), abs=0.01 * result.sigma("fx"))
+    data, unknowns = 2 * result.corners, 9 + 6 * len(views)
+    multiplications = data * unknowns**2  # J'J, as if J were dense
+    assert multiplications == pytest.approx(6e7, rel=0.3)
+    assert 30 * multiplications < 5e9  # a core does some 1e9 a second without effort
+    ROWS["I6"].says("30 iterations", "6e7 multiplications", "seconds")
+
+
+# --- I7 and I8: boards and causes ---
+
+
+@claim("I7", "right")
+def test_i7_charuco_knows_which_corner_it_sees() -> None:
+    def picture(board: Board) -> np.ndarray:
+        return np.pad(board.image(60), 60, constant_values=255)
+
+    whole = {board.kind: picture(board) for board in (CHARUCO, CHECKERBOARD)}
+    part = detect(whole["charuco"][:, :360], CHARUCO)  # a good half of the board
+    assert 12 <= len(part.ids) < len(CHARUCO.points)
+    exact = 59.5 + 60 * CHARUCO.points[part.ids, :2] / 0.025
+    assert np.abs(part.pixels - exact).max() < 0.1
+    with pytest.raises(BoardNotFound):
+        detect(whole["checkerboard"][:, :360], CHECKERBOARD)
+    # upside down a marker is still the same marker; of a symmetric checkerboard nobody can tell
+    turned = detect(whole["charuco"][::-1, ::-1].copy(), CHARUCO)
+    size = np.array(whole["charuco"].shape[::-1])
+    exact = size - 1 - (59.5 + 60 * CHARUCO.points[turned.ids, :2] / 0.025)
+    assert np.abs(turned.pixels - exact).max() < 0.1
+    symmetric = Board("checkerboard", (9, 7), 0.025)
+    image = picture(symmetric)
+    upright, turned = detect(image, symmetric), detect(image[::-1, ::-1].copy(), symmetric)
+    np.testing.assert_array_equal(upright.ids, turned.ids)
+    np.testing.assert_allclose(upright.pixels, turned.pixels, atol=0.1)  # the wrong way round
+
+
+@claim("I8", "right")
+def test_i8_each_cause_has_a_signature() -> None:
+    causes = {
+        "focus_drift": Effects(focus_drift=0.02),
+        "motion_blur": Effects(blur_px=3.0),
+        "rolling_shutter": Effects(readout_s=0.02, speed_m_s=0.1),
+        "no_edge_corners": Effects(inner_only=0.15),
+    }
+    healthy = corner_session(CHARUCO, LENS, 3)[0]
+    assert intrinsics.diagnose(healthy, CHARUCO).names == ()
+    good = intrinsics.calibrate(healthy, CHARUCO)
+    for name, effects in causes.items():
+        views, _ = corner_session(CHARUCO, LENS, 3, effects=effects)
+        assert intrinsics.diagnose(views, CHARUCO).names == (name,)
+        fit = intrinsics.calibrate(views, CHARUCO)
+        worse = (
+            fit.rms_px > 1.3 * good.rms_px,
+            fit.uncertainty_map(0.45).max() > 2 * good.uncertainty_map(0.45).max(),
+        )
+        assert any(worse), name
+    ROWS["I8"].says("reproducible session with its own signature")
