@@ -334,7 +334,8 @@ def test_frames_stay_in_order_though_the_recorders_clock_steps_back(rs, tmp_path
             "SELECT timestamp FROM messages JOIN topics ON topic_id = topics.id "
             "WHERE name LIKE '%/Depth_0/image/data%' ORDER BY timestamp LIMIT 1 OFFSET 2"
         ).fetchone()
-        file.execute("UPDATE messages SET timestamp = 10 * ? WHERE timestamp = ?", (third, third))
+        (last,) = file.execute("SELECT MAX(timestamp) FROM messages").fetchone()
+        file.execute("UPDATE messages SET timestamp = ? WHERE timestamp = ?", (last + third, third))
     assert depth_frame_numbers(path) == [7, 14, 28, 35, 42, 49, 56, 21]
     _restore_order(path)
     with open_camera(path) as played:
