@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from coursekit import (
         arm,
+        attribution,
         boards,
+        budget,
         cameras,
         geometry,
         hand_eye,
@@ -30,7 +32,9 @@ if TYPE_CHECKING:
 
 __all__ = [
     "arm",
+    "attribution",
     "boards",
+    "budget",
     "cameras",
     "capture",
     "check",

@@ -114,10 +114,12 @@ def exact(view: View, along: str, change: np.ndarray) -> np.ndarray:
         case "shift":
             shift = change
         case "intrinsics":
-            names = ("fx", "fy", "cx", "cy")
-            camera = replace(
-                camera, **{n: getattr(camera, n) + c for n, c in zip(names, change, strict=True)}
-            )
+            K = {
+                n: getattr(camera, n) + c
+                for n, c in zip(("fx", "fy", "cx", "cy"), change[:4], strict=True)
+            }
+            lens = tuple(np.add(camera.coeffs, change[4:]))
+            camera = replace(camera, model="brown_conrady", coeffs=lens, **K)
     in_base = view.R_base_camera @ deproject(pixel, Z, camera.K, camera.dist)
     return Rotation.from_rotvec(turn).apply(in_base) + shift
 
@@ -131,12 +133,12 @@ def exact(view: View, along: str, change: np.ndarray) -> np.ndarray:
         ("disparity", 1),
         ("turn", 3),
         ("shift", 3),
-        ("intrinsics", 4),
+        ("intrinsics", 9),
     ],
 )
 @pytest.mark.parametrize("view", [SOMEWHERE, lesson_view()], ids=["lens", "lesson"])
 def test_matrix_is_the_derivative(view: View, along: str, k: int) -> None:
-    factor = tuple(map(tuple, np.eye(4))) if along == "intrinsics" else None
+    factor = tuple(map(tuple, np.eye(9))) if along == "intrinsics" else None
     term = ErrorTerm("x", "bias", 0.0, 1.0, along, "test", factor=factor)  # type: ignore[arg-type]
     h = 1e-5
     numerical = [

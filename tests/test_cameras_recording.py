@@ -330,12 +330,14 @@ def test_frames_stay_in_order_though_the_recorders_clock_steps_back(rs, tmp_path
 
     path = RandomCamera(n=8).record(tmp_path / "a.db3", 8)
     with sqlite3.connect(path) as file:  # what a late correction did to the third frame
-        (third,) = file.execute(
-            "SELECT timestamp FROM messages JOIN topics ON topic_id = topics.id "
-            "WHERE name LIKE '%/Depth_0/image/data%' ORDER BY timestamp LIMIT 1 OFFSET 2"
-        ).fetchone()
-        (last,) = file.execute("SELECT MAX(timestamp) FROM messages").fetchone()
-        file.execute("UPDATE messages SET timestamp = ? WHERE timestamp = ?", (last + third, third))
+        late = file.execute("SELECT MAX(timestamp) + 1 FROM messages").fetchone()[0]
+        for part in ("data", "metadata"):  # of the image; by id, for times can coincide
+            (third,) = file.execute(
+                "SELECT messages.id FROM messages JOIN topics ON topic_id = topics.id "
+                "WHERE name LIKE ? ORDER BY messages.id LIMIT 1 OFFSET 2",
+                (f"%/Depth_0/image/{part}%",),
+            ).fetchone()
+            file.execute("UPDATE messages SET timestamp = ? WHERE id = ?", (late, third))
     assert depth_frame_numbers(path) == [7, 14, 28, 35, 42, 49, 56, 21]
     _restore_order(path)
     with open_camera(path) as played:

@@ -1,0 +1,15 @@
+"""Whose fault a missed grasp is: decided with a test from repeated misses, and kept in a ledger."""
+
+from coursekit.attribution.attribute import Attribution, Verdict, attribute
+from coursekit.attribution.ledger import Entry, Ledger
+from coursekit.attribution.simulate import SimulatedMisses, simulate_misses
+
+__all__ = [
+    "Attribution",
+    "Entry",
+    "Ledger",
+    "SimulatedMisses",
+    "Verdict",
+    "attribute",
+    "simulate_misses",
+]

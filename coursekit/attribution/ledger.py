@@ -1,0 +1,203 @@
+"""The ledger of attributed failures: one CSV file, one row a batch of trials.
+
+Several notebooks may append at once. A writer holds a lock, checks every row that is there, and
+replaces the file by one with a row more, so a reader sees the old file or the new one. The file
+opens in a spreadsheet, and text that a spreadsheet would run as a formula is kept as text.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+import math
+import sys
+from collections.abc import Iterator
+from dataclasses import astuple, dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
+
+from coursekit.results import folder, now, write_bytes
+
+if TYPE_CHECKING:
+    from coursekit.attribution.attribute import Attribution
+
+FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")  # what a spreadsheet takes as a formula
+LONGEST = 500
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One row: what the budget said about a task, then what trials of it showed.
+
+    Every number may be None, where it was not computed or there were no trials yet: the first row
+    of a ledger is the budget alone. date: ISO 8601. success: the probability that the budget gives
+    a grasp. mean_*, scatter_*: of the misses along the base's axes. p_mean, p_pose: of the tests.
+    """
+
+    date: str
+    task: str
+    camera: str = ""
+    noise_mm: float | None = None
+    bias_quadrature_mm: float | None = None
+    bias_worst_mm: float | None = None
+    tolerance_mm: float | None = None
+    success: float | None = None
+    trials: int | None = None
+    mean_x_mm: float | None = None
+    mean_y_mm: float | None = None
+    mean_z_mm: float | None = None
+    scatter_x_mm: float | None = None
+    scatter_y_mm: float | None = None
+    scatter_z_mm: float | None = None
+    p_mean: float | None = None
+    p_pose: float | None = None
+    verdict: str = ""
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        for name, value in zip(HEADER, astuple(self), strict=True):
+            _check(name, value)
+
+    @classmethod
+    def of(cls, found: Attribution, task: str, camera: str = "", **rest: Any) -> Entry:
+        """The row of an attribution, dated now. rest: other fields, such as tolerance_mm."""
+        given: dict[str, Any] = {
+            "date": now(),
+            "task": task,
+            "camera": camera,
+            "trials": found.n,
+            "p_mean": found.p_mean,
+            "p_pose": found.p_pose,
+            "verdict": found.verdict,
+        }
+        for axis, mean, scatter in zip("xyz", found.mean_m, found.scatter_m, strict=True):
+            given[f"mean_{axis}_mm"] = 1e3 * float(mean)
+            given[f"scatter_{axis}_mm"] = 1e3 * float(scatter)
+        return cls(**given | rest)
+
+
+HEADER = tuple(field.name for field in fields(Entry))
+TEXTS = ("date", "task", "camera", "verdict", "note")
+
+
+class Ledger:
+    """A CSV file of `Entry` rows, made when the first is appended.
+
+    path: None takes `ledger.csv` beside the results of the notebooks.
+    """
+
+    def __init__(self, path: Path | str | None = None) -> None:
+        self.path = folder() / "ledger.csv" if path is None else Path(path)
+
+    def append(self, entry: Entry) -> None:
+        """Add one row, whole or not at all.
+
+        Raises ValueError, and leaves the file as it is, where it has another header or a damaged
+        row; OSError where it cannot be written.
+        """
+        if not isinstance(entry, Entry):
+            raise ValueError(f"entry: got a {type(entry).__name__}, want an Entry")
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with _locked(self.path.with_name(f".{self.path.name}.lock")):
+            rows = [*self.read(), entry]
+            text = io.StringIO(newline="")
+            writer = csv.writer(text, lineterminator="\n")
+            writer.writerow(HEADER)
+            writer.writerows([_cell(value) for value in astuple(row)] for row in rows)
+            write_bytes(self.path, text.getvalue().encode("utf-8"))
+
+    def read(self) -> tuple[Entry, ...]:
+        """All rows, the oldest first; none where there is no file yet.
+
+        Raises ValueError that names the file and the line for what is no ledger.
+        """
+        try:
+            text = self.path.read_bytes().decode("utf-8-sig")  # some spreadsheets add a mark
+        except FileNotFoundError:
+            return ()
+        except UnicodeDecodeError as error:
+            raise ValueError(f"{self.path.name}: is not UTF-8 text ({error.reason})") from error
+        reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+        entries = []
+        try:
+            for index, row in enumerate(reader):
+                if index:
+                    entries.append(_entry(row))
+                elif tuple(row) != HEADER:
+                    raise ValueError(f"the header is {','.join(row)[:80]!r}, not a ledger's")
+        except (ValueError, csv.Error) as error:
+            raise ValueError(
+                f"{self.path.name}, line {reader.line_num}: {error}. Mend it or move it away."
+            ) from error
+        if reader.line_num == 0:
+            raise ValueError(f"{self.path.name}: is empty. Move it away.")
+        return tuple(entries)
+
+    def __repr__(self) -> str:
+        rows = self.read()
+        lines = [
+            f"{row.date[:10]}  {row.task[:40]:<40}  {row.trials or 0:>4} trials  "
+            f"{row.verdict or 'budget'}"
+            for row in rows
+        ]
+        return "\n".join([f"{self.path.name}: {len(rows)} row{'s' * (len(rows) != 1)}", *lines])
+
+
+def _cell(value: str | float | None) -> str:
+    """What is written: six digits of a number, text that cannot be taken for a formula."""
+    if value is None:
+        return ""
+    if not isinstance(value, str):
+        return f"{value:.6g}"
+    risky = value.lstrip().startswith(FORMULA) or value.startswith("'")
+    return "'" + value if risky else value
+
+
+def _entry(row: list[str]) -> Entry:
+    if len(row) != len(HEADER):
+        raise ValueError(f"has {len(row)} fields, want {len(HEADER)}")
+    return Entry(**{name: _value(name, cell) for name, cell in zip(HEADER, row, strict=True)})
+
+
+def _value(name: str, cell: str) -> Any:
+    if name in TEXTS:
+        return cell.removeprefix("'")
+    if not cell:
+        return None
+    try:
+        return int(cell) if name == "trials" else float(cell)
+    except ValueError:
+        raise ValueError(f"{name} is {cell[:40]!r}, want a number") from None
+
+
+def _check(name: str, value: Any) -> None:
+    if name in TEXTS:
+        plain = isinstance(value, str) and len(value) <= LONGEST and value.isprintable()
+        if not plain:
+            raise ValueError(f"{name}: got {str(value)[:40]!r}, want one line of {LONGEST} at most")
+        if not value and name in ("date", "task"):
+            raise ValueError(f"{name}: got nothing")
+    elif value is not None:
+        kinds = (int,) if name == "trials" else (int, float)
+        if isinstance(value, bool) or not isinstance(value, kinds) or not math.isfinite(value):
+            raise ValueError(f"{name}: got {value!r}, want a finite number or None")
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Held by one writer at a time; given back when the writer ends, however it ends."""
+    with path.open("a+", encoding="utf-8") as file:
+        _lock(file)
+        yield  # closing the file unlocks it
+
+
+def _lock(file: TextIO) -> None:
+    if sys.platform == "win32":
+        import msvcrt
+
+        msvcrt.locking(file.fileno(), msvcrt.LK_LOCK, 1)  # waits up to ten seconds
+    else:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX)

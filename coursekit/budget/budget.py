@@ -1,0 +1,397 @@
+"""The table: every error at the object, in millimetres, bias and noise apart.
+
+Noise averages down and adds in quadrature. Bias repeats, and how biases add is a question of what
+is asked:
+
+- worst case: how far off can it be, if every bias has its largest size and all point one way?
+- quadrature: how far off is it typically, if their directions have nothing to do with each other?
+- Monte Carlo: how often is it off by more than a tolerance, if sizes and directions are drawn?
+"""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from coursekit.budget.terms import ErrorTerm, effective_frames
+from coursekit.budget.view import AXES, GraspAxes, View
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+
+Range = tuple[float, float]
+Directions = Literal["own", "isotropic"]
+QUESTIONS = {
+    "worst case": "how far off can it be, if all point one way?",
+    "quadrature": "how far off is it, if the directions are unrelated?",
+    "Monte Carlo": "how often is it off by more than the tolerance?",
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """A term at the object, of single frames: low and high of its length, m.
+
+    along_m: the most it does along closing, approach and lateral, (3,) m.
+    """
+
+    term: ErrorTerm
+    low_m: float
+    high_m: float
+    along_m: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class AxisBudget:
+    """What adds up along one axis of the grasp, m: one standard deviation of noise, bias ranges."""
+
+    axis: str
+    tolerance_m: float
+    noise_m: float
+    worst_case_m: Range
+    quadrature_m: Range
+
+    @property
+    def fits(self) -> bool:
+        """Whether the worst case of the biases and two sigmas of noise stay in the tolerance."""
+        return self.worst_case_m[1] + 2 * self.noise_m <= self.tolerance_m
+
+
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """Displacements drawn from a budget, (n, 3), m, in the base; axes (3, 3): rows of the grasp."""
+
+    displacements_m: Floats
+    axes: Floats
+    tolerance_m: tuple[float, float, float]
+
+    @property
+    def norm_m(self) -> Floats:
+        """Their lengths, (n,)."""
+        return np.linalg.norm(self.displacements_m, axis=1)
+
+    @property
+    def along_m(self) -> Floats:
+        """Along closing, approach and lateral, (n, 3)."""
+        return np.asarray(self.displacements_m @ self.axes.T)
+
+    @property
+    def mean_m(self) -> float:
+        """The mean length."""
+        return float(self.norm_m.mean())
+
+    def percentile_m(self, percent: float = 95) -> float:
+        """The length that so many percent stay below."""
+        return float(np.percentile(self.norm_m, percent))
+
+    def share_over(self, tolerance_m: float, axis: str | None = None) -> float:
+        """The share that is off by more than this, in length or to either side along an axis."""
+        if axis is None:
+            return float((self.norm_m > tolerance_m).mean())
+        return float((np.abs(self.along_m[:, axis_index(axis)]) > tolerance_m).mean())
+
+    def success(self) -> float:
+        """The share that stays within the tolerance along all three axes."""
+        return float((np.abs(self.along_m) <= np.array(self.tolerance_m)).all(axis=1).mean())
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorBudget:
+    """Error terms seen from one place, and a grasp with its tolerances.
+
+    frames: how many frames are averaged; autocorrelation: of one frame's noise with the next's.
+    title: of the table. Raises ValueError for no terms or two of one name, and for frames or
+    autocorrelation as `effective_frames` does.
+    """
+
+    terms: tuple[ErrorTerm, ...]
+    view: View
+    grasp: GraspAxes = field(default_factory=GraspAxes)
+    frames: int = 1
+    autocorrelation: float = 0.0
+    title: str = "Error budget"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "terms", tuple(self.terms))
+        names = [term.name for term in self.terms]
+        twice = [name for name in names if names.count(name) > 1]
+        if twice:
+            raise ValueError(f"terms: got {twice[0]!r} more than once, want different names")
+        if not names:
+            raise ValueError("terms: got none, want at least one")
+        effective_frames(self.frames, self.autocorrelation)  # says what is wrong with them
+        object.__setattr__(self, "_matrices", tuple(t.matrix(self.view) for t in self.terms))
+
+    # --- the same budget otherwise ---
+
+    def at(self, **changes: Any) -> ErrorBudget:
+        """The budget from another place or with more frames: distance_m, u, v, off_axis_deg,
+        baseline_m, intrinsics and T_base_camera of the view; grasp, frames, autocorrelation, title.
+
+        Raises ValueError where the view changes and a row holds only where it was stated.
+        """
+        own = {k: changes.pop(k) for k in tuple(changes) if k in self.__dataclass_fields__}
+        if changes:
+            stated = [term.name for term in self.terms if term.stated_m is not None]
+            if stated:
+                raise ValueError(
+                    f"{next(iter(changes))}: {stated[0]!r} is stated at the object and knows no "
+                    "other place; take a budget whose rows are converted"
+                )
+            own["view"] = self.view.moved(**changes)
+        return replace(self, **own)
+
+    def with_term(self, term: ErrorTerm) -> ErrorBudget:
+        """The budget with this term in the place of the one of the same name, or added."""
+        if term.name not in self.names:
+            return replace(self, terms=(*self.terms, term))
+        return replace(self, terms=tuple(term if t.name == term.name else t for t in self.terms))
+
+    def scaled(self, name: str, factor: float) -> ErrorBudget:
+        """The budget with one term's magnitude times `factor`."""
+        return self.with_term(self[name].scaled(factor))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the terms, in order."""
+        return tuple(term.name for term in self.terms)
+
+    def __getitem__(self, name: str) -> ErrorTerm:
+        for term in self.terms:
+            if term.name == name:
+                return term
+        raise ValueError(f"name: got {name!r}, want one of {', '.join(self.names)}")
+
+    # --- what adds up ---
+
+    @property
+    def rows(self) -> tuple[Row, ...]:
+        """Each term at the object, of single frames."""
+        axes, found = self.grasp.directions, []
+        for term, matrix in zip(self.terms, self._terms_matrices, strict=True):
+            along = term.range[1] * np.linalg.norm(axes @ matrix, axis=1)
+            found.append(Row(term, *term.at_object_m(self.view), tuple(along.tolist())))
+        return tuple(found)
+
+    @property
+    def noise_m(self) -> float:
+        """One standard deviation: the noise rows in quadrature, after averaging.
+
+        Each row along the direction in which it is largest, as tables do; `noise_covariance` says
+        what is true of all three directions.
+        """
+        lengths = [
+            self._sigma(term) * np.linalg.norm(matrix, 2) for term, matrix in self._of("noise")
+        ]
+        return math.hypot(*lengths)
+
+    @property
+    def noise_covariance(self) -> Floats:
+        """Of the object's position by noise, after averaging, base axes, (3, 3), m²."""
+        total = np.zeros((3, 3))
+        for term, matrix in self._of("noise"):
+            total += self._sigma(term) ** 2 * matrix @ matrix.T
+        return total
+
+    @property
+    def noise_total_m(self) -> float:
+        """Root mean square length of the displacement by noise, all directions together."""
+        return float(np.sqrt(np.trace(self.noise_covariance)))
+
+    @property
+    def worst_case_m(self) -> Range:
+        """(low, high) of the biases if all point one way."""
+        lows, highs = self._bias_lengths
+        return sum(lows), sum(highs)
+
+    @property
+    def quadrature_m(self) -> Range:
+        """(low, high) of the biases if their directions are unrelated."""
+        lows, highs = self._bias_lengths
+        return math.hypot(*lows), math.hypot(*highs)
+
+    def along(self, axis: str) -> AxisBudget:
+        """Along "closing", "approach" or "lateral": each term with its greatest effect there."""
+        i = axis_index(axis)
+        direction = self.grasp.directions[i]
+        lows, highs = [], []
+        for term, matrix in self._of("bias"):
+            gain = float(np.linalg.norm(direction @ matrix))
+            lows.append(term.range[0] * gain)
+            highs.append(term.range[1] * gain)
+        noise = float(np.sqrt(direction @ self.noise_covariance @ direction))
+        return AxisBudget(
+            axis,
+            self.grasp.tolerance_m[i],
+            noise,
+            (sum(lows), sum(highs)),
+            (math.hypot(*lows), math.hypot(*highs)),
+        )
+
+    # --- how often ---
+
+    def draw(
+        self,
+        n: int = 1_000_000,
+        seed: int = 0,
+        directions: Directions = "own",
+        noise: bool = False,
+    ) -> Draws:
+        """n rigs: each bias with a magnitude from its range and a direction, all independent.
+
+        directions: "own", each as its term can point (depth along the ray, a turn across it), or
+        "isotropic", each with its length at the object and any direction in space, which is what
+        a table of lengths alone says. Magnitudes are uniform in their ranges, or normal where the
+        term says so. noise: add it, after averaging, as at one grasp of each rig.
+        The same seed draws the same numbers term by term, so a budget with one term changed
+        differs by that term only.
+        """
+        chosen = [i for i, term in enumerate(self.terms) if noise or term.kind == "bias"]
+        total = np.zeros((3, _checked(n, directions)))
+        for i in chosen:
+            total += self._part(i, n, seed, directions)
+        return self.as_draws(total)
+
+    def parts(self, n: int, seed: int = 0, directions: Directions = "own") -> Iterator[Floats]:
+        """What each term, noise included, does in n draws, (3, n) m in the base, in their order.
+
+        `draw` is their sum. A part is proportional to its term's magnitude.
+        """
+        _checked(n, directions)
+        return (self._part(i, n, seed, directions) for i in range(len(self.terms)))
+
+    def as_draws(self, displacements: Floats) -> Draws:
+        """Displacements (3, n), m in the base, with the axes and tolerances of the grasp."""
+        return Draws(displacements.T, self.grasp.directions, self.grasp.tolerance_m)
+
+    # --- the inside ---
+
+    def _part(self, i: int, n: int, seed: int, directions: Directions) -> Floats:
+        term, matrix = self.terms[i], self._terms_matrices[i]
+        rng, k = np.random.default_rng([seed, i]), matrix.shape[1]
+        if term.kind == "noise":
+            return np.asarray(self._sigma(term) * matrix @ rng.standard_normal((k, n)))
+        if directions == "own":
+            return np.asarray(matrix @ _components(term.range, k, n, term.normal, rng))
+        return _components(term.at_object_m(self.view), 3, n, term.normal, rng)
+
+    @property
+    def _terms_matrices(self) -> tuple[Floats, ...]:
+        matrices: tuple[Floats, ...] = self.__dict__["_matrices"]
+        return matrices
+
+    def _of(self, kind: str) -> Iterator[tuple[ErrorTerm, Floats]]:
+        pairs = zip(self.terms, self._terms_matrices, strict=True)
+        return ((term, matrix) for term, matrix in pairs if term.kind == kind)
+
+    def _sigma(self, term: ErrorTerm) -> float:
+        """Of a noise after averaging; its floor stays."""
+        effective = effective_frames(self.frames, self.autocorrelation)
+        return math.hypot(term.range[1] / math.sqrt(effective), term.floor)
+
+    @property
+    def _bias_lengths(self) -> tuple[list[float], list[float]]:
+        ranges = [term.at_object_m(self.view) for term, _ in self._of("bias")]
+        return [low for low, _ in ranges], [high for _, high in ranges]
+
+    # --- for people ---
+
+    def table(self) -> tuple[Sequence[str], list[Sequence[str]]]:
+        """Heading and one line of text a term."""
+        head = ("error", "kind", "magnitude", "conversion", "at the object", "whose number")
+        lines: list[Sequence[str]] = []
+        for row in self.rows:
+            term = row.term
+            lines.append(
+                (
+                    term.name,
+                    term.kind,
+                    term.magnitude,
+                    term.conversion,
+                    _span(row.low_m, row.high_m),
+                    term.source,
+                )
+            )
+        return head, lines
+
+    def summary(self) -> list[str]:
+        """The sums, a line each, with the question each answers."""
+        averaged = f", {self.frames} frames" if self.frames > 1 else ""
+        text = [f"noise in quadrature{averaged}: {1e3 * self.noise_m:.2f} mm (one sigma)"]
+        sums = {"worst case": self.worst_case_m, "quadrature": self.quadrature_m}
+        for name, (low, high) in sums.items():
+            text.append(f"bias, {name}: {_span(low, high)} ({QUESTIONS[name]})")
+        for axis in AXES:
+            a = self.along(axis)
+            text.append(
+                f"{axis}: bias up to {1e3 * a.worst_case_m[1]:.1f} mm, in quadrature "
+                f"{1e3 * a.quadrature_m[1]:.1f}, noise {1e3 * a.noise_m:.2f}; "
+                f"tolerance ±{1e3 * a.tolerance_m:.1f}"
+            )
+        return text
+
+    def _heading(self) -> str:
+        view = self.view
+        return (
+            f"{self.title}: Z = {view.distance_m:.2f} m, {view.off_axis_deg:.0f}° off axis, "
+            f"f = {view.intrinsics.fx:.0f} px, baseline {1e3 * view.baseline_m:.0f} mm"
+        )
+
+    def __repr__(self) -> str:
+        shown = [(name, kind, what, at) for name, kind, what, _, at, _ in self.table()[1]]
+        shown.insert(0, ("error", "kind", "magnitude", "at the object"))
+        widths = [max(len(line[i]) for line in shown) for i in range(4)]
+        lines = [
+            "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
+            for line in shown
+        ]
+        return "\n".join([self._heading(), *lines, *self.summary()])
+
+    def _repr_html_(self) -> str:
+        head, lines = self.table()
+        top = "".join(f"<th style='text-align:left'>{html.escape(cell)}</th>" for cell in head)
+        body = "".join(
+            "<tr>"
+            + "".join(f"<td style='text-align:left'>{html.escape(c)}</td>" for c in line)
+            + "</tr>"
+            for line in lines
+        )
+        notes = "".join(f"<li>{html.escape(line)}</li>" for line in self.summary())
+        heading = html.escape(self._heading())
+        return f"<p><b>{heading}</b></p><table><tr>{top}</tr>{body}</table><ul>{notes}</ul>"
+
+
+def axis_index(axis: str) -> int:
+    """Of "closing", "approach", "lateral"; ValueError for any other name."""
+    if axis not in AXES:
+        raise ValueError(f"axis: got {axis!r}, want one of {', '.join(AXES)}")
+    return AXES.index(axis)
+
+
+def _checked(n: int, directions: str) -> int:
+    if not isinstance(n, (int, np.integer)) or n < 1:
+        raise ValueError(f"n: got {n!r}, want a whole number of draws")
+    if directions not in ("own", "isotropic"):
+        raise ValueError(f"directions: got {directions!r}, want 'own' or 'isotropic'")
+    return int(n)
+
+
+def _components(span: Range, k: int, n: int, normal: bool, rng: np.random.Generator) -> Floats:
+    """Components (k, n) of a bias: a length from its range and a direction, or normal ones."""
+    directions = rng.standard_normal((k, n))
+    if normal:
+        return np.asarray(span[1] / 2 * directions)
+    lengths = rng.uniform(*span, n)
+    return np.asarray(directions * (lengths / np.linalg.norm(directions, axis=0)))
+
+
+def _span(low_m: float, high_m: float) -> str:
+    low, high = f"{1e3 * low_m:.1f}", f"{1e3 * high_m:.1f}"
+    return f"{high} mm" if low == high else f"{low} to {high} mm"

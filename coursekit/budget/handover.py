@@ -1,0 +1,290 @@
+"""What notebooks 1 to 4 found becomes the rows of the budget, and each row says whose it is.
+
+A file that is missing, of another version, or damaged is named, and the reference that comes with
+the course is used in its place; so is a file that lacks a number. Nothing is replaced in silence.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from coursekit import results
+from coursekit.budget.budget import ErrorBudget
+from coursekit.budget.propagate import PARAMETERS, Covariances
+from coursekit.budget.tables import LESSON_DISTANCE_M, lesson_terms
+from coursekit.budget.terms import SIGMAS, ErrorTerm
+from coursekit.budget.view import GraspAxes, View, looking_down
+from coursekit.geometry import Intrinsics
+from coursekit.results import Covariance, Quantity, Result
+from coursekit.specifications import DATA, device
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    Floats = NDArray[np.float64]
+
+LESSONS = ("01_pinhole", "02_depth_noise", "03_intrinsics", "04_hand_eye")
+REFERENCE = DATA / "reference_results"
+NEEDED: dict[str, tuple[str, ...]] = {  # "a|b": either
+    "01_pinhole": ("depth_fx", "depth_fy", "depth_cx", "depth_cy"),
+    "02_depth_noise": ("sigma_d", "depth_bias_fitted_at_450_mm|depth_bias_at_450_mm"),
+    "03_intrinsics": ("fx", "fy", "cx", "cy"),
+    "04_hand_eye": ("rx", "ry", "rz", "tx", "ty", "tz"),
+}
+BY_SIGMA = ("03_intrinsics", "04_hand_eye")  # their sigmas are the rows; without they say nothing
+TOGETHER = ("01_pinhole", "03_intrinsics", "04_hand_eye")  # all of it from one place, or none
+GROUPS = {"03_intrinsics": "intrinsics", "04_hand_eye": "X"}
+SIZE = (848, 480)  # of the depth image; notebook 1 keeps only its K
+
+
+@dataclass(frozen=True)
+class Found:
+    """One notebook's result. says: whose is used, and why if it is not the student's.
+
+    yours: None where it cannot be used. lacks: what it does not hold and the reference gives.
+    """
+
+    lesson: str
+    yours: Result | None
+    reference: Result | None
+    says: str
+    lacks: tuple[str, ...] = ()
+
+    def result(self, names: str = "") -> Result:
+        """The student's, else the reference, of a number in `NEEDED`; ValueError for neither."""
+        chosen = self.reference if names in self.lacks else self.yours or self.reference
+        if chosen is None:
+            raise ValueError(f"{self.lesson}: no number to use. {self.says}")
+        return chosen
+
+    def whose(self, names: str = "") -> str:
+        """Whose number that is, in a few words, for a row of the table."""
+        result = self.result(names)
+        if result is self.reference:
+            return f"reference ({result.camera})"
+        return f"yours ({result.source}: {result.camera}, {result.date[:10]})"
+
+
+@dataclass(frozen=True)
+class HandOver:
+    """What the four notebooks hand over, by name of the lesson."""
+
+    found: dict[str, Found]
+
+    def __getitem__(self, lesson: str) -> Found:
+        if lesson not in self.found:
+            raise ValueError(f"lesson: got {lesson!r}, want one of {', '.join(self.found)}")
+        return self.found[lesson]
+
+    def __iter__(self) -> Iterator[Found]:
+        return iter(self.found.values())
+
+    def quantity(self, lesson: str, names: str) -> Quantity:
+        """A number of one notebook; names: "a|b" is b where there is no a."""
+        quantities = self[lesson].result(names).quantities
+        name = _first(quantities, names)
+        if name is None:
+            raise ValueError(f"{lesson}: holds no {names.replace('|', ' or ')}")
+        return quantities[name]
+
+    def covariance(self, lesson: str) -> Covariance | None:
+        """Of the numbers that this notebook estimated together, None where it kept none."""
+        return self[lesson].result().covariances.get(GROUPS.get(lesson, ""))
+
+    def __repr__(self) -> str:
+        return "\n".join(found.says for found in self)
+
+    # --- the budget ---
+
+    def view(
+        self,
+        distance_m: float = LESSON_DISTANCE_M,
+        baseline_m: float | None = None,
+        T_base_camera: Floats | None = None,
+    ) -> View:
+        """The camera of notebook 1 with the object on its axis; baseline_m: None is the D435's."""
+        fx, fy, cx, cy = (self.quantity("01_pinhole", name).value for name in NEEDED["01_pinhole"])
+        baseline = device("D435").unit.baseline_m if baseline_m is None else baseline_m
+        T = looking_down() if T_base_camera is None else T_base_camera
+        return View(Intrinsics(*SIZE, fx, fy, cx, cy), distance_m, baseline, T_base_camera=T)
+
+    def terms(self) -> tuple[ErrorTerm, ...]:
+        """The rows, each with its source.
+
+        What nobody has measured stays the lesson's: the detector's pixel and the arm. What was
+        measured with a standard deviation is a normal bias, shown up to two of them.
+        """
+        pixel, *_, arm = lesson_terms(stated=False)
+        return (
+            pixel,
+            self._depth_noise(),
+            self._depth_bias(),
+            self._intrinsics(),
+            self._hand_eye("rotation"),
+            self._hand_eye("translation"),
+            arm,
+        )
+
+    def budget(self, view: View | None = None, grasp: GraspAxes | None = None) -> ErrorBudget:
+        """The student's own table, the reference's numbers where there are no others."""
+        title = "Your budget" if any(found.yours for found in self) else "The reference budget"
+        return ErrorBudget(self.terms(), view or self.view(), grasp or GraspAxes(), title=title)
+
+    def covariances(self, view: View, arm: ArrayLike | None = None) -> Covariances:
+        """What `propagate` takes, from the same numbers: noise and what calibration left unknown.
+
+        arm (6, 6): of the gripper's twist, as `arm.fk_covariance(q).covariance`; None: exact. The
+        depth bias, which has a known size, is not in it. The mount's covariance is in the frame in
+        which notebook 4 gave X: the gripper's for a camera on the wrist, else the base's; the
+        `Chain` must be of the same mount.
+        """
+        K = self._known("03_intrinsics", NEEDED["03_intrinsics"])
+        X = self._known("04_hand_eye", NEEDED["04_hand_eye"])
+        order = [X.names.index(name) for name in NEEDED["04_hand_eye"]]
+        unit = np.repeat([math.radians(1.0), 1e-3], 3)
+        depth = self._depth_noise()
+        return Covariances(
+            pixel=np.eye(2),
+            depth_sigma_m=depth.at_object_m(view)[1] / float(np.linalg.norm(view.ray)),
+            intrinsics=np.array(K.matrix),
+            names=K.names,
+            hand_eye=np.array(X.matrix)[np.ix_(order, order)] * np.outer(unit, unit),
+            arm=arm,
+        )
+
+    def _known(self, lesson: str, names: tuple[str, ...]) -> Covariance:
+        """The covariance that the notebook kept, else the sigmas of these numbers."""
+        known = self.covariance(lesson)
+        usable = (*PARAMETERS, *NEEDED["04_hand_eye"])
+        if known is not None and set(names) <= set(known.names) <= set(usable):
+            return known
+        sigmas = [self.quantity(lesson, name).sigma for name in names]
+        if None in sigmas:
+            raise ValueError(f"{lesson}: {names[sigmas.index(None)]} has no sigma")
+        variances = np.square(np.array(sigmas, dtype=np.float64))
+        return Covariance(names, np.diag(variances))  # type: ignore[arg-type]
+
+    def _depth_noise(self) -> ErrorTerm:
+        sigma_d = self.quantity("02_depth_noise", "sigma_d").value
+        whose = self["02_depth_noise"].whose("sigma_d")
+        return ErrorTerm("depth noise", "noise", sigma_d, sigma_d, "disparity", whose)
+
+    def _depth_bias(self) -> ErrorTerm:
+        """As a scale: between a shift, which does not grow with Z, and an offset of disparity,
+        which grows with Z²; at 0.45 m, where it was measured, all three are the same."""
+        name = NEEDED["02_depth_noise"][1]
+        bias, whose = self.quantity("02_depth_noise", name), self["02_depth_noise"].whose(name)
+        sigma = SIGMAS * (bias.sigma or 0.0)
+        low, high = max(0.0, abs(bias.value) - sigma), abs(bias.value) + sigma
+        low, high = (1e-3 * value / LESSON_DISTANCE_M for value in (low, high))
+        return ErrorTerm("depth bias", "bias", low, high, "scale", whose)
+
+    def _intrinsics(self) -> ErrorTerm:
+        """By the covariance of K and lens together, where there is one; else by the sigmas.
+
+        Pessimistic where the same K was used for the hand-eye calibration, which takes up a part
+        of its error.
+        """
+        known = self._known("03_intrinsics", NEEDED["03_intrinsics"])
+        factor = np.zeros((len(PARAMETERS), len(known.names)))
+        factor[[PARAMETERS.index(name) for name in known.names]] = _root(np.array(known.matrix))
+        rows = tuple(map(tuple, factor.tolist()))
+        whose = self["03_intrinsics"].whose()
+        return ErrorTerm(
+            "intrinsics", "bias", 0.0, SIGMAS, "intrinsics", whose, normal=True, factor=rows
+        )
+
+    def _hand_eye(self, part: str) -> ErrorTerm:
+        """The root mean square over the three axes: a row knows no frame. What `propagate` takes
+        is the whole covariance."""
+        names, along, unit = (
+            (("rx", "ry", "rz"), "turn", math.radians(1.0))
+            if part == "rotation"
+            else (("tx", "ty", "tz"), "shift", 1e-3)
+        )
+        known = self._known("04_hand_eye", NEEDED["04_hand_eye"])
+        variances = [known.matrix[i][i] for i in map(known.names.index, names)]
+        high = SIGMAS * unit * math.sqrt(sum(variances) / 3)
+        whose = self["04_hand_eye"].whose()
+        return ErrorTerm(f"hand-eye {part}", "bias", 0.0, high, along, whose, normal=True)  # type: ignore[arg-type]
+
+
+def hand_over(reference: Path = REFERENCE) -> HandOver:
+    """Read `results/01` to `04` where they are whole, else their reference, and say which.
+
+    Raises nothing: a number that neither has is a ValueError when it is asked for.
+    """
+    return HandOver({lesson: _find(lesson, reference) for lesson in LESSONS})
+
+
+def _find(lesson: str, reference: Path) -> Found:
+    stand_in, comes_in = _stand_in(reference / f"{lesson}.json")
+    try:
+        yours = results.load(lesson)
+        if yours.lesson != lesson:
+            raise ValueError(f"it is the result of notebook {yours.lesson}")
+    except FileNotFoundError:
+        why = f"results/{lesson}.json is not there yet, notebook {lesson} has not saved it"
+        return Found(lesson, None, stand_in, f"{lesson}: {why}; {comes_in}.")
+    except (ValueError, OSError) as error:
+        why = f"results/{lesson}.json cannot be used ({str(error).rstrip('.')})"
+        return Found(lesson, None, stand_in, f"{lesson}: {why}; {comes_in}.")
+    lacks = _lacking(lesson, yours)
+    names = ", ".join(name.replace("|", " or ") for name in lacks)
+    what = f"no {names}" if lesson not in BY_SIGMA else f"no {names} with a sigma"
+    if lacks and lesson in TOGETHER:
+        why = f"results/{lesson}.json holds {what}"
+        return Found(lesson, None, stand_in, f"{lesson}: {why}; {comes_in}.")
+    but = f", but it holds {what}: for that, {comes_in}" if lacks else ""
+    whose = Found(lesson, yours, stand_in, "").whose()
+    return Found(lesson, yours, stand_in, f"{lesson}: {whose}{but}.", lacks)
+
+
+def _stand_in(path: Path) -> tuple[Result | None, str]:
+    """The reference, and what becomes of the rows that need it."""
+    try:
+        return _read(path), "the reference is used"
+    except FileNotFoundError:
+        return None, f"and there is no reference {path.name}"
+    except ValueError as error:
+        return None, f"and the reference is damaged ({error})"
+
+
+def _lacking(lesson: str, result: Result) -> tuple[str, ...]:
+    def usable(names: str) -> bool:
+        name = _first(result.quantities, names)
+        if name is None:
+            return False
+        return lesson not in BY_SIGMA or result.quantities[name].sigma is not None
+
+    return tuple(names for names in NEEDED[lesson] if not usable(names))
+
+
+def _first(quantities: dict[str, Quantity], names: str) -> str | None:
+    return next((name for name in names.split("|") if name in quantities), None)
+
+
+def _read(path: Path) -> Result:
+    """A reference file; it has the format of `results`, in another folder."""
+    content = results.read_json(path)
+    try:
+        if content.pop("format") != results.FORMAT:
+            raise ValueError("written by another version of the course")
+        quantities = {k: Quantity(**v) for k, v in content.pop("quantities").items()}
+        covariances = {k: Covariance(**v) for k, v in content.pop("covariances", {}).items()}
+        return Result(**content, quantities=quantities, covariances=covariances)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path.name}: {error}") from error
+
+
+def _root(matrix: Floats) -> Floats:
+    """A symmetric square root of a covariance whose entries differ by powers of ten, (p, p)."""
+    scale = np.sqrt(np.where(np.diag(matrix) > 0, np.diag(matrix), 1.0))
+    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
+    return np.asarray(scale[:, None] * vectors * np.sqrt(np.clip(values, 0, None)))

@@ -1,0 +1,442 @@
+"""Attribution of misses: the shares of right and wrong verdicts, the tests behind, the ledger.
+
+Rules and thresholds were set on the seeds below 100,000; the tests use seeds from there on. The
+bounds on shares of 1,000 sets are those asked of the course; on other seeds the figures were two
+standard errors or more on the safe side of each. COURSEKIT_NIGHTLY=1 checks the levels of the
+mean test and the pose test with ten times as many sets.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+import threading
+from collections import Counter
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.stats import binom, f, ncf, t
+
+from coursekit.arm import widowx
+from coursekit.attribution import Entry, Ledger, attribute, simulate_misses
+from coursekit.attribution.ledger import HEADER
+from coursekit.attribution.mean_test import (
+    POOLED,
+    effective_axes,
+    mean_power,
+    mean_test,
+    pose_power,
+)
+from coursekit.attribution.pose_test import GROUPS, STILL, pose_columns, pose_test
+
+NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
+SETS = 1000
+FIRST_SEED = 100_000
+MANY = 40_000 if NIGHTLY else 4_000
+LEVEL = 0.01
+
+
+@cache
+def shares(
+    kind: str, n: int | None = None, poses: bool = True, sets: int = SETS, **options
+) -> dict[str, float]:
+    """Of each verdict on sets of n trials, or of 5 to 30 in turn."""
+    found: Counter[str] = Counter()
+    for i in range(sets):
+        made = simulate_misses(kind, n or 5 + i % 26, FIRST_SEED + i, **options)
+        found[attribute(made.misses, made.T_base_gripper if poses else None).verdict] += 1
+    return {verdict: count / sets for verdict, count in found.items()}
+
+
+# --- verdicts ---
+
+
+@pytest.mark.parametrize("poses", [True, False])
+@pytest.mark.parametrize("kind", ["perception", "pose_dependent", "cannot_tell_yet"])
+def test_what_is_no_calibration_error_is_rarely_called_one(kind, poses):
+    assert shares(kind, poses=poses).get("calibration", 0) <= 0.02
+
+
+@pytest.mark.parametrize("poses", [True, False])
+@pytest.mark.parametrize(("trials", "least"), [(10, 0.80), (20, 0.97)])
+def test_a_bias_of_3_mm_under_2_mm_of_scatter_is_found(trials, least, poses):
+    assert shares("calibration", trials, poses)["calibration"] >= least
+
+
+def test_an_arm_error_is_found_from_the_poses_and_nothing_else_is_blamed_on_the_arm():
+    assert shares("pose_dependent", poses=True)["pose_dependent"] >= 0.70
+    assert shares("perception", poses=True).get("pose_dependent", 0) <= 0.02
+    assert shares("calibration", 20, True).get("pose_dependent", 0) <= 0.02
+
+
+def test_perception_is_said_once_enough_trials_rule_out_the_rest():
+    found = shares("perception", 25, sets=300)
+    assert found["perception"] >= 0.95
+    assert "perception" not in shares("perception", 6, sets=300)
+
+
+def test_uneven_scatter_as_of_depth_is_not_taken_for_a_constant():
+    found = shares("perception", noise_m=(0.001, 0.001, 0.004))
+    assert found.get("calibration", 0) <= 0.02
+
+
+def test_a_small_bias_across_large_depth_noise_is_found_by_hotelling():
+    rng = np.random.default_rng(FIRST_SEED)
+    misses = np.array([0.0015, 0, 0]) + rng.standard_normal((20, 3)) * (0.0006, 0.0006, 0.008)
+    found = attribute(misses)
+    assert found.mean_test.p_pooled > 0.05
+    assert found.p_hotelling < 1e-4
+    assert found.verdict == "calibration"
+
+
+def test_an_unfinished_verdict_says_how_many_trials_would_settle_it():
+    undecided = [simulate_misses("perception", 8, FIRST_SEED + i) for i in range(40)]
+    more = [attribute(made.misses, made.T_base_gripper).more_trials for made in undecided]
+    n = 8 + int(np.median([m for m in more if m]))
+    assert 14 <= n <= 22
+    assert shares("perception", n, sets=300)["perception"] >= 0.70
+    settled = attribute(simulate_misses("calibration", 30, FIRST_SEED).misses)
+    assert settled.more_trials == 0
+    hopeless = np.random.default_rng(1).standard_normal((10, 3)) * 0.1
+    assert attribute(hopeless).more_trials is None
+
+
+def test_a_constant_is_not_blamed_on_the_calibration_while_the_pose_may_explain_it():
+    blamed, unsure = Counter(), []
+    for i in range(200):
+        made = simulate_misses("pose_dependent", 6, FIRST_SEED + i, noise_m=0.001)
+        misses = made.misses + np.array([0.005, 0, 0])  # the arm's error is nowhere zero
+        found = attribute(misses, made.T_base_gripper)
+        blamed["without poses"] += attribute(misses).verdict == "calibration"
+        blamed["with poses"] += found.verdict == "calibration"
+        if "follow the pose" in found.says:
+            unsure.append(found)
+    assert blamed["with poses"] <= 0.7 * blamed["without poses"]
+    assert unsure
+    assert all(found.verdict == "cannot_tell_yet" and found.more_trials > 0 for found in unsure)
+
+
+def test_columns_of_the_arm_replace_the_general_regression():
+    arm = widowx()
+    verdicts = Counter()
+    for i in range(100):
+        made = simulate_misses("pose_dependent", 12, FIRST_SEED + i)
+        columns = arm.jacobian(made.q)[:, 3:]
+        verdicts[attribute(made.misses, columns=columns).verdict] += 1
+    assert verdicts["pose_dependent"] >= 75
+
+
+def test_poses_that_do_not_differ_are_not_tested():
+    made = simulate_misses("calibration", 12, FIRST_SEED)
+    found = attribute(made.misses, np.repeat(made.T_base_gripper[:1], 12, axis=0))
+    assert found.p_pose is None
+    assert found.verdict == "calibration"
+    assert "not ruled out" in repr(found)
+
+
+def test_the_numbers_are_those_of_the_textbook():
+    made = simulate_misses("calibration", 12, FIRST_SEED)
+    found = attribute(made.misses, made.T_base_gripper)
+    x = made.misses
+    S = (x - x.mean(0)).T @ (x - x.mean(0)) / 11
+    t2 = 12 * x.mean(0) @ np.linalg.inv(S) @ x.mean(0)
+    assert found.mean_test.t2 == pytest.approx(t2, rel=1e-9)
+    assert found.p_hotelling == pytest.approx(f.sf(t2 * 9 / 33, 3, 9), rel=1e-9)
+    half = t.ppf(0.975, 11) * x.std(0, ddof=1) / np.sqrt(12)
+    np.testing.assert_allclose(found.interval_m[:, 1] - found.mean_m, half, rtol=1e-9)
+    np.testing.assert_allclose(found.scatter_m, x.std(0, ddof=1), rtol=1e-12)
+
+
+def test_the_interval_of_the_mean_covers_it():
+    inside = []
+    for i in range(400):
+        made = simulate_misses("calibration", 10, FIRST_SEED + i)
+        low, high = attribute(made.misses).interval_m.T
+        inside.extend((low <= made.constant_m) & (made.constant_m <= high))
+    low, high = binom.ppf([0.001, 0.999], len(inside), 0.95) / len(inside)
+    assert low <= np.mean(inside) <= high
+
+
+def test_a_printout_is_narrow_and_names_cause_numbers_and_remedy():
+    made = simulate_misses("pose_dependent", 20, FIRST_SEED + 1)
+    text = repr(attribute(made.misses, made.T_base_gripper))
+    assert max(map(len, text.splitlines())) <= 88
+    for word in ("POSE DEPENDENT", "20 trials", "T²", "p <", "mm", "joint zeros", "a turn"):
+        assert word in text
+    few = repr(attribute(made.misses[:4]))
+    assert "CANNOT TELL YET" in few
+    assert "more would settle it" in few
+
+
+@pytest.mark.parametrize(
+    ("misses", "options", "words"),
+    [
+        (np.zeros((5, 2)), {}, "misses: got shape"),
+        (np.zeros((1, 3)), {}, "misses: got shape"),
+        (np.full((5, 3), np.nan), {}, r"misses\[0\]"),
+        (np.ones((5, 3)), {}, "millimetres"),
+        (np.zeros((5, 3)), {"level": 0.0}, "level"),
+        (np.zeros((5, 3)), {"matters_m": 3.0}, "matters_m"),
+        (np.zeros((5, 3)), {"poses": np.tile(np.eye(4), (4, 1, 1))}, "one for each of 5"),
+        (np.zeros((5, 3)), {"poses": np.zeros((5, 4, 4))}, "poses"),
+        (np.zeros((5, 3)), {"columns": np.zeros((5, 6))}, "columns"),
+        (
+            np.zeros((5, 3)),
+            {"columns": np.zeros((5, 3, 1)), "poses": np.tile(np.eye(4), (5, 1, 1))},
+            "one of them",
+        ),
+    ],
+)
+def test_bad_input_is_named(misses, options, words):
+    with pytest.raises(ValueError, match=words):
+        attribute(misses, **options)
+
+
+def test_misses_without_scatter_are_no_trouble():
+    same = np.tile([0.003, 0, 0], (8, 1))
+    assert attribute(same).verdict == "calibration"
+    assert attribute(same).p_hotelling is None
+    made = simulate_misses("perception", 8, FIRST_SEED)
+    assert attribute(same, made.T_base_gripper).verdict == "calibration"
+    assert attribute(np.zeros((8, 3))).p_mean == 1.0
+
+
+# --- the tests behind it ---
+
+
+@pytest.mark.parametrize("n", [5, 8, 10, 25])
+@pytest.mark.parametrize("scatter", [(1, 1, 1), (1, 1, 3), (1, 4, 4)])
+def test_the_level_of_the_mean_test(scatter, n):
+    rng = np.random.default_rng([FIRST_SEED, n, *scatter])
+    rows = rng.standard_normal((MANY, n, 3)) * scatter * 1e-3
+    rejected = sum(mean_test(row).p_value < LEVEL for row in rows)
+    assert rejected <= binom.ppf(0.999, MANY, 0.019)
+    assert rejected >= binom.ppf(0.001, MANY, 0.003)
+
+
+def test_the_level_of_the_pose_test_under_scatter_far_from_normal():
+    rng = np.random.default_rng(FIRST_SEED)
+    columns = pose_columns(simulate_misses("perception", 8, FIRST_SEED).T_base_gripper)
+    p = np.array(
+        [
+            pose_test(rng.standard_t(2, (8, 3)) * 1e-3, columns, {}, STILL, 0.05).p_value
+            for _ in range(MANY // 2)
+        ]
+    )
+    low, high = binom.ppf([0.001, 0.999], len(p), 0.05)
+    assert low <= np.count_nonzero(p <= 0.05) <= high
+
+
+@pytest.mark.parametrize("scatter", [(1, 1, 1), (1, 1, 2)])
+def test_the_stated_power_is_the_share_found(scatter):
+    """Of the pooled test alone, with the scatter known; for a bias in any direction."""
+    n, size, S = 10, 1.5e-3 * np.sqrt(np.mean(np.square(scatter))), np.diag(np.square(scatter))
+    axes = np.trace(S) ** 2 / np.trace(S @ S)
+    rng = np.random.default_rng(FIRST_SEED)
+    bias = rng.standard_normal((MANY, 1, 3))
+    bias *= size / np.linalg.norm(bias, axis=2, keepdims=True)
+    rows = bias + 1e-3 * rng.standard_normal((MANY, n, 3)) * scatter
+    found = np.mean([mean_test(row).p_pooled < LEVEL * POOLED for row in rows])
+    assert mean_power(size, 1e-6 * S, axes, n, LEVEL) == pytest.approx(found, abs=0.06)
+
+
+def test_the_power_for_even_scatter_is_the_noncentral_f():
+    S = 4e-6 * np.eye(3)
+    limit = f.isf(LEVEL * POOLED, 3, 27)
+    assert mean_power(0.003, S, 3.0, 10, LEVEL) == pytest.approx(ncf.sf(limit, 3, 27, 22.5))
+    limit = f.isf(LEVEL, 7, 20)
+    assert pose_power(0.003, S, 3.0, 10, 7, LEVEL) == pytest.approx(ncf.sf(limit, 7, 20, 22.5))
+    assert pose_power(0.003, S, 3.0, 3, 7, LEVEL) == 0.0
+
+
+def test_the_number_of_axes_is_that_of_the_covariance():
+    rng = np.random.default_rng(FIRST_SEED)
+    C = np.diag([1.0, 1.0, 4.0])
+    rows = rng.standard_normal((400, 400, 3)) * np.sqrt(np.diag(C))
+    axes = [effective_axes(np.cov(row.T), 400) for row in rows]
+    assert np.mean(axes) == pytest.approx(2.0, abs=0.03)  # 6^2 / 18
+
+
+def test_the_regression_names_the_group_that_made_the_misses():
+    made = simulate_misses("perception", 20, FIRST_SEED, noise_m=2e-4)
+    poses = made.T_base_gripper
+    columns = pose_columns(poses)
+    causes = {
+        "a turn of the base": np.cross([0, 0, 0.01], poses[:, :3, 3]),
+        "a scale": 0.01 * poses[:, :3, 3],
+        "the gripper": poses[:, :3, :3] @ [0, 0.003, 0],
+    }
+    for name, part in causes.items():
+        found = pose_test(made.misses + part, columns, GROUPS, STILL, LEVEL)
+        assert max(found.shares, key=found.shares.get) == name
+        varying = np.sqrt(((part - part.mean(0)) ** 2).sum(1).mean())
+        assert found.part_m == pytest.approx(varying, rel=0.1)
+        assert found.p_value < LEVEL
+
+
+# --- simulated misses ---
+
+
+def test_the_same_seed_gives_the_same_misses_and_the_truth_adds_up():
+    for kind in ("calibration", "perception", "pose_dependent", "cannot_tell_yet"):
+        one, two = (simulate_misses(kind, 15, FIRST_SEED) for _ in range(2))
+        np.testing.assert_array_equal(one.misses, two.misses)
+        still = simulate_misses(kind, 15, FIRST_SEED, noise_m=0)
+        np.testing.assert_allclose(still.misses, still.constant_m + still.by_pose_m, atol=1e-15)
+        arm = widowx()
+        np.testing.assert_allclose(arm.forward(one.q), one.T_base_gripper, atol=1e-8)
+
+
+def test_an_arm_error_is_as_large_as_asked_and_has_no_constant_over_the_table():
+    made = simulate_misses("pose_dependent", 397, FIRST_SEED, noise_m=0, arm_m=0.004)
+    rms = np.sqrt((made.misses**2).sum(axis=1).mean())
+    assert rms == pytest.approx(0.004, rel=0.05)
+    assert np.linalg.norm(made.misses.mean(axis=0)) < 5e-4
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"kind": "weather"}, "kind"),
+        ({"n": 0}, "n: got"),
+        ({"n": 2.5}, "n: got"),
+        ({"noise_m": -1}, "noise_m"),
+        ({"noise_m": (1, 2)}, "noise_m"),
+        ({"bias_m": np.nan}, "bias_m"),
+        ({"kind": "pose_dependent", "arm_m": np.inf}, "arm_m"),
+    ],
+)
+def test_bad_simulations_are_named(change, words):
+    with pytest.raises(ValueError, match=words):
+        simulate_misses(**({"kind": "calibration", "n": 5, "seed": FIRST_SEED} | change))
+
+
+# --- the ledger ---
+
+BUDGET = Entry("2026-01-01T10:00:00+00:00", "25 mm cube", "Simulated D435", 1.22, 5.0, 9.1, 7.5)
+
+
+def test_the_budget_is_the_first_row_and_trials_follow(tmp_path):
+    ledger = Ledger(tmp_path / "new" / "ledger.csv")
+    assert ledger.read() == ()
+    ledger.append(BUDGET)
+    made = simulate_misses("calibration", 20, FIRST_SEED)
+    row = Entry.of(attribute(made.misses, made.T_base_gripper), "25 mm cube", tolerance_mm=7.5)
+    ledger.append(row)
+    first, second = ledger.read()
+    assert first == BUDGET
+    assert second.verdict == "calibration"
+    assert second.trials == 20
+    assert second.mean_x_mm == pytest.approx(1e3 * made.misses[:, 0].mean(), rel=1e-5)
+    assert "25 mm cube" in repr(ledger)
+    assert ledger.path.read_text("utf-8").splitlines()[0] == (
+        "date,task,camera,noise_mm,bias_quadrature_mm,bias_worst_mm,tolerance_mm,success,trials,"
+        "mean_x_mm,mean_y_mm,mean_z_mm,scatter_x_mm,scatter_y_mm,scatter_z_mm,p_mean,p_pose,"
+        "verdict,note"
+    )
+
+
+@pytest.mark.parametrize(
+    "text", ["=1+1", "+1", "-1", "@SUM(A1)", " =1", "'=1", "'quoted'", "＝1", 'a "b", c', "Würfel"]
+)
+def test_text_comes_back_and_no_cell_is_a_formula(tmp_path, text):
+    ledger = Ledger(tmp_path / "ledger.csv")
+    ledger.append(replace(BUDGET, task=text, note=text))
+    assert ledger.read()[0].task == text
+    assert ledger.read()[0].note == text
+    with ledger.path.open(encoding="utf-8", newline="") as file:
+        cell = list(csv.reader(file))[1][1]
+    assert not cell.lstrip().startswith(("=", "+", "-", "@", "＝"))
+
+
+def test_a_negative_number_stays_a_number(tmp_path):
+    ledger = Ledger(tmp_path / "ledger.csv")
+    ledger.append(replace(BUDGET, mean_x_mm=-1.25))
+    assert ",-1.25," in ledger.path.read_text("utf-8")
+    assert ledger.read()[0].mean_x_mm == -1.25
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "is empty"),
+        (b"a,b,c\n1,2,3\n", "line 1: the header"),
+        ((",".join(HEADER) + "\n2026,cube,half a r").encode(), "line 2: has 3 fields"),
+        ((",".join(HEADER) + "\n2026,cube,,many" + "," * 15 + "\n").encode(), "noise_mm is 'many'"),
+        ((",".join(HEADER) + "\n2026,cube,,nan" + "," * 15 + "\n").encode(), "noise_mm: got nan"),
+        ((",".join(HEADER) + '\n"2026,cube').encode(), "line 2"),
+        (b"\xff\xfe\x00", "not UTF-8"),
+    ],
+)
+def test_a_damaged_ledger_is_named_and_left_alone(tmp_path, content, words):
+    ledger = Ledger(tmp_path / "ledger.csv")
+    ledger.path.write_bytes(content)
+    for act in (ledger.read, lambda: ledger.append(BUDGET)):
+        with pytest.raises(ValueError, match=rf"ledger\.csv.*{words}"):
+            act()
+    assert ledger.path.read_bytes() == content
+
+
+def test_a_spreadsheet_may_have_saved_it_with_a_mark_and_other_line_ends(tmp_path):
+    ledger = Ledger(tmp_path / "ledger.csv")
+    ledger.append(BUDGET)
+    text = ledger.path.read_bytes()
+    ledger.path.write_bytes(b"\xef\xbb\xbf" + text.replace(b"\n", b"\r\n").removesuffix(b"\r\n"))
+    ledger.append(BUDGET)
+    assert ledger.read() == (BUDGET, BUDGET)
+
+
+def test_writers_at_the_same_time_lose_no_row(tmp_path):
+    def write(number: int) -> None:
+        for _ in range(10):
+            Ledger(tmp_path / "ledger.csv").append(replace(BUDGET, note=f"writer {number}"))
+
+    writers = [threading.Thread(target=write, args=(number,)) for number in range(4)]
+    for writer in writers:
+        writer.start()
+    for writer in writers:
+        writer.join()
+    notes = Counter(row.note for row in Ledger(tmp_path / "ledger.csv").read())
+    assert notes == {f"writer {number}": 10 for number in range(4)}
+
+
+def test_a_write_that_fails_leaves_the_ledger_as_it_was(tmp_path, monkeypatch):
+    ledger = Ledger(tmp_path / "ledger.csv")
+    ledger.append(BUDGET)
+    before = ledger.path.read_bytes()
+
+    def full(*_: object) -> None:
+        raise OSError("no space left")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("pathlib.Path.replace", full)
+        with pytest.raises(OSError, match="no space"):
+            ledger.append(BUDGET)
+    assert ledger.path.read_bytes() == before
+    assert not list(tmp_path.glob("*.part")) + list(tmp_path.glob(".*.part"))
+    ledger.append(BUDGET)  # the lock was given back
+    assert len(ledger.read()) == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"task": ""}, "task: got nothing"),
+        ({"note": "two\nlines"}, "note"),
+        ({"note": "nul\0"}, "note"),
+        ({"note": "x" * 501}, "note"),
+        ({"noise_mm": np.nan}, "noise_mm"),
+        ({"trials": 2.5}, "trials"),
+        ({"success": "high"}, "success"),
+    ],
+)
+def test_a_bad_entry_is_named(change, words):
+    with pytest.raises(ValueError, match=words):
+        replace(BUDGET, **change)
+
+
+def test_only_entries_are_appended(tmp_path):
+    with pytest.raises(ValueError, match="entry: got a dict"):
+        Ledger(tmp_path / "ledger.csv").append({})

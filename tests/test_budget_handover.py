@@ -1,0 +1,196 @@
+"""Notebook 5 takes what notebooks 1 to 4 saved, and names every file that it cannot use."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from coursekit import results
+from coursekit.budget import HandOver, hand_over
+from coursekit.budget.handover import LESSONS
+from coursekit.results import Covariance, Quantity
+
+YOURS = SimpleNamespace(source="live", name="D435 on the bench")
+REFERENCE = SimpleNamespace(source="simulated", name="Simulated D435, seed 7")
+K = ("fx", "fy", "cx", "cy", "k1")
+TWIST = ("rx", "ry", "rz", "tx", "ty", "tz")
+
+
+def write(camera: SimpleNamespace, scale: float = 1.0) -> None:
+    """What the last cells of the four notebooks save; scale multiplies every error."""
+    pinhole = {
+        f"depth_{n}": Quantity(v, "px", None, "bias")
+        for n, v in zip(K[:4], (430.0, 430.0, 424.0, 240.0), strict=True)
+    }
+    results.save("01_pinhole", camera, pinhole)
+    depth = {
+        "sigma_d": Quantity(0.07 * scale, "px", 0.003, "noise"),
+        "depth_bias_fitted_at_450_mm": Quantity(-1.8 * scale, "mm", 0.5 * scale, "bias"),
+    }
+    results.save("02_depth_noise", camera, depth)
+    sigma = np.array([0.9, 0.9, 1.1, 1.2, 0.004]) * scale
+    R = np.eye(5)
+    R[0, 1] = R[1, 0] = 0.95
+    lens = {n: Quantity(1.0, "px", s) for n, s in zip(K, sigma, strict=True)}
+    groups = {"intrinsics": Covariance(K, R * np.outer(sigma, sigma))}
+    results.save("03_intrinsics", camera, lens, groups)
+    turn, shift = np.array([0.05, 0.06, 0.07]) * scale, np.array([0.6, 0.8, 1.0]) * scale
+    mount = {
+        n: Quantity(0.0, "deg" if n[0] == "r" else "mm", s)
+        for n, s in zip(TWIST, (*turn, *shift), strict=True)
+    }
+    results.save("04_hand_eye", camera, mount)
+
+
+@pytest.fixture
+def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
+    """The student's folder, still empty, and a whole reference whose errors are twice as large."""
+    reference, mine = tmp_path / "reference", tmp_path / "results"
+    monkeypatch.setenv("COURSEKIT_RESULTS", str(reference))
+    write(REFERENCE, scale=2.0)
+    monkeypatch.setenv("COURSEKIT_RESULTS", str(mine))
+    return mine, reference
+
+
+def at_object_mm(handed: HandOver) -> dict[str, tuple[float, float]]:
+    return {r.term.name: (1e3 * r.low_m, 1e3 * r.high_m) for r in handed.budget().rows}
+
+
+def test_all_yours(folders: tuple[Path, Path]) -> None:
+    write(YOURS)
+    handed = hand_over(folders[1])
+    assert all("yours (live: D435 on the bench, 20" in found.says for found in handed)
+    budget = handed.budget()
+    assert "Your budget" in repr(budget)
+    at = at_object_mm(handed)
+    assert at["pixel"][1] == pytest.approx(450 / 430)
+    f_B = 430.0 * budget.view.baseline_m
+    assert at["depth noise"][1] == pytest.approx(1e3 * 0.45**2 * 0.07 / f_B)
+    assert at["depth bias"] == pytest.approx((0.8, 2.8))
+    turn = math.radians(math.sqrt((0.05**2 + 0.06**2 + 0.07**2) / 3))
+    assert at["hand-eye rotation"][1] == pytest.approx(2 * turn * 450)
+    assert at["hand-eye translation"][1] == pytest.approx(2 * math.sqrt((0.36 + 0.64 + 1) / 3))
+    assert at["forward kinematics"] == pytest.approx((2.0, 4.0))
+    assert at["intrinsics"][1] == pytest.approx(2 * 450 / 430 * 1.2, rel=1e-6)  # cy, on the axis
+    whose = {row.term.name: row.term.source for row in budget.rows}
+    assert whose["pixel"] == whose["forward kinematics"] == "the lesson"
+    assert whose["depth noise"].startswith("yours")
+
+
+def test_intrinsics_use_the_correlations(folders: tuple[Path, Path]) -> None:
+    write(YOURS)
+    handed = hand_over(folders[1])
+    view = handed.view().moved(u=824.0, v=640.0)  # 400 px off both ways: fx and fy move together
+    M = handed.budget(view)["intrinsics"].matrix(view)
+    covariance = M @ M.T
+    x = np.array([400 / 430, 400 / 430])
+    r2 = x @ x
+    expected = (0.45 / 430) ** 2 * (0.9**2 * 0.95 * x[0] * x[1]) + (0.45 * 0.004 * r2) ** 2 * x[
+        0
+    ] * x[1]
+    assert covariance[0, 1] == pytest.approx(expected, rel=1e-6)  # base -y, -x: the signs cancel
+
+
+def test_what_propagate_takes(folders: tuple[Path, Path]) -> None:
+    write(YOURS)
+    handed = hand_over(folders[1])
+    given = handed.covariances(handed.view(0.6))
+    assert given.names == K
+    assert np.diag(given.intrinsics)[4] == pytest.approx(0.004**2)
+    twist = np.sqrt(np.diag(given.hand_eye))  # rad and m, from the sigmas: no covariance was kept
+    assert np.degrees(twist[:3]) == pytest.approx([0.05, 0.06, 0.07])
+    assert 1e3 * twist[3:] == pytest.approx([0.6, 0.8, 1.0])
+    f_B = 430.0 * handed.view().baseline_m
+    assert given.depth_sigma_m == pytest.approx(0.36 * 0.07 / f_B)
+    C = np.full((6, 6), 0.5) + 0.5 * np.eye(6)
+    mount = {n: Quantity(0.0, "deg" if n[0] == "r" else "mm", 1.0) for n in TWIST}
+    results.save("04_hand_eye", YOURS, mount, {"X": Covariance(TWIST, C)})
+    kept = np.asarray(hand_over(folders[1]).covariances(handed.view()).hand_eye)
+    assert kept[0, 5] == pytest.approx(0.5 * math.radians(1) * 1e-3)
+    assert kept[1, 1] == pytest.approx(math.radians(1) ** 2)
+
+
+def test_nothing_yet(folders: tuple[Path, Path]) -> None:
+    handed = hand_over(folders[1])
+    for lesson, found in zip(LESSONS, handed, strict=True):
+        assert found.says == (
+            f"{lesson}: results/{lesson}.json is not there yet, notebook {lesson} has not "
+            "saved it; the reference is used."
+        )
+    assert "The reference budget" in repr(handed.budget())
+    assert handed.budget()["depth noise"].source == "reference (Simulated D435, seed 7)"
+    assert at_object_mm(handed)["depth bias"] == pytest.approx((1.6, 5.6))
+
+
+@pytest.mark.parametrize(
+    ("damage", "named"),
+    [
+        (lambda text: text[:80], "not a JSON file"),
+        (lambda text: "", "not a JSON file"),
+        (lambda text: text.replace('"format": 1', '"format": 0'), "another version"),
+        (lambda text: text.replace('"value": 0.0', '"value": null'), "value"),
+        (lambda text: text.replace('"04_hand_eye"', '"03_intrinsics"'), "notebook 03_intrinsics"),
+        (lambda text: text.replace('"rz"', '"turn"'), "holds no rz with a sigma"),
+        (lambda text: text.replace('"sigma": 0.05', '"sigma": null'), "holds no rx with a sigma"),
+    ],
+)
+def test_a_bad_file_is_named_and_replaced(
+    folders: tuple[Path, Path], damage: object, named: str
+) -> None:
+    write(YOURS)
+    path = folders[0] / "04_hand_eye.json"
+    text = path.read_text("utf-8")
+    broken = damage(text)  # type: ignore[operator]
+    assert broken != text
+    path.write_text(broken, encoding="utf-8")
+    handed = hand_over(folders[1])
+    says = handed["04_hand_eye"].says
+    assert "04_hand_eye.json" in says
+    assert named in says
+    assert says.endswith("the reference is used.")
+    assert says in repr(handed)
+    rows = handed.budget()
+    assert rows["hand-eye rotation"].source.startswith("reference")
+    assert rows["depth noise"].source.startswith("yours")
+    at = at_object_mm(handed)
+    assert at["hand-eye translation"][1] == pytest.approx(4 * math.sqrt((0.36 + 0.64 + 1) / 3))
+
+
+def test_a_file_without_the_studio_exercise(folders: tuple[Path, Path]) -> None:
+    """Noise without bias: one row is the student's, the other the reference's."""
+    write(YOURS)
+    results.save("02_depth_noise", YOURS, {"sigma_d": Quantity(0.05, "px", 0.01, "noise")})
+    handed = hand_over(folders[1])
+    assert "but it holds no depth_bias_fitted_at_450_mm or depth_bias_at_450_mm" in repr(handed)
+    budget = handed.budget()
+    assert budget["depth noise"].source.startswith("yours")
+    assert budget["depth noise"].high == 0.05
+    assert budget["depth bias"].source.startswith("reference")
+    only = {"sigma_d": Quantity(0.05, "px"), "depth_bias_at_450_mm": Quantity(2.0, "mm", 0.25)}
+    results.save("02_depth_noise", YOURS, only)
+    assert at_object_mm(hand_over(folders[1]))["depth bias"] == pytest.approx((1.5, 2.5))
+
+
+def test_neither_yours_nor_a_reference(folders: tuple[Path, Path]) -> None:
+    (folders[1] / "03_intrinsics.json").unlink()
+    (folders[1] / "01_pinhole.json").write_text("{", encoding="utf-8")
+    handed = hand_over(folders[1])
+    assert "there is no reference 03_intrinsics.json" in handed["03_intrinsics"].says
+    assert "the reference is damaged" in handed["01_pinhole"].says
+    with pytest.raises(ValueError, match=r"^03_intrinsics: no number to use"):
+        handed.terms()
+    with pytest.raises(ValueError, match=r"^lesson: "):
+        handed["05_error_budget"]
+
+
+def test_the_reference_is_only_read(folders: tuple[Path, Path]) -> None:
+    before = {p.name: p.read_bytes() for p in folders[1].iterdir()}
+    hand_over(folders[1]).budget()
+    assert {p.name: p.read_bytes() for p in folders[1].iterdir()} == before
+    assert not folders[0].exists()
+    assert json.loads(before["01_pinhole.json"])["source"] == "simulated"
