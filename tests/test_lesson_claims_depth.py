@@ -154,6 +154,7 @@ def test_d8_what_a_hundred_frames_buy() -> None:
         assert measured == pytest.approx(gain_of_hundred(rho), rel=0.05)
     assert gain_of_hundred(0.0) == pytest.approx(10)
     ROWS["D8"].says(f"AR(1) rho 0.5 gives {gain_of_hundred(0.5):.1f}x")
+    ROWS["D8"].says(f"{gain_of_hundred(0.0):.0f}x")
     ROWS["D8"].says(f"gained {SERIES['d435_window_mean']['gain_of_100_frames']}x")
     # a pattern that stays: 0.6 mm in each pixel, the same in all frames
     pattern = 0.6e-3 * rng.standard_normal((30, 30))
@@ -262,9 +263,9 @@ def test_d11_the_width_does_not_follow_the_depths_curve() -> None:
 # --- D12 to D16 ---
 
 
-def plain_median(depth: np.ndarray, u, v, half: int = 2) -> float:
-    """What the lesson's text describes, taken at its word: slice, drop zeros, median, else 0."""
-    values = depth[v - half : v + half + 1, u - half : u + half + 1].ravel()
+def plain_median(depth: np.ndarray, u, v) -> float:
+    """Taken at its word: slices of 5 x 5 pixels, zeros dropped, the median; 0 if none is left."""
+    values = depth[v - 2 : v + 3, u - 2 : u + 3].ravel()
     return float(np.median(values[values > 0])) if (values > 0).any() else 0.0
 
 
@@ -329,6 +330,7 @@ def test_d15_the_d405_is_of_another_class() -> None:
     ratio = float(noise_mm(0.4, FX, baseline) / noise_mm(0.4))
     own = float(noise_mm(0.4, D405.unit.depth.fx, baseline))
     assert ratio > 2  # not the noise of the class described
+    ROWS["D15"].says(f"own {D405.unit.depth.fx:.0f} px")
     ROWS["D15"].says("18 mm baseline and no projector", f"{ratio:.1f}x")
     ROWS["D15"].says(f"{float(noise_mm(0.4, FX, baseline)):.2f} mm at 0.4 m", f"{own:.2f} with")
 
@@ -337,6 +339,7 @@ def test_d15_the_d405_is_of_another_class() -> None:
 def test_d16_two_millimetres_over_a_tabletop() -> None:
     z = np.array([0.4, 0.6])
     wide, narrow = noise_mm(z), noise_mm(z, FX, D405.nominal.baseline_m)
+    ROWS["D16"].says("< 2 mm")
     assert wide.max() < 2  # as the lesson says, with the baseline that it assumes
     assert narrow.max() > 2  # and not with the camera that the arm ships with
     ROWS["D16"].says(f"{wide[0]:.2f}-{wide[1]:.2f} mm", f"{narrow[0]:.1f}-{narrow[1]:.1f} mm")

@@ -214,4 +214,4 @@ def test_p12_pixel_pitch() -> None:
         assert 1e-6 < pitch < 6e-6
     assert pitches["D435 infrared"] == pytest.approx(3.0e-6, rel=0.02)
     assert pitches["D435 colour"] == pytest.approx(1.4e-6, rel=0.04)
-    ROWS["P12"].says("1-6 um", "1e-6 to 1e-5 m")
+    ROWS["P12"].says("1e-5-1e-4 m", "1-6 um", "1e-6 to 1e-5 m")
