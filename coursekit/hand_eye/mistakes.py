@@ -79,7 +79,7 @@ def single_axis(turns: Floats, axis: Floats) -> Finding:
     text = "({:.2f}, {:.2f}, {:.2f})".format(*(axis + 0.0))
     return Finding(
         "single_axis",
-        "All poses turn about one axis: translation along it is free, and rotation about it nearly so.",
+        "All poses turn about one axis: translation along it is free, rotation about it nearly.",
         f"turned by {turns[0]:.1f} deg (rms) about {text} in the base, by {turns[1]:.1f} deg about "
         "any other axis",
         "Turn the wrist about a second axis across this one, by 30 deg or more to either side.",
