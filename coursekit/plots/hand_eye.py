@@ -183,7 +183,7 @@ def _rms(values: Floats) -> float:
 
 
 def touched(gap_mm: ArrayLike) -> LessonFigure:
-    """Where a corner is by camera, from several looks, and by fingertip: the gaps (n, 3), mm."""
+    """Where corners are by camera, from several looks, and by fingertip: the gaps (n, 3), mm."""
     gap = np.asarray(gap_mm)
     fig = figure(7.0, 3.2)
     ax = fig.subplots()
@@ -192,9 +192,9 @@ def touched(gap_mm: ArrayLike) -> LessonFigure:
         ax.bar(places + 0.25 * (k - 1), gap[:, k], 0.22, color=COLORS[color], label=axis)
     ax.axhline(0, color=COLORS["ink"], lw=1)
     ax.set_xticks(places, [f"{n + 1}" for n in places])
-    ax.set(xlabel="look (number)", ylabel="camera - fingertip (mm)")
+    ax.set(xlabel="corner, look after look (number)", ylabel="camera - fingertip (mm)")
     ax.legend(ncols=3)
-    fig.alt = "Camera minus fingertip, one look after the other, mm: " + "; ".join(
+    fig.alt = "Camera minus fingertip, corner by corner and look by look, mm: " + "; ".join(
         ", ".join(f"{a} {v:+.1f}" for a, v in zip("xyz", row, strict=True)) for row in gap
     )
     return fig
