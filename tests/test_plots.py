@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 
-from coursekit import boards, geometry, plots, specifications
+from coursekit import boards, budget, geometry, plots, specifications
+from coursekit.attribution import simulate_misses
 from coursekit.geometry import Intrinsics
 from coursekit.hand_eye import error_study
 from coursekit.intrinsics import calibrate, compare, stored_power
-from coursekit.plots import depth_noise, hand_eye, intrinsics, pinhole
+from coursekit.plots import depth_noise, error_budget, hand_eye, intrinsics, pinhole
 from coursekit.plots.interactive import label
 from coursekit.simulation import (
     Effects,
@@ -352,3 +353,39 @@ def test_gaps_say_their_root_mean_squares() -> None:
     assert "rms 1.58 mm over 2 fitted poses, 2.00 mm over 1 held out" in (
         HAND_EYE_FIGURES["gaps"].alt
     )
+
+
+# --- notebook 05 ---
+
+
+def error_budget_figures() -> dict[str, plots.LessonFigure]:
+    table = budget.lesson_budget(stated=False)
+    rigs = budget.lesson_budget().draw(20_000, seed=1, directions="isotropic")
+    missed = {"P": simulate_misses("perception", 8, 1).misses}
+    covariance = table.noise_covariance[:2, :2]
+    return {
+        "bars": error_budget.bars(budget.lesson_budget()),
+        "biases": error_budget.biases(rigs, 0.007),
+        "between_fingers": error_budget.between_fingers(
+            budget.LESSON_GRIPPER, budget.CUBE, covariance, (1.0, 2.0)
+        ),
+        "distances": error_budget.distances(budget.best_distance(table)),
+        "misses": error_budget.misses(missed),
+    }
+
+
+ERROR_BUDGET_FIGURES = error_budget_figures()
+
+
+@pytest.mark.parametrize("name", ERROR_BUDGET_FIGURES)
+def test_error_budget_figures_have_labels_and_words(name: str) -> None:
+    check_labels_and_words(ERROR_BUDGET_FIGURES[name])
+
+
+def test_the_ellipse_holds_ninety_five_of_a_hundred_grasps() -> None:
+    covariance = np.array([[4e-6, 1.5e-6], [1.5e-6, 2e-6]])
+    fig = error_budget.between_fingers(budget.LESSON_GRIPPER, budget.CUBE, covariance, (1.0, -2.0))
+    (place,) = [p for p in fig.axes[0].patches if p.get_label().startswith("centre")]
+    drawn = np.random.default_rng(3).multivariate_normal((1.0, -2.0), 1e6 * covariance, 20_000)
+    inside = place.get_patch_transform().inverted().transform(drawn)
+    assert np.mean(np.hypot(*inside.T) < 1) == pytest.approx(0.95, abs=0.006)

@@ -13,7 +13,7 @@ from coursekit.lessons.verdict import Verdict
 
 __all__ = ["LESSONS", "check", "checkpoint", "checkpoints", "evidence", "exercises"]
 
-LESSONS = ("pinhole", "depth_noise", "intrinsics", "hand_eye")
+LESSONS = ("pinhole", "depth_noise", "intrinsics", "hand_eye", "error_budget")
 
 
 def checkpoint(name: str) -> Checkpoint:

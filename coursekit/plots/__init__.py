@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from coursekit.plots import depth_noise, hand_eye, intrinsics, pinhole
+from coursekit.plots import depth_noise, error_budget, hand_eye, intrinsics, pinhole
 from coursekit.plots.interactive import drag
 from coursekit.plots.style import COLORS, LessonFigure, figure
 
@@ -11,6 +11,7 @@ __all__ = [
     "LessonFigure",
     "depth_noise",
     "drag",
+    "error_budget",
     "figure",
     "hand_eye",
     "intrinsics",
