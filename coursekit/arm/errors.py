@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 STOP_RAD = 5e-4  # std by which the controller misses the commanded angle; the encoder sees it
+STILL_RAD = 1e-6  # a joint that is sent no farther stays where it is
 LOAD_ARM_M = 0.03  # gravity decides on which flank a joint rests from this lever arm on
 HOME = (0.0, 1.2, 1.0, 0.2, 0.0, 0.0)  # rad; where the simulated arm starts
 
@@ -276,6 +277,8 @@ def with_link_errors(arm: Arm, link: ArrayLike) -> Arm:
 
 def _directions(path: Floats, before: Floats) -> Floats:
     """(n, 6): -1 or 1, the way each joint last moved at each of path (n + 1, 6) but the first."""
-    moved = np.concatenate([before[None], np.sign(np.diff(path, axis=0))])
+    change = np.diff(path, axis=0)
+    change[np.abs(change) < STILL_RAD] = 0.0  # rounding is no move, and differs between machines
+    moved = np.concatenate([before[None], np.sign(change)])
     last = np.maximum.accumulate(np.where(moved != 0, np.arange(len(moved))[:, None], 0), axis=0)
     return np.take_along_axis(moved, last, axis=0)[1:]
