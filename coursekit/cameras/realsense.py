@@ -155,6 +155,8 @@ class RealSense(Camera):
         """Stop the camera, or close the file; a second call does nothing."""
         pipeline, self._pipeline = self._pipeline, None
         if pipeline is not None:
+            if self._path is not None:
+                _halt(pipeline, self._profile.get_device().as_playback())
             with contextlib.suppress(RuntimeError):  # an unplugged camera cannot be stopped
                 pipeline.stop()
 
@@ -394,6 +396,19 @@ class RealSense(Camera):
                 (rs.frame_metadata_value.gain_level, option.gain),
             )
         )
+
+
+def _halt(pipeline: Any, playback: Any) -> None:
+    """Bring a playback's reading thread to rest, so that the pipeline can be stopped.
+
+    At the end of the file that thread stops the sensors itself; when the pipeline stops them at the
+    same moment, librealsense frees its callbacks twice and may end the process (its issue 9446).
+    pause() returns once the thread rests, which it does only while somebody takes its images.
+    """
+    pause = threading.Thread(target=playback.pause, daemon=True)
+    pause.start()
+    while pause.is_alive():  # at most librealsense's own 10 s
+        pipeline.try_wait_for_frames(1)
 
 
 # --- images ------------------------------------------------------------------------------------
