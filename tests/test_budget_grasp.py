@@ -104,7 +104,7 @@ def test_what_to_fix_first() -> None:
         assert gain.success == pytest.approx(again - before, abs=1e-4)
     assert by_name["pixel"].worst_case_m == 0.0
     assert by_name["pixel"].noise_m > 0.0
-    assert str(turn).startswith("halve hand-eye rotation: +")
+    assert str(turn).startswith("halve hand-eye rotation:     +")
 
 
 def test_what_to_fix_first_when_all_succeed() -> None:

@@ -11,7 +11,14 @@ import numpy as np
 import pytest
 
 from coursekit import results
-from coursekit.budget import HandOver, hand_over
+from coursekit.budget import (
+    HandOver,
+    beside,
+    effective_frames,
+    hand_over,
+    lesson_budget,
+    wrist_budget,
+)
 from coursekit.budget.handover import LESSONS
 from coursekit.results import Covariance, Quantity
 
@@ -194,3 +201,64 @@ def test_the_reference_is_only_read(folders: tuple[Path, Path]) -> None:
     assert {p.name: p.read_bytes() for p in folders[1].iterdir()} == before
     assert not folders[0].exists()
     assert json.loads(before["01_pinhole.json"])["source"] == "simulated"
+
+
+def test_beside_the_lesson_says_every_row_and_whose_it_is(folders: tuple[Path, Path]) -> None:
+    write(YOURS)
+    handed = hand_over(folders[1])
+    both = beside(lesson_budget(), handed.budget())
+    lines = {line[0]: line[2:] for line in both.lines()}
+    assert lines["hand-eye rotation"][0] == "0.5 deg: 0.0–3.9 mm"
+    assert lines["depth bias"] == ("2–5 mm: 2.0–6.0 mm", "0.18–0.62 %: 0.8–2.8 mm")
+    assert lines["intrinsics"][0] == "-"
+    whose = [line for line in repr(both).splitlines() if "pixel, forward kinematics" in line]
+    assert whose == ["  pixel, forward kinematics: the lesson"]
+    assert "the bench" in repr(both)
+    assert "the bench" in both._repr_html_()
+
+
+def test_what_notebook_1_and_2_may_have_kept_is_used(folders: tuple[Path, Path]) -> None:
+    """Size and baseline of the camera; the pattern that stays, and how alike two frames are."""
+    write(YOURS)
+    plain = hand_over(folders[1]).budget()
+    also = results.load("01_pinhole").quantities | {
+        "depth_width": Quantity(640.0, "px"),
+        "depth_height": Quantity(480.0, "px"),
+        "baseline": Quantity(55.0, "mm"),
+    }
+    results.save("01_pinhole", YOURS, also)
+    depth = results.load("02_depth_noise").quantities | {
+        "fixed_pattern": Quantity(0.05, "px"),
+        "frame_autocorrelation": Quantity(0.3, "1"),
+    }
+    results.save("02_depth_noise", YOURS, depth)
+    budget = hand_over(folders[1]).budget()
+    assert budget.view.intrinsics.size == (640, 480)
+    assert budget.view.baseline_m == pytest.approx(0.055)
+    per_px = 0.45**2 / (430.0 * 0.055)
+    noise = {row.term.name: row.high_m for row in budget.rows}["depth noise"]
+    assert noise == pytest.approx(per_px * math.hypot(0.07, 0.05))
+    many = 0.07**2 / effective_frames(400, 0.3) + 0.05**2
+    assert budget.at(frames=400).averaged_m["depth noise"] == pytest.approx(
+        per_px * math.sqrt(many)
+    )
+    assert plain.at(frames=400).averaged_m["depth noise"] < 0.1 * budget.averaged_m["depth noise"]
+
+
+def test_a_bias_that_is_subtracted_leaves_its_uncertainty(folders: tuple[Path, Path]) -> None:
+    write(YOURS)  # -1.8 +- 0.5 mm
+    left = {r.term.name: r for r in hand_over(folders[1]).budget(subtract_depth_bias=True).rows}
+    assert 1e3 * left["depth bias"].low_m == 0.0
+    assert 1e3 * left["depth bias"].high_m == pytest.approx(1.0)
+
+
+def test_on_the_wrist_with_your_numbers(folders: tuple[Path, Path]) -> None:
+    write(YOURS)
+    handed = hand_over(folders[1])
+    wrist, lesson = handed.wrist_budget(), wrist_budget()
+    assert wrist.view.point_camera == pytest.approx(lesson.view.point_camera)
+    assert wrist["depth bias"] == lesson["depth bias"]  # of another camera than notebook 2's
+    assert wrist["hand-eye rotation"] == handed.budget()["hand-eye rotation"]
+    turn = wrist["hand-eye rotation"].high
+    at = {row.term.name: row.high_m for row in wrist.rows}
+    assert at["hand-eye rotation"] == pytest.approx(turn * np.linalg.norm(wrist.view.point_camera))

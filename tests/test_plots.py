@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
+from matplotlib.patches import Ellipse
 
 from coursekit import boards, budget, geometry, plots, specifications
 from coursekit.attribution import simulate_misses
@@ -361,13 +362,13 @@ def test_gaps_say_their_root_mean_squares() -> None:
 def error_budget_figures() -> dict[str, plots.LessonFigure]:
     table = budget.lesson_budget(stated=False)
     rigs = budget.lesson_budget().draw(20_000, seed=1, directions="isotropic")
-    missed = {"P": simulate_misses("perception", 8, 1).misses}
-    covariance = table.noise_covariance[:2, :2]
+    missed = {"P": simulate_misses("perception", 8, 1)}
+    others = rigs.along_m[:20] * 1000
     return {
         "bars": error_budget.bars(budget.lesson_budget()),
         "biases": error_budget.biases(rigs, 0.007),
         "between_fingers": error_budget.between_fingers(
-            budget.LESSON_GRIPPER, budget.CUBE, covariance, (1.0, 2.0)
+            budget.LESSON_GRIPPER, budget.CUBE, table.noise_covariance, (1.0, 2.0, 0.5), others
         ),
         "distances": error_budget.distances(budget.best_distance(table)),
         "misses": error_budget.misses(missed),
@@ -382,10 +383,35 @@ def test_error_budget_figures_have_labels_and_words(name: str) -> None:
     check_labels_and_words(ERROR_BUDGET_FIGURES[name])
 
 
-def test_the_ellipse_holds_ninety_five_of_a_hundred_grasps() -> None:
-    covariance = np.array([[4e-6, 1.5e-6], [1.5e-6, 2e-6]])
-    fig = error_budget.between_fingers(budget.LESSON_GRIPPER, budget.CUBE, covariance, (1.0, -2.0))
-    (place,) = [p for p in fig.axes[0].patches if p.get_label().startswith("centre")]
-    drawn = np.random.default_rng(3).multivariate_normal((1.0, -2.0), 1e6 * covariance, 20_000)
-    inside = place.get_patch_transform().inverted().transform(drawn)
-    assert np.mean(np.hypot(*inside.T) < 1) == pytest.approx(0.95, abs=0.006)
+def test_ellipse_and_ellipsoid_hold_ninety_five_of_a_hundred_grasps() -> None:
+    """Given as closing, approach, lateral; seen as closing, lateral, and up against approach."""
+    covariance = np.array([[4.0, 1.5, 0.5], [1.5, 2.0, -0.6], [0.5, -0.6, 3.0]])
+    middle = np.array([1.0, -2.0, 3.0])
+    fig = error_budget.between_fingers(
+        budget.LESSON_GRIPPER, budget.CUBE, 1e-6 * covariance, middle
+    )
+    drawn = np.random.default_rng(3).multivariate_normal(middle, covariance, 40_000)
+    (place,) = [p for p in fig.axes[1].patches if isinstance(p, Ellipse)]
+    inside = place.get_patch_transform().inverted().transform(drawn[:, [0, 2]])
+    assert np.mean(np.hypot(*inside.T) < 1) == pytest.approx(0.95, abs=0.005)
+
+    surface = error_budget._surface(covariance, middle).reshape(3, -1).T
+    at = np.column_stack([surface[:, 0], -surface[:, 2], surface[:, 1]]) - middle
+    distance = np.sqrt(np.einsum("ni,ij,nj->n", at, np.linalg.inv(covariance), at))
+    assert np.ptp(distance) < 1e-9
+    own = drawn - middle
+    within = np.einsum("ni,ij,nj->n", own, np.linalg.inv(covariance), own) < distance[0] ** 2
+    assert within.mean() == pytest.approx(0.95, abs=0.005)
+
+
+def test_bars_of_noise_shrink_with_frames_and_bias_does_not() -> None:
+    one, many = budget.lesson_budget(), budget.lesson_budget().at(frames=100)
+    dark = [
+        [p.get_width() for p in error_budget.bars(b).axes[0].patches[1::2]] for b in (one, many)
+    ]
+    kinds = [row.term.kind for row in one.rows]
+    ratios = [b / a for a, b, kind in zip(*dark, kinds, strict=True) if kind == "noise"]
+    assert ratios == pytest.approx([0.1, 0.1])
+    assert [x for x, k in zip(dark[0], kinds, strict=True) if k == "bias"] == [
+        x for x, k in zip(dark[1], kinds, strict=True) if k == "bias"
+    ]

@@ -2,7 +2,7 @@
 
 from coursekit.attribution.attribute import Attribution, Verdict, attribute
 from coursekit.attribution.ledger import Entry, Ledger
-from coursekit.attribution.simulate import SimulatedMisses, simulate_misses
+from coursekit.attribution.simulate import SimulatedMisses, four_sets, simulate_misses
 
 __all__ = [
     "Attribution",
@@ -11,5 +11,6 @@ __all__ = [
     "SimulatedMisses",
     "Verdict",
     "attribute",
+    "four_sets",
     "simulate_misses",
 ]

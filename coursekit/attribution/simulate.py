@@ -85,6 +85,16 @@ def simulate_misses(
     return SimulatedMisses(misses, poses[chosen], q[chosen], kind, constant, by_pose)
 
 
+def four_sets() -> dict[str, SimulatedMisses]:
+    """Sets P, Q, R and S for notebook 5: one of each kind, in an order of their own."""
+    return {
+        "P": simulate_misses("perception", 25, seed=8),
+        "Q": simulate_misses("calibration", 25, seed=18),
+        "R": simulate_misses("pose_dependent", 25, seed=28),
+        "S": simulate_misses("calibration", 5, seed=9),
+    }
+
+
 def _slip(ratio: Floats) -> Floats:
     """Misses at all places after slips in this ratio (6,), constant taken up, 1 m rms."""
     q, poses = _places()

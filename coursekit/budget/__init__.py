@@ -1,5 +1,6 @@
 """The error budget: pixels, depth, hand-eye and arm errors as one table in millimetres."""
 
+from coursekit.budget.beside import beside
 from coursekit.budget.budget import AxisBudget, Draws, ErrorBudget, Row
 from coursekit.budget.grasp import (
     CUBE,
@@ -55,6 +56,7 @@ __all__ = [
     "Success",
     "Target",
     "View",
+    "beside",
     "best_distance",
     "centring_tolerance_m",
     "check_first_order",

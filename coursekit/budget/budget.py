@@ -187,10 +187,15 @@ class ErrorBudget:
         Each row along the direction in which it is largest, as tables do; `noise_covariance` says
         what is true of all three directions.
         """
-        lengths = [
-            self._sigma(term) * np.linalg.norm(matrix, 2) for term, matrix in self._of("noise")
-        ]
-        return math.hypot(*lengths)
+        return math.hypot(*self.averaged_m.values())
+
+    @property
+    def averaged_m(self) -> dict[str, float]:
+        """Each noise row by name after averaging: its sigma where it is largest, m."""
+        return {
+            term.name: self._sigma(term) * float(np.linalg.norm(matrix, 2))
+            for term, matrix in self._of("noise")
+        }
 
     @property
     def noise_covariance(self) -> Floats:
@@ -315,7 +320,7 @@ class ErrorBudget:
                     term.kind,
                     term.magnitude,
                     term.conversion,
-                    _span(row.low_m, row.high_m),
+                    span(row.low_m, row.high_m),
                     term.source,
                 )
             )
@@ -327,7 +332,7 @@ class ErrorBudget:
         text = [f"noise in quadrature{averaged}: {1e3 * self.noise_m:.2f} mm (one sigma)"]
         sums = {"worst case": self.worst_case_m, "quadrature": self.quadrature_m}
         for name, (low, high) in sums.items():
-            text.append(f"bias, {name}: {_span(low, high)} ({QUESTIONS[name]})")
+            text.append(f"bias, {name}: {span(low, high)} ({QUESTIONS[name]})")
         for axis in AXES:
             a = self.along(axis)
             text.append(
@@ -392,6 +397,7 @@ def _components(span: Range, k: int, n: int, normal: bool, rng: np.random.Genera
     return np.asarray(directions * (lengths / np.linalg.norm(directions, axis=0)))
 
 
-def _span(low_m: float, high_m: float) -> str:
-    low, high = f"{1e3 * low_m:.1f}", f"{1e3 * high_m:.1f}"
+def span(low_m: float, high_m: float, digits: int = 1) -> str:
+    """A range of lengths for people, such as "2.0 to 6.0 mm"."""
+    low, high = f"{1e3 * low_m:.{digits}f}", f"{1e3 * high_m:.{digits}f}"
     return f"{high} mm" if low == high else f"{low} to {high} mm"

@@ -91,10 +91,10 @@ class Success:
         return AXES[int(np.argmin(self.by_axis))]
 
     def __repr__(self) -> str:
-        axes = ", ".join(f"{a} {100 * p:.1f} %" for a, p in zip(AXES, self.by_axis, strict=True))
+        axes = ", ".join(f"{a} {100 * p:.1f}" for a, p in zip(AXES, self.by_axis, strict=True))
         return (
-            f"{100 * self.probability:.1f} % of grasps succeed ({axes}); "
-            f"{100 * self.rigs:.1f} % of rigs are within the tolerance but for noise"
+            f"{100 * self.probability:.1f} % of grasps succeed ({axes});\n"
+            f"    {100 * self.rigs:.1f} % of rigs would be within the tolerance without noise"
         )
 
 
@@ -122,7 +122,7 @@ def success_probability(budget: ErrorBudget, n: int = DRAWS, seed: int = 0) -> S
 class Gain:
     """What it gains to multiply one term's magnitude by a factor: differences, positive is better.
 
-    worst_case_m, noise_m: along the closing axis, m. success: of the probability.
+    worst_case_m, noise_m: along the closing axis, m, as its words have them. success: of the probability.
     """
 
     name: str
@@ -135,9 +135,8 @@ class Gain:
     def __str__(self) -> str:
         action = "halve" if self.factor == 0.5 else f"{self.factor:g} times"
         return (
-            f"{action} {self.name}: {100 * self.success:+.1f} % of grasps, "
-            f"{1e3 * self.worst_case_m:.2f} mm of worst-case bias and {1e3 * self.noise_m:.2f} mm "
-            "of noise less along the closing axis"
+            f"{action} {self.name + ':':<22} {100 * self.success:+.1f} % of grasps; "
+            f"{1e3 * self.worst_case_m:.1f} mm less bias, {1e3 * self.noise_m:.2f} mm less noise"
         )
 
 

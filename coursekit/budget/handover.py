@@ -17,7 +17,7 @@ import numpy as np
 from coursekit import results
 from coursekit.budget.budget import ErrorBudget
 from coursekit.budget.propagate import PARAMETERS, Covariances
-from coursekit.budget.tables import LESSON_DISTANCE_M, lesson_terms
+from coursekit.budget.tables import LESSON_DISTANCE_M, lesson_terms, wrist_budget
 from coursekit.budget.terms import SIGMAS, ErrorTerm
 from coursekit.budget.view import GraspAxes, View, looking_down
 from coursekit.geometry import Intrinsics
@@ -40,7 +40,7 @@ NEEDED: dict[str, tuple[str, ...]] = {  # "a|b": either
 BY_SIGMA = ("03_intrinsics", "04_hand_eye")  # their sigmas are the rows; without they say nothing
 TOGETHER = ("01_pinhole", "03_intrinsics", "04_hand_eye")  # all of it from one place, or none
 GROUPS = {"03_intrinsics": "intrinsics", "04_hand_eye": "X"}
-SIZE = (848, 480)  # of the depth image; notebook 1 keeps only its K
+SIZE = (848, 480)  # of the depth image, where notebook 1 did not keep it
 
 
 @dataclass(frozen=True)
@@ -108,33 +108,70 @@ class HandOver:
         baseline_m: float | None = None,
         T_base_camera: Floats | None = None,
     ) -> View:
-        """The camera of notebook 1 with the object on its axis; baseline_m: None is the D435's."""
-        fx, fy, cx, cy = (self.quantity("01_pinhole", name).value for name in NEEDED["01_pinhole"])
-        baseline = device("D435").unit.baseline_m if baseline_m is None else baseline_m
-        T = looking_down() if T_base_camera is None else T_base_camera
-        return View(Intrinsics(*SIZE, fx, fy, cx, cy), distance_m, baseline, T_base_camera=T)
+        """The camera of notebook 1 with the object on its axis.
 
-    def terms(self) -> tuple[ErrorTerm, ...]:
+        baseline_m: None takes what that camera reports, and the D435's where it reports none.
+        """
+        fx, fy, cx, cy = (self.quantity("01_pinhole", name).value for name in NEEDED["01_pinhole"])
+        width, height = (
+            round(self._also("01_pinhole", f"depth_{name}", size))
+            for name, size in zip(("width", "height"), SIZE, strict=True)
+        )
+        if baseline_m is None:
+            usual_mm = 1e3 * device("D435").unit.baseline_m
+            baseline_m = 1e-3 * self._also("01_pinhole", "baseline", usual_mm)
+        T = looking_down() if T_base_camera is None else T_base_camera
+        return View(
+            Intrinsics(width, height, fx, fy, cx, cy), distance_m, baseline_m, T_base_camera=T
+        )
+
+    def terms(self, subtract_depth_bias: bool = False) -> tuple[ErrorTerm, ...]:
         """The rows, each with its source.
 
-        What nobody has measured stays the lesson's: the detector's pixel and the arm. What was
-        measured with a standard deviation is a normal bias, shown up to two of them.
+        subtract_depth_bias: as if every depth were corrected by the bias that notebook 2 measured,
+        so that only what is not known of it stays. What nobody has measured stays the lesson's: the
+        detector's pixel and the arm. What was measured with a standard deviation is a normal bias,
+        shown up to two of them.
         """
         pixel, *_, arm = lesson_terms(stated=False)
         return (
             pixel,
             self._depth_noise(),
-            self._depth_bias(),
+            self._depth_bias(subtract_depth_bias),
             self._intrinsics(),
             self._hand_eye("rotation"),
             self._hand_eye("translation"),
             arm,
         )
 
-    def budget(self, view: View | None = None, grasp: GraspAxes | None = None) -> ErrorBudget:
+    def budget(
+        self,
+        view: View | None = None,
+        grasp: GraspAxes | None = None,
+        subtract_depth_bias: bool = False,
+    ) -> ErrorBudget:
         """The student's own table, the reference's numbers where there are no others."""
-        title = "Your budget" if any(found.yours for found in self) else "The reference budget"
-        return ErrorBudget(self.terms(), view or self.view(), grasp or GraspAxes(), title=title)
+        return ErrorBudget(
+            self.terms(subtract_depth_bias),
+            view or self.view(),
+            grasp or GraspAxes(),
+            autocorrelation=self._also("02_depth_noise", "frame_autocorrelation", 0.0),
+            title="Your budget" if any(found.yours for found in self) else "The reference budget",
+        )
+
+    def wrist_budget(self, grasp: GraspAxes | None = None) -> ErrorBudget:
+        """The D405 on the wrist with these numbers, as `tables.wrist_budget` sees it.
+
+        The matching noise, K and mount are those of the notebooks; the depth bias stays the
+        assumed one there, because notebook 2's belongs to another camera.
+        """
+        wrist, own = wrist_budget(grasp=grasp), self.budget()
+        for name in wrist.names:
+            if name != "depth bias":
+                wrist = wrist.with_term(own[name])
+        return wrist.with_term(own["intrinsics"]).at(
+            autocorrelation=own.autocorrelation, title=own.title
+        )
 
     def covariances(self, view: View, arm: ArrayLike | None = None) -> Covariances:
         """What `propagate` takes, from the same numbers: noise and what calibration left unknown.
@@ -170,20 +207,28 @@ class HandOver:
         variances = np.square(np.array(sigmas, dtype=np.float64))
         return Covariance(names, np.diag(variances))  # type: ignore[arg-type]
 
+    def _also(self, lesson: str, name: str, otherwise: float) -> float:
+        """A number that the notebook may have kept."""
+        found = self[lesson].result().quantities.get(name)
+        return otherwise if found is None else found.value
+
     def _depth_noise(self) -> ErrorTerm:
+        """With the pattern that every frame repeats, which no averaging takes away."""
         sigma_d = self.quantity("02_depth_noise", "sigma_d").value
         whose = self["02_depth_noise"].whose("sigma_d")
-        return ErrorTerm("depth noise", "noise", sigma_d, sigma_d, "disparity", whose)
+        floor = self._also("02_depth_noise", "fixed_pattern", 0.0)
+        return ErrorTerm("depth noise", "noise", sigma_d, sigma_d, "disparity", whose, floor=floor)
 
-    def _depth_bias(self) -> ErrorTerm:
+    def _depth_bias(self, subtracted: bool) -> ErrorTerm:
         """As a scale: between a shift, which does not grow with Z, and an offset of disparity,
         which grows with Z²; at 0.45 m, where it was measured, all three are the same."""
         name = NEEDED["02_depth_noise"][1]
         bias, whose = self.quantity("02_depth_noise", name), self["02_depth_noise"].whose(name)
         sigma = SIGMAS * (bias.sigma or 0.0)
-        low, high = max(0.0, abs(bias.value) - sigma), abs(bias.value) + sigma
+        size = 0.0 if subtracted else abs(bias.value)
+        low, high = max(0.0, size - sigma), size + sigma
         low, high = (1e-3 * value / LESSON_DISTANCE_M for value in (low, high))
-        return ErrorTerm("depth bias", "bias", low, high, "scale", whose)
+        return ErrorTerm("depth bias", "bias", low, high, "scale", whose, normal=subtracted)
 
     def _intrinsics(self) -> ErrorTerm:
         """By the covariance of K and lens together, where there is one; else by the sigmas.
@@ -211,7 +256,8 @@ class HandOver:
         known = self._known("04_hand_eye", NEEDED["04_hand_eye"])
         variances = [known.matrix[i][i] for i in map(known.names.index, names)]
         high = SIGMAS * unit * math.sqrt(sum(variances) / 3)
-        whose = self["04_hand_eye"].whose()
+        mount = self["04_hand_eye"].result().quantities["tx"].note.replace("_", " ")
+        whose = self["04_hand_eye"].whose() + (f", {mount}" if mount else "")
         return ErrorTerm(f"hand-eye {part}", "bias", 0.0, high, along, whose, normal=True)  # type: ignore[arg-type]
 
 
@@ -233,7 +279,8 @@ def _find(lesson: str, reference: Path) -> Found:
         why = f"results/{lesson}.json is not there yet, notebook {lesson} has not saved it"
         return Found(lesson, None, stand_in, f"{lesson}: {why}; {comes_in}.")
     except (ValueError, OSError) as error:
-        why = f"results/{lesson}.json cannot be used ({str(error).rstrip('.')})"
+        again = "" if "again" in str(error) else f". Run notebook {lesson} again"
+        why = f"results/{lesson}.json cannot be used ({str(error).rstrip('.')}{again})"
         return Found(lesson, None, stand_in, f"{lesson}: {why}; {comes_in}.")
     lacks = _lacking(lesson, yours)
     names = ", ".join(name.replace("|", " or ") for name in lacks)

@@ -145,7 +145,8 @@ class ErrorTerm:
         """The range of the magnitude for people, such as "2 to 5 mm"."""
         unit, factor = _CONVERSIONS[self.along].shown
         low, high = (f"{factor * value:.2g}" for value in (self.low, self.high))
-        return f"{high} {unit}" if low == high else f"{low} to {high} {unit}"
+        repeats = f", {factor * self.floor:.2g} repeats" if self.floor else ""
+        return f"{high} {unit}{repeats}" if low == high else f"{low} to {high} {unit}"
 
     @property
     def range(self) -> tuple[float, float]:
@@ -169,12 +170,14 @@ class ErrorTerm:
 
         From the least magnitude in the direction that moves the object least, to the greatest in
         the one that moves it most: a turn about the line of sight moves it not at all. For noise
-        both are the standard deviation along the direction in which it is largest.
+        both are the standard deviation in a single frame, what repeats included, along the
+        direction in which it is largest.
         """
         gains = np.linalg.svd(self.matrix(view), compute_uv=False)
         low, high = self.range
         if self.kind == "noise":
-            return high * float(gains[0]), high * float(gains[0])
+            single = math.hypot(high, self.floor) * float(gains[0])
+            return single, single
         return low * float(gains[-1]), high * float(gains[0])
 
     def scaled(self, factor: float) -> ErrorTerm:

@@ -24,7 +24,7 @@ def _depth_price(u: float, Z: float, fx: float, cx: float) -> float:
     return (u - cx) / fx
 
 
-def _leak(by_u: float, by_Z: float, depth_error: float) -> float:
+def _leak(by_u: float, by_Z: float, depth_error: float, Z: float) -> float:
     return by_Z * depth_error
 
 
@@ -35,7 +35,7 @@ def _in_order(by_u: float, by_Z: float, leak: float) -> Array:
 def _build(steps: Mapping[str, Step]) -> Model:
     def sensitivities(u: float, Z: float, fx: float, cx: float, depth_error: float) -> Array:
         by_u, by_Z = steps["pixel"](u, Z, fx, cx), steps["depth"](u, Z, fx, cx)
-        return steps["order"](by_u, by_Z, steps["leak"](by_u, by_Z, depth_error))
+        return steps["order"](by_u, by_Z, steps["leak"](by_u, by_Z, depth_error, Z))
 
     return sensitivities
 
@@ -133,7 +133,7 @@ def sine(u: float, Z: float, fx: float, cx: float) -> float:
     "the depth error is multiplied by the price of a pixel",
     "Which of the two prices has the unit metre per metre?",
 )
-def wrong_price(by_u: float, by_Z: float, depth_error: float) -> float:
+def wrong_price(by_u: float, by_Z: float, depth_error: float, Z: float) -> float:
     return by_u * depth_error
 
 
@@ -142,7 +142,7 @@ def wrong_price(by_u: float, by_Z: float, depth_error: float) -> float:
     "the leak has a sign: a depth that is too short pulls the point towards the middle",
     "What is lost when you take the absolute value of a bias?",
 )
-def sign_lost(by_u: float, by_Z: float, depth_error: float) -> float:
+def sign_lost(by_u: float, by_Z: float, depth_error: float, Z: float) -> float:
     return abs(by_Z * depth_error)
 
 
@@ -151,8 +151,26 @@ def sign_lost(by_u: float, by_Z: float, depth_error: float) -> float:
     "millimetres and metres are mixed: the leak is off by a factor 1000",
     "The depth error comes in metres, and the leak leaves in metres.",
 )
-def millimetres(by_u: float, by_Z: float, depth_error: float) -> float:
+def millimetres(by_u: float, by_Z: float, depth_error: float, Z: float) -> float:
     return 1000 * by_Z * depth_error
+
+
+@SENSITIVITIES.mistake(
+    "leak",
+    "that is where the point lands, not how far it was moved",
+    "What would your third number be with a depth error of zero, and what should it be?",
+)
+def landing_place(by_u: float, by_Z: float, depth_error: float, Z: float) -> float:
+    return by_Z * (Z + depth_error)
+
+
+@SENSITIVITIES.mistake(
+    "order",
+    "all of it is in millimetres, and metres are wanted",
+    "Everything goes in in metres and pixels; what is the unit of Z / fx then?",
+)
+def all_millimetres(by_u: float, by_Z: float, leak: float) -> Array:
+    return np.array([1000 * by_u, by_Z, 1000 * leak])
 
 
 @SENSITIVITIES.mistake(
@@ -280,13 +298,14 @@ CHECKPOINTS = (
             Option(
                 "The calibration: one direction in all places is a bias of the mount or the depth",
                 "A mean of 3 mm with a standard error of 2/√10 = 0.6 mm is no accident, and a "
-                "perception error would point another way each time.",
+                "perception error would point another way each time. (A turned mount moves a point "
+                "by its distance from the camera, so it differs a little from place to place.)",
                 right=True,
             ),
             Option(
                 "The arm: its forward kinematics are off",
-                "An arm's error changes with the pose; in ten places it would not point the same "
-                "way ten times.",
+                "In one place an arm's error repeats, and the budget books it as a bias. But it "
+                "changes with the pose: in ten places it would not point the same way ten times.",
             ),
             Option(
                 "Nothing yet: ten trials say nothing",

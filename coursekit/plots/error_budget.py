@@ -7,37 +7,46 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.patches import Ellipse, Rectangle
+from matplotlib.ticker import MultipleLocator
 from numpy.typing import ArrayLike, NDArray
 
 from coursekit.plots.style import COLORS, LessonFigure, figure
 
 if TYPE_CHECKING:
+    from coursekit.attribution.simulate import SimulatedMisses
     from coursekit.budget import BestDistance, Draws, ErrorBudget, Gripper, Target
 
 KINDS = {"bias": "measured", "noise": "depth"}
 CHI2_95 = 5.991  # of two degrees of freedom
+CHI2_95_SPACE = 7.815  # of three
 
 
 def bars(budget: ErrorBudget) -> LessonFigure:
-    """Each row of a budget in millimetres at the object: from its least to its largest."""
-    rows = budget.rows
+    """Each row of a budget in millimetres at the object.
+
+    Bias: dark to its least, light to its most. Noise (one sigma): light in a single frame, dark in
+    the mean of the budget's frames.
+    """
+    rows, averaged = budget.rows, budget.averaged_m
     fig = figure(8.6, 0.5 * len(rows) + 1.3)
     ax = fig.subplots()
+    said = []
     for y, row in enumerate(rows):
-        low, high = 1000 * row.low_m, 1000 * row.high_m
-        color = COLORS[KINDS[row.term.kind]]
+        name, kind = row.term.name, row.term.kind
+        high, low = 1000 * row.high_m, 1000 * averaged.get(name, row.low_m)
+        color = COLORS[KINDS[kind]]
         ax.barh(y, high, color=color, height=0.6, alpha=0.45)
         ax.barh(y, low, color=color, height=0.6)
-    ax.axvline(1000 * budget.grasp.tolerance_m[0], color=COLORS["ink"], ls="--")
-    ax.annotate("closing tolerance", (1000 * budget.grasp.tolerance_m[0], -0.7), (4, 0),
+        said.append(f"{name} {low:.1f} to {high:.1f} mm ({kind})")
+    tolerance = 1000 * budget.grasp.tolerance_m[0]
+    ax.axvline(tolerance, color=COLORS["ink"], ls="--")
+    ax.annotate(f"closing tolerance ±{tolerance:g} mm", (tolerance, -0.7), (4, 0),
                 textcoords="offset points", fontsize=10, va="center")  # fmt: skip
     ax.set_yticks(range(len(rows)), [f"{row.term.name} ({row.term.kind})" for row in rows])
-    ax.set(xlabel="at the object (mm)", ylim=(len(rows) - 0.5, -1.0))
+    right = max(11.0, 1050 * max(row.high_m for row in rows))
+    ax.set(xlabel="at the object (mm)", xlim=(0, right), ylim=(len(rows) - 0.5, -1.0))
     ax.set_ylabel(" ")
-    fig.alt = "The budget's rows at the object: " + "; ".join(
-        f"{r.term.name} {1000 * r.low_m:.1f} to {1000 * r.high_m:.1f} mm ({r.term.kind})"
-        for r in rows
-    )
+    fig.alt = "The budget's rows at the object: " + "; ".join(said)
     return fig
 
 
@@ -66,42 +75,89 @@ def biases(draws: Draws, tolerance_m: float) -> LessonFigure:
 
 
 def between_fingers(
-    gripper: Gripper, target: Target, covariance: ArrayLike, bias_mm: ArrayLike
+    gripper: Gripper,
+    target: Target,
+    covariance: ArrayLike,
+    bias_mm: ArrayLike,
+    others_mm: ArrayLike = (),
 ) -> LessonFigure:
-    """The cube between the fingers from above, at true scale, and where its centre may be.
+    """The cube between the fingers at true scale, in space and from above, and where it may be.
 
-    covariance (2, 2): of closing and approach, m^2, drawn as the ellipse that holds 95 %.
-    bias_mm (2,): where the ellipse's middle is.
+    covariance (3, 3): of the cube's centre along closing, approach and lateral, m^2, drawn as the
+    ellipsoid (from above: the ellipse) that holds 95 %. bias_mm (3,): its middle. others_mm (n, 3):
+    the biases of other rigs, as dots.
     """
-    fig = figure(7.2, 4.2)
-    ax = fig.subplots()
+    covariance, bias = 1e6 * np.asarray(covariance, float), np.asarray(bias_mm, float)
+    others = np.reshape(np.asarray(others_mm, float), (-1, 3))
     width, opening = 1000 * target.width_m, 1000 * gripper.opening_m
+    reach = opening / 2 + 10
+    fig = figure(10.0, 4.6)
+    grid = fig.add_gridspec(1, 2, width_ratios=(1.15, 1))
+    space: Any = fig.add_subplot(grid[0], projection="3d")
     for side in (-1, 1):
-        ax.add_patch(Rectangle((side * opening / 2 - (side < 0) * 10, -20), 10, 40,
-                               color=COLORS["block"]))  # fmt: skip
-    ax.add_patch(Rectangle((-width / 2, -width / 2), width, width, fc=COLORS["cube"], alpha=0.6))
-    values, vectors = np.linalg.eigh(1e6 * np.asarray(covariance))
-    size = 2 * np.sqrt(CHI2_95 * values)
-    turn = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
-    middle = np.asarray(bias_mm, float)
-    place = Ellipse((middle[0], middle[1]), size[1], size[0], angle=turn, fill=False, lw=2)
-    place.set(edgecolor=COLORS["measured"], label="centre of the cube, 95 %")
-    ax.add_patch(place)
-    ax.plot(*middle, "o", color=COLORS["measured"])
-    room = (opening - width) / 2
-    for side in (-1, 1):
-        ax.axvline(side * room, color=COLORS["ink"], ls="--", lw=1)
-    reach = max(opening / 2 + 15, 45)
-    ax.set(xlim=(-reach, reach), ylim=(-32, 32), aspect="equal",
-           xlabel="along the closing axis (mm)", ylabel="along the approach (mm)")  # fmt: skip
-    ax.set_title(f"room ±{room:.1f} mm (dashed)")
-    ax.legend(loc="upper right")
+        _box(space, (side * (opening / 2 + 4), 0, 0), (8, 16, 30), COLORS["block"], 0.5)
+    _box(space, (0, 0, 0), (width,) * 3, COLORS["cube"], 0.15)
+    space.plot_surface(*_surface(covariance, bias), color=COLORS["measured"], shade=True)
+    space.scatter(others[:, 0], others[:, 2], -others[:, 1], s=2, color=COLORS["ink"], alpha=0.4)
+    limits: dict[str, Any] = {f"{axis}lim": (-reach, reach) for axis in "xyz"}
+    space.set(xlabel="closing (mm)", ylabel="lateral (mm)", zlabel="up (mm)", **limits)
+    space.set_box_aspect((1, 1, 1), zoom=1.1)
+    for axis in (space.xaxis, space.yaxis, space.zaxis):
+        axis.set_major_locator(MultipleLocator(20))
+    space.view_init(elev=20, azim=-65)
+    above = fig.add_subplot(grid[1])
+    above.plot(others[:, 0], others[:, 2], ".", ms=2, color=COLORS["ink"], alpha=0.5)
+    half = _from_above(above, width, opening, covariance[::2, ::2], bias[::2])
     fig.alt = (
-        f"A {width:g} mm cube between fingers that open {opening:g} mm, with the ellipse that "
-        f"holds its centre in 95 of 100 grasps: {size[1] / 2:.1f} by {size[0] / 2:.1f} mm, its "
-        f"middle {np.hypot(*middle):.1f} mm off; the room is ±{room:.1f} mm."
+        f"A {width:g} mm cube between fingers that open {opening:g} mm, with the ellipsoid that "
+        f"holds its centre in 95 of 100 grasps, from above {half[0]:.1f} by {half[1]:.1f} mm to "
+        f"either side, its middle {np.linalg.norm(bias):.1f} mm off, {bias[0]:+.1f} mm of it "
+        f"along the closing axis; the room is ±{(opening - width) / 2:.1f} mm. {len(others)} dots: "
+        "the same for other rigs, without noise."
     )
     return fig
+
+
+def _from_above(
+    ax: Any, width: float, opening: float, covariance: NDArray[Any], bias: NDArray[Any]
+) -> NDArray[Any]:
+    """Fingers, cube and the 95 % ellipse of (closing, lateral), mm; its half axes (2,)."""
+    room, reach = (opening - width) / 2, opening / 2 + 10
+    for side in (-1, 1):
+        left = opening / 2 if side > 0 else -opening / 2 - 8
+        ax.add_patch(Rectangle((left, -8), 8, 16, color=COLORS["block"]))
+        ax.axvline(side * room, color=COLORS["ink"], ls="--", lw=1)
+    ax.add_patch(Rectangle((-width / 2, -width / 2), width, width, fc=COLORS["cube"], alpha=0.25))
+    values, vectors = np.linalg.eigh(covariance)
+    half = np.sqrt(CHI2_95 * np.clip(values, 0, None))[::-1]
+    turn = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
+    middle = (float(bias[0]), float(bias[1]))
+    place = Ellipse(middle, 2 * half[0], 2 * half[1], angle=turn, fc=COLORS["measured"], alpha=0.5)
+    place.set(edgecolor=COLORS["measured"], lw=2)
+    ax.add_patch(place)
+    ax.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal",
+           xlabel="closing (mm)", ylabel="lateral (mm)")  # fmt: skip
+    ax.set_title(f"from above: its centre must stay within ±{room:.1f} mm")
+    return half
+
+
+def _surface(covariance: NDArray[Any], middle: NDArray[Any]) -> NDArray[Any]:
+    """The 95 % ellipsoid as x, y, z to plot, (3, 17, 25): closing, lateral, up (mm)."""
+    polar, around = np.meshgrid(np.linspace(0, np.pi, 17), np.linspace(0, 2 * np.pi, 25),
+                                indexing="ij")  # fmt: skip
+    sphere = np.stack([np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around),
+                       np.cos(polar)])  # fmt: skip
+    values, vectors = np.linalg.eigh(covariance)
+    root = vectors * np.sqrt(CHI2_95_SPACE * np.clip(values, 0, None))
+    closing, approach, lateral = np.tensordot(root, sphere, 1) + middle[:, None, None]
+    return np.stack([closing, lateral, -approach])  # the gripper comes from above
+
+
+def _box(ax: Any, middle: tuple[float, ...], size: tuple[float, ...], color: str,
+         alpha: float) -> None:  # fmt: skip
+    """A block in a 3-D axes, of `size` about `middle`, mm."""
+    corner = np.subtract(middle, np.divide(size, 2))
+    ax.bar3d(*corner, *size, color=color, alpha=alpha, shade=True)
 
 
 def distances(best: BestDistance) -> LessonFigure:
@@ -119,21 +175,21 @@ def distances(best: BestDistance) -> LessonFigure:
     return fig
 
 
-def misses(sets: Mapping[str, NDArray[Any]]) -> LessonFigure:
-    """Sets of misses (n, 3), m, from above, each from the origin as an arrow."""
-    fig = figure(9.6, 3.0)
+def misses(sets: Mapping[str, SimulatedMisses]) -> LessonFigure:
+    """Sets of misses from above, each arrow where its grasp was and ten times as long."""
+    fig = figure(9.6, 3.4)
     axes = fig.subplots(1, len(sets), sharex=True, sharey=True, squeeze=False)[0]
-    reach = 1.1 * max(1000 * np.abs(m[:, :2]).max() for m in sets.values())
-    for ax, (name, m) in zip(axes, sets.items(), strict=True):
-        zero = np.zeros(len(m))
-        ax.quiver(zero, zero, 1000 * m[:, 0], 1000 * m[:, 1], angles="xy", scale_units="xy",
-                  scale=1, width=0.012, color=COLORS["measured"])  # fmt: skip
-        ax.plot(0, 0, "+", ms=12, color=COLORS["ink"])
-        ax.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", title=name,
-               xlabel="x of the base (mm)", ylabel="y of the base (mm)")  # fmt: skip
+    for ax, (name, one) in zip(axes, sets.items(), strict=True):
+        x, y = one.T_base_gripper[:, :2, 3].T
+        ax.quiver(x, y, *(10 * one.misses[:, :2].T), angles="xy", scale_units="xy", scale=1,
+                  width=0.012, color=COLORS["measured"])  # fmt: skip
+        ax.plot(x, y, ".", ms=3, color=COLORS["ink"])
+        ax.set(xlim=(0.05, 0.5), ylim=(-0.42, 0.42), aspect="equal", title=name,
+               xlabel="x of the base (m)", ylabel="y of the base (m)")  # fmt: skip
         ax.label_outer()
-    fig.alt = "Misses from above: " + "; ".join(
-        f"{name}, {len(m)} trials, mean {1000 * np.linalg.norm(m.mean(axis=0)):.1f} mm"
-        for name, m in sets.items()
+    fig.alt = "Misses from above, ten times as long, where they happened: " + "; ".join(
+        f"{name}, {len(one.misses)} trials, mean "
+        f"{1000 * np.linalg.norm(one.misses.mean(axis=0)):.1f} mm"
+        for name, one in sets.items()
     )
     return fig

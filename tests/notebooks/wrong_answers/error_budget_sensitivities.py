@@ -63,6 +63,18 @@ def leak_in_millimetres(u, Z, fx, cx, depth_error):
     return Z / fx, (u - cx) / fx, (u - cx) / fx * depth_error * 1e3
 
 
+@wrong("landing_place", "the whole depth")
+def where_the_point_ends_up(u, Z, fx, cx, depth_error):
+    slope = (u - cx) / fx
+    return Z / fx, slope, slope * (Z + depth_error)
+
+
+@wrong("all_millimetres", "all in mm")
+def prices_in_millimetres(u, Z, fx, cx, depth_error):
+    slope = (u - cx) / fx
+    return 1000 * Z / fx, slope, 1000 * slope * depth_error
+
+
 @wrong("exchanged", "one line")
 def depth_first(u, Z, fx, cx, depth_error):
     return (u - cx) / fx, Z / fx, (u - cx) / fx * depth_error
