@@ -333,6 +333,8 @@ class ErrorBudget:
         sums = {"worst case": self.worst_case_m, "quadrature": self.quadrature_m}
         for name, (low, high) in sums.items():
             text.append(f"bias, {name}: {span(low, high)} ({QUESTIONS[name]})")
+        if all(term.stated_m is not None for term in self.terms):
+            return text  # lengths alone know no direction
         for axis in AXES:
             a = self.along(axis)
             text.append(

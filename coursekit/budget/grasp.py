@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 DRAWS = 20_000  # of a probability that is redrawn while dragging: a standard error of 0.4 % at most
 DISTANCES = 200
+LARGEST_M = 1.0  # of a gripper or an object; more was meant in millimetres
+FEW_DRAWS = 10  # a gain of so many draws says nothing about which row is first
 
 
 @dataclass(frozen=True)
@@ -27,11 +29,10 @@ class Gripper:
     """Two fingers that open opening_m wide; source: who says so."""
 
     opening_m: float
-    source: str
+    source: str = ""
 
     def __post_init__(self) -> None:
-        if not positive(self.opening_m):
-            raise ValueError(f"opening_m: got {self.opening_m!r}, want a positive length, m")
+        _check_length("opening_m", self.opening_m)
 
 
 @dataclass(frozen=True)
@@ -41,8 +42,14 @@ class Target:
     width_m: float
 
     def __post_init__(self) -> None:
-        if not positive(self.width_m):
-            raise ValueError(f"width_m: got {self.width_m!r}, want a positive length, m")
+        _check_length("width_m", self.width_m)
+
+
+def _check_length(name: str, value: float) -> None:
+    if not positive(value):
+        raise ValueError(f"{name}: got {value!r}, want a positive length, m")
+    if value > LARGEST_M:
+        raise ValueError(f"{name}: got {value!r} m; metres are wanted: 60 mm is 0.060")
 
 
 LESSON_GRIPPER = Gripper(0.040, "the lesson; it is the travel of one finger")
@@ -122,7 +129,7 @@ def success_probability(budget: ErrorBudget, n: int = DRAWS, seed: int = 0) -> S
 class Gain:
     """What it gains to multiply one term's magnitude by a factor: differences, positive is better.
 
-    worst_case_m, noise_m: along the closing axis, m, as its words have them. success: of the probability.
+    worst_case_m, noise_m: along the closing axis, m. success: of the probability.
     """
 
     name: str
@@ -166,7 +173,7 @@ def sensitivity(
                 fewer.success() - before,
             )
         )
-    chance = 2 / math.sqrt(n) * math.sqrt(max(before * (1 - before), 1 / n))
+    chance = max(2 * math.sqrt(before * (1 - before) / n), FEW_DRAWS / n)
     if max(abs(gain.success) for gain in gains) <= chance:
         return tuple(sorted(gains, key=lambda g: -(g.worst_case_m + 2 * g.noise_m)))
     return tuple(sorted(gains, key=lambda g: -g.success))

@@ -19,14 +19,18 @@ AXES = ("closing", "approach", "lateral")
 MAX_DISPARITY_PX = 126  # the vendor's search range: nearer than fx baseline / 126 nothing is seen
 
 
-def looking_down() -> Floats:
+def looking_down(tilt_deg: float = 0.0) -> Floats:
     """T_base_camera (4, 4) of a camera over the base's origin that looks straight down.
 
-    Image right is the base's -y, image down its -x. Where it stands does not matter to a budget,
-    which knows only directions and the lever from camera to object.
+    Image right is the base's -y, image down its -x. tilt_deg: turned from there about image down,
+    so that it looks along the base's +y as well; at 90 it looks along y alone. Where it stands does
+    not matter to a budget, which knows only directions and the lever from camera to object.
     """
+    if not -180 <= tilt_deg <= 180:
+        raise ValueError(f"tilt_deg: got {tilt_deg!r}, want an angle in degrees")
+    c, s = math.cos(math.radians(tilt_deg)), math.sin(math.radians(tilt_deg))
     T = np.eye(4)
-    T[:3, :3] = [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]
+    T[:3, :3] = [[0, -1, 0], [-c, 0, s], [-s, 0, -c]]
     return T
 
 

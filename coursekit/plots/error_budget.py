@@ -25,7 +25,8 @@ def bars(budget: ErrorBudget) -> LessonFigure:
     """Each row of a budget in millimetres at the object.
 
     Bias: dark to its least, light to its most. Noise (one sigma): light in a single frame, dark in
-    the mean of the budget's frames.
+    the mean of the budget's frames. A tick: the most that the row does along the closing axis,
+    where the rows know their directions.
     """
     rows, averaged = budget.rows, budget.averaged_m
     fig = figure(8.6, 0.5 * len(rows) + 1.3)
@@ -38,6 +39,10 @@ def bars(budget: ErrorBudget) -> LessonFigure:
         ax.barh(y, high, color=color, height=0.6, alpha=0.45)
         ax.barh(y, low, color=color, height=0.6)
         said.append(f"{name} {low:.1f} to {high:.1f} mm ({kind})")
+        if row.term.stated_m is None:
+            closing = 1000 * row.along_m[0]
+            ax.plot([closing] * 2, [y - 0.42, y + 0.42], color=COLORS["ink"], lw=2.5)
+            said[-1] += f", {closing:.1f} along closing"
     tolerance = 1000 * budget.grasp.tolerance_m[0]
     ax.axvline(tolerance, color=COLORS["ink"], ls="--")
     ax.annotate(f"closing tolerance ±{tolerance:g} mm", (tolerance, -0.7), (4, 0),
