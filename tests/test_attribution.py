@@ -17,7 +17,8 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy.stats import binom, f, ncf, t
+from scipy.spatial.transform import Rotation
+from scipy.stats import binom, f, f_oneway, ncf, t
 
 from coursekit.arm import widowx
 from coursekit.attribution import Entry, Ledger, attribute, simulate_misses
@@ -29,6 +30,7 @@ from coursekit.attribution.mean_test import (
     mean_test,
     pose_power,
 )
+from coursekit.attribution.place_test import find_places, place_test
 from coursekit.attribution.pose_test import GROUPS, STILL, pose_columns, pose_test
 
 NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
@@ -73,7 +75,7 @@ def test_an_arm_error_is_found_from_the_poses_and_nothing_else_is_blamed_on_the_
 
 def test_perception_is_said_once_enough_trials_rule_out_the_rest():
     found = shares("perception", 25, sets=300)
-    assert found["perception"] >= 0.95
+    assert found["perception"] >= 0.90  # a mean of p < 0.05, which chance makes, holds it back
     assert "perception" not in shares("perception", 6, sets=300)
 
 
@@ -96,7 +98,7 @@ def test_an_unfinished_verdict_says_how_many_trials_would_settle_it():
     more = [attribute(made.misses, made.T_base_gripper).more_trials for made in undecided]
     n = 8 + int(np.median([m for m in more if m]))
     assert 14 <= n <= 22
-    assert shares("perception", n, sets=300)["perception"] >= 0.70
+    assert shares("perception", n, sets=300)["perception"] >= 0.60  # half is the aim
     settled = attribute(simulate_misses("calibration", 30, FIRST_SEED).misses)
     assert settled.more_trials == 0
     hopeless = np.random.default_rng(1).standard_normal((10, 3)) * 0.1
@@ -128,12 +130,51 @@ def test_columns_of_the_arm_replace_the_general_regression():
     assert verdicts["pose_dependent"] >= 75
 
 
-def test_poses_that_do_not_differ_are_not_tested():
+def test_a_small_constant_is_seldom_called_perception():
+    """The interval of a mean of 2 mm still leaves zero out at 95 % in most sets that miss 99 %."""
+    assert shares("calibration", 12, sets=300, bias_m=0.002, noise_m=0.0015)["perception"] <= 0.06
+    doubtful = np.random.default_rng(3).standard_normal((40, 3)) * 0.002
+    doubtful += np.array([0.0011, 0, 0]) - doubtful.mean(axis=0)
+    found = attribute(doubtful)
+    assert LEVEL < found.p_mean < 0.05
+    assert found.power_mean > 0.99
+    assert found.verdict == "cannot_tell_yet"
+    assert found.more_trials > 0
+
+
+def test_in_one_place_a_constant_is_not_told_from_an_error_of_the_arm():
     made = simulate_misses("calibration", 12, FIRST_SEED)
-    found = attribute(made.misses, np.repeat(made.T_base_gripper[:1], 12, axis=0))
+    poses = np.repeat(made.T_base_gripper[:1], 12, axis=0)
+    found = attribute(made.misses, poses)
     assert found.p_pose is None
-    assert found.verdict == "calibration"
+    assert found.verdict == "cannot_tell_yet"
+    assert "too near" in found.says
+    assert "in other places" in found.remedy
+    assert found.more_trials >= 5
     assert "not ruled out" in repr(found)
+    known = attribute(made.misses)
+    assert known.verdict == "calibration"
+    assert "not ruled out" in repr(known)
+    columns = np.ones((12, 3, 2))
+    assert attribute(made.misses, columns=columns).verdict == "cannot_tell_yet"
+    few = [0.003, 0, 0] + 0.5e-3 * np.random.default_rng(1).standard_normal((5, 3))
+    assert "too near" in attribute(few, poses[:5]).says
+    exact = np.tile([0.003, 0, 0], (12, 1))
+    assert attribute(exact, poses).verdict == "cannot_tell_yet"
+
+
+@pytest.mark.parametrize(("apart_m", "called"), [(0.002, 0.0), (0.03, 0.1), (0.15, 0.95)])
+def test_the_nearer_the_places_the_less_a_constant_is_blamed_on_the_calibration(apart_m, called):
+    verdicts = Counter()
+    for i in range(100):
+        made = simulate_misses("calibration", 15, FIRST_SEED + i)
+        poses = made.T_base_gripper.copy()
+        at = poses[:, :3, 3]
+        rms = np.sqrt(((at - at.mean(axis=0)) ** 2).sum(axis=1).mean())
+        poses[:, :3, 3] = at.mean(axis=0) + (at - at.mean(axis=0)) * apart_m / rms
+        verdicts[attribute(made.misses, poses).verdict] += 1
+    share = verdicts["calibration"] / 100
+    assert share >= called if called > 0.5 else share <= called
 
 
 def test_the_numbers_are_those_of_the_textbook():
@@ -157,6 +198,159 @@ def test_the_interval_of_the_mean_covers_it():
         inside.extend((low <= made.constant_m) & (made.constant_m <= high))
     low, high = binom.ppf([0.001, 0.999], len(inside), 0.95) / len(inside)
     assert low <= np.mean(inside) <= high
+
+
+# --- repeats ---
+
+
+def repeated(places: int, repeats: int, seed: int, kind: str = "pose_dependent", **options):
+    """Places with offsets of their own (2 mm an axis, 0.5 mm of scatter), or another kind."""
+    if kind == "pose_dependent":
+        options = {"arm_m": 0.002 * 3**0.5, "noise_m": 0.0005, "unrelated": True} | options
+    return simulate_misses(kind, places * repeats, FIRST_SEED + seed, repeats=repeats, **options)
+
+
+@cache
+def repeated_shares(places: int, repeats: int, sets: int = 200, **options) -> dict[str, float]:
+    made = [repeated(places, repeats, i, **options) for i in range(sets)]
+    found = Counter(attribute(one.misses, one.T_base_gripper).verdict for one in made)
+    return {verdict: count / sets for verdict, count in found.items()}
+
+
+@pytest.mark.parametrize(("places", "repeats"), [(8, 3), (5, 3), (8, 2), (3, 5)])
+def test_errors_of_places_that_follow_no_regression_are_found_by_repeats(places, repeats):
+    found = repeated_shares(places, repeats)
+    assert found["pose_dependent"] >= 0.95
+    assert found.get("calibration", 0) <= 0.02
+
+
+def test_the_least_repeats_have_power_too():
+    found = repeated_shares(3, 2)
+    assert found["pose_dependent"] >= 0.70
+    assert found.get("calibration", 0) <= 0.02
+
+
+@pytest.mark.parametrize(("places", "repeats"), [(3, 2), (4, 3), (8, 3)])
+def test_repeated_scatter_is_blamed_on_nothing_else(places, repeats):
+    found = repeated_shares(places, repeats, 500, kind="perception")
+    assert found.get("pose_dependent", 0) <= 0.02
+    assert found.get("calibration", 0) <= 0.02
+
+
+def test_repeated_constants_are_those_of_the_calibration():
+    assert repeated_shares(8, 3, kind="calibration")["calibration"] >= 0.95
+    assert repeated_shares(10, 2, kind="calibration")["calibration"] >= 0.95
+    assert repeated_shares(5, 3, kind="calibration", noise_m=0.001)["calibration"] >= 0.95
+
+
+def test_weak_errors_of_few_places_do_not_pass_for_a_constant():
+    """A mean of 15 trials in 3 places is one of 3 if the places differ."""
+    found = repeated_shares(3, 5, 400, arm_m=0.0005 * 3**0.5)
+    assert found.get("calibration", 0) <= 0.05
+
+
+def test_perception_rests_on_the_repeats_where_there_are_any():
+    assert repeated_shares(8, 3, kind="perception", noise_m=0.0015)["perception"] >= 0.90
+    seldom = [repeated(10, 2, i, kind="perception") for i in range(50)]
+    verdicts = Counter()
+    for made in seldom:
+        found = attribute(made.misses, made.T_base_gripper)
+        assert found.pose_test.p_value >= found.p_pose / 2
+        assert found.power_pose < 0.95
+        if found.verdict == "perception":
+            assert found.power_pose >= 0.9
+        verdicts[found.verdict] += 1
+    assert verdicts["cannot_tell_yet"] >= 40  # the regression alone would have said perception
+
+
+def test_the_words_name_the_places_and_their_own_p_value():
+    made = repeated(8, 3, 1)
+    found = attribute(made.misses, made.T_base_gripper)
+    assert found.p_pose == pytest.approx(min(1, 2 * min(found.p_regression, found.p_places)))
+    assert "from place to place" in found.says
+    text = repr(found)
+    assert max(map(len, text.splitlines())) <= 88
+    for words in ("8 places repeated, 24 trials", "p < 0.001", "place to place", "repeats in one"):
+        assert words in text.replace("\n    ", " ").replace("\n  ", " ")
+    assert "No turn, scale or shift" in found.remedy
+    slipped = repeated(12, 2, 1, unrelated=False, arm_m=0.004)
+    assert "joint zeros" in attribute(slipped.misses, slipped.T_base_gripper).remedy
+    assert Entry.of(found, "cube").p_pose == found.p_pose
+
+
+def test_the_place_test_is_the_one_way_analysis_of_variance_on_one_axis():
+    made = repeated(4, 3, 2)
+    misses = made.misses * [1.0, 0, 0]
+    found = place_test(misses, made.T_base_gripper, LEVEL)
+    groups = misses[:, 0].reshape(4, 3)
+    assert found.axes == pytest.approx(1)
+    assert found.p_value == pytest.approx(f_oneway(*groups).pvalue, rel=1e-6)
+    assert found.S[0, 0] == pytest.approx(np.mean(groups.var(axis=1, ddof=1)))
+    np.testing.assert_allclose(np.sort(found.means_m[:, 0]), np.sort(groups.mean(axis=1)))
+
+
+@pytest.mark.parametrize(("places", "repeats"), [(3, 2), (5, 2), (3, 5), (8, 3)])
+@pytest.mark.parametrize("scatter", [(1, 1, 1), (1, 1, 3), (1, 4, 4)])
+def test_the_level_of_the_place_test(scatter, places, repeats):
+    rng = np.random.default_rng([FIRST_SEED, places, repeats, *scatter])
+    poses = repeated(places, repeats, 0).T_base_gripper
+    rows = rng.standard_normal((MANY // 2, places * repeats, 3)) * scatter * 1e-3
+    rejected = sum(place_test(row, poses, LEVEL).p_value < LEVEL for row in rows)
+    assert rejected <= binom.ppf(0.999, len(rows), 0.019)
+
+
+def test_places_are_told_apart_by_where_and_how_the_hand_is():
+    rng = np.random.default_rng(FIRST_SEED)
+    poses = repeated(6, 3, 0).T_base_gripper.copy()
+    poses[:, :3, 3] += rng.uniform(-0.002, 0.002, (18, 3))
+    poses[:, :3, :3] = (
+        poses[:, :3, :3] @ Rotation.from_rotvec(rng.uniform(-0.01, 0.01, (18, 3))).as_matrix()
+    )
+    order = rng.permutation(18)
+    place = find_places(poses[order])[np.argsort(order)].reshape(6, 3)
+    assert (place == place[:, :1]).all()
+    assert len(set(place[:, 0])) == 6
+    far, turned = poses[[0, 0]].copy(), poses[[0, 0]].copy()
+    far[1, 0, 3] += 0.012
+    turned[1, :3, :3] = turned[1, :3, :3] @ Rotation.from_rotvec([0, 0, 0.06]).as_matrix()
+    assert len(set(find_places(far))) == len(set(find_places(turned))) == 2
+    chain = np.repeat(poses[:1], 40, axis=0)
+    chain[:, 0, 3] += 0.004 * np.arange(40)  # each is near the next
+    assert len(set(find_places(chain))) >= 14
+
+
+def test_too_few_repeats_are_not_tested():
+    made = simulate_misses("perception", 12, FIRST_SEED + 1)
+    assert place_test(made.misses, made.T_base_gripper, LEVEL) is None
+    two = repeated(2, 5, 0)
+    assert place_test(two.misses, two.T_base_gripper, LEVEL) is None
+    mostly_once = np.concatenate([repeated(3, 2, 0).T_base_gripper, made.T_base_gripper])
+    misses = np.random.default_rng(1).standard_normal((18, 3)) * 1e-3
+    assert place_test(misses, mostly_once, LEVEL) is None
+    found = place_test(misses[:10], mostly_once[:10], LEVEL)
+    assert (found.places, found.trials) == (3, 6)
+
+
+def test_repeats_without_scatter_are_no_trouble():
+    still = repeated(4, 3, 0, noise_m=0)
+    assert attribute(still.misses, still.T_base_gripper).verdict == "pose_dependent"
+    same = np.tile([0.003, 0, 0], (12, 1))
+    assert attribute(same, still.T_base_gripper).verdict == "calibration"
+    assert attribute(0 * same, still.T_base_gripper).verdict == "perception"
+
+
+# --- words and input ---
+
+
+def test_two_trials_are_too_few_and_it_says_so():
+    made = simulate_misses("calibration", 2, FIRST_SEED)
+    for poses in (None, made.T_base_gripper):
+        found = attribute(made.misses, poses)
+        assert found.verdict == "cannot_tell_yet"
+        assert "2 trials decide nothing" in found.says
+        assert found.more_trials >= 3
+        assert 0 < found.p_mean <= 1
+        assert "CANNOT TELL YET (2 trials)" in repr(found)
 
 
 def test_a_printout_is_narrow_and_names_cause_numbers_and_remedy():
@@ -289,6 +483,19 @@ def test_the_same_seed_gives_the_same_misses_and_the_truth_adds_up():
         np.testing.assert_allclose(arm.forward(one.q), one.T_base_gripper, atol=1e-8)
 
 
+def test_repeats_stay_in_their_place():
+    made = simulate_misses("pose_dependent", 11, FIRST_SEED, repeats=3, noise_m=0)
+    for start in (0, 3, 6, 9):
+        rows = slice(start, start + 3)
+        for values in (made.misses, made.T_base_gripper, made.q, made.by_pose_m):
+            assert (values[rows] == values[start]).all()
+    assert len(np.unique(made.q, axis=0)) == 4
+    own = simulate_misses("pose_dependent", 390, FIRST_SEED, unrelated=True, arm_m=0.003, noise_m=0)
+    assert np.sqrt((own.misses**2).sum(axis=1).mean()) == pytest.approx(0.003, rel=0.1)
+    regression = pose_test(own.misses, pose_columns(own.T_base_gripper), {}, STILL, LEVEL)
+    assert regression.part_m < 6e-4
+
+
 def test_an_arm_error_is_as_large_as_asked_and_has_no_constant_over_the_table():
     made = simulate_misses("pose_dependent", 397, FIRST_SEED, noise_m=0, arm_m=0.004)
     rms = np.sqrt((made.misses**2).sum(axis=1).mean())
@@ -302,6 +509,8 @@ def test_an_arm_error_is_as_large_as_asked_and_has_no_constant_over_the_table():
         ({"kind": "weather"}, "kind"),
         ({"n": 0}, "n: got"),
         ({"n": 2.5}, "n: got"),
+        ({"repeats": 0}, "repeats: got"),
+        ({"repeats": True}, "repeats: got"),
         ({"noise_m": -1}, "noise_m"),
         ({"noise_m": (1, 2)}, "noise_m"),
         ({"bias_m": np.nan}, "bias_m"),

@@ -51,10 +51,9 @@ def mean_test(misses: Floats) -> MeanTest:
     n, mean, S = len(misses), misses.mean(axis=0), np.cov(misses.T)
     total = float(np.trace(S))
     axes = effective_axes(S, n)
-    below = axes if n >= FEW or total == 0 else total**2 / float((S * S).sum())
     squares = float(n * mean @ mean)
     if total > 0:
-        p_pooled = float(f.sf(squares / total, axes, below * (n - 1)))
+        p_pooled = float(f.sf(squares / total, axes, box_freedom(S, n) * (n - 1)))
     else:
         p_pooled = 0.0 if squares > 0 else 1.0
     values = np.linalg.eigvalsh(S)
@@ -68,14 +67,25 @@ def mean_test(misses: Floats) -> MeanTest:
 def effective_axes(S: Floats, n: int) -> float:
     """tr(C)^2 / tr(C^2) of the true covariance C behind S (3, 3) of n trials: 1 to 3.
 
-    From the expectations of tr(S)^2 and tr(S^2) for normal scatter; S alone would say too few.
+    From the expectations of tr(S)^2 and tr(S^2) for normal scatter; S alone would say too few. Two
+    trials lie on a line, and 1 is all that they show.
     """
     v = n - 1
+    if v == 1:
+        return 1.0
     square_of_trace, trace_of_square = float(np.trace(S)) ** 2, float((S * S).sum())
     a, b = np.linalg.solve(
         [[1.0, 2.0 / v], [1.0 / v, 1.0 + 1.0 / v]], [square_of_trace, trace_of_square]
     )
     return float(np.clip(a / b, 1.0, 3.0)) if b > 0 else 3.0
+
+
+def box_freedom(S: Floats, n: int) -> float:
+    """Degrees of freedom of tr S (3, 3) for each of the n - 1 trials behind it: 1 to 3."""
+    squares = float((S * S).sum())
+    if n >= FEW or squares == 0:
+        return effective_axes(S, n)
+    return float(np.trace(S)) ** 2 / squares
 
 
 def mean_power(size_m: float, S: Floats, axes: float, n: int, level: float) -> float:
@@ -103,7 +113,7 @@ def _power(
 
     total = float(np.trace(S))
     if total <= 0:
-        return 1.0
+        return float(squares > 0)
     limit = f.isf(level, above, below)
     return float(
         np.nan_to_num(ncf.sf(limit, above, below, min(axes * squares / total, 1e4)), nan=1.0)

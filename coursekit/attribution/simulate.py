@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, get_args
 import numpy as np
 
 from coursekit.arm import widowx
-from coursekit.attribution.attribute import Verdict
+from coursekit.attribution.decision import Verdict
 from coursekit.geometry import make_transform
 
 if TYPE_CHECKING:
@@ -53,22 +53,28 @@ def simulate_misses(
     noise_m: ArrayLike | None = None,
     bias_m: float | None = None,
     arm_m: float = ARM_M,
+    repeats: int = 1,
+    unrelated: bool = False,
 ) -> SimulatedMisses:
     """n grasps from above, all over the table in front of a WidowX AI, that miss for one reason.
 
     kind: "calibration" (a constant of length bias_m, 3 mm, in a random direction of the base),
     "perception" (scatter and nothing else), "pose_dependent" (the zeros of the six joints slipped,
     then the hand-eye calibration was repeated, which took up what the slip does everywhere; arm_m
-    rms is left over the table), "cannot_tell_yet" (a constant of 0.5 mm under scatter of 6 mm).
+    rms is left over the table; unrelated: each place has an error of its own, normal and alike in
+    all directions), "cannot_tell_yet" (a constant of 0.5 mm under scatter of 6 mm).
+    repeats: trials in each place, one after the other; the last place gets what is left of n.
     noise_m: std of the scatter that every kind has, one number or (3,) along the base's axes, m;
     2 mm unless given.
 
-    Raises ValueError for an unknown kind, n < 1, and sizes that are negative or not finite.
+    Raises ValueError for an unknown kind, n or repeats < 1, and sizes that are negative or not
+    finite.
     """
     if kind not in get_args(Verdict):
         raise ValueError(f"kind: got {kind!r}, want one of {', '.join(get_args(Verdict))}")
-    if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1:
-        raise ValueError(f"n: got {n!r}, want a number of trials, 1 or more")
+    for name, number in (("n", n), ("repeats", repeats)):
+        if isinstance(number, bool) or not isinstance(number, (int, np.integer)) or number < 1:
+            raise ValueError(f"{name}: got {number!r}, want a number of trials, 1 or more")
     usual = {"calibration": BIAS_M, "cannot_tell_yet": WEAK_BIAS_M}.get(kind, 0.0)
     size = _size("bias_m", usual if bias_m is None else bias_m, ())
     if noise_m is None:
@@ -77,10 +83,16 @@ def simulate_misses(
     slipped_m = _size("arm_m", arm_m, ()) if kind == "pose_dependent" else np.zeros(())
     rng = np.random.default_rng([seed, zlib.crc32(b"misses")])
     q, poses = _places()
-    chosen = rng.choice(len(q), n, replace=n > len(q))
+    places = -(-n // repeats)
+    chosen = rng.choice(len(q), places, replace=places > len(q))
+    place = np.arange(n) // repeats
     direction = rng.standard_normal(3)
     constant = size * direction / np.linalg.norm(direction)
-    by_pose = float(slipped_m) * _slip(rng.standard_normal(6))[chosen]
+    if unrelated:
+        by_place = rng.standard_normal((places, 3)) / np.sqrt(3)
+    else:
+        by_place = _slip(rng.standard_normal(6))[chosen]
+    chosen, by_pose = chosen[place], float(slipped_m) * by_place[place]
     misses = constant + by_pose + noise * rng.standard_normal((n, 3))
     return SimulatedMisses(misses, poses[chosen], q[chosen], kind, constant, by_pose)
 

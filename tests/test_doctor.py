@@ -1,0 +1,554 @@
+"""`coursekit doctor`: each fault has its line and its remedy, and none stops the rest."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import subprocess
+import sys
+import tempfile
+import webbrowser
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from fake_realsense import SERIAL, FakeImage, FakeRealSense, real_library
+
+from coursekit import doctor, results
+from coursekit.cameras import librealsense, open_camera, realsense
+from coursekit.doctor import Line, examine
+from coursekit.geometry import Intrinsics
+
+UDEV = "99-realsense-libusb.rules"
+
+
+class PluggedIn(FakeRealSense):
+    """The fake D435 with what a device tells about its link and firmware, and noisy depth."""
+
+    def __init__(self, **behaviour):
+        super().__init__(**behaviour)
+        self.told = {
+            "name": "Intel RealSense D435",
+            "serial_number": SERIAL,
+            "usb_type_descriptor": "3.2",
+            "firmware_version": "5.16.0.1",
+            "recommended_firmware_version": "5.16.0.1",
+        }
+        self.filled, self.noise = 1.0, 0.6
+
+    def context(self):
+        device = SimpleNamespace(supports=self.told.__contains__, get_info=self.told.__getitem__)
+        super().context()  # may not be allowed to
+        return SimpleNamespace(query_devices=lambda: [device] * len(self.serials))
+
+    def pipeline(self):
+        pipeline = super().pipeline()
+        wait, rng = pipeline.try_wait_for_frames, np.random.default_rng(0)
+
+        def noisy(timeout_ms):
+            arrived, frameset = wait(timeout_ms)
+            if arrived:
+                depth = np.rint(700 + self.noise * rng.standard_normal((480, 848)))
+                depth[rng.random(depth.shape) >= self.filled] = 0
+                image = FakeImage(frameset.get_depth_frame().get_frame_number(), depth.astype("u2"))
+                frameset.get_depth_frame = lambda: image
+            return arrived, frameset
+
+        pipeline.try_wait_for_frames = noisy
+        return pipeline
+
+
+@pytest.fixture(autouse=True)
+def alone(monkeypatch, tmp_path):
+    """No camera, no variable; a screen with a browser; results of its own."""
+    for name in ("COURSEKIT_CAMERA", "JUPYTERHUB_SERVICE_PREFIX"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setenv("COURSEKIT_RESULTS", str(tmp_path / "results"))
+    monkeypatch.setattr(webbrowser, "get", lambda: SimpleNamespace(name="firefox"))
+
+
+@pytest.fixture
+def plug_in(monkeypatch, tmp_path):
+    """Plug in a fake D435 that behaves as the arguments say."""
+    monkeypatch.setattr(librealsense, "USB_DEVICES", tmp_path)
+    monkeypatch.setattr(realsense, "SILENCE_S", 0.05)
+    monkeypatch.setattr(realsense, "_live_cameras", {})
+
+    def plug(**behaviour):
+        rs = PluggedIn(**behaviour)
+        for module in (librealsense, realsense):
+            monkeypatch.setattr(module, "load_librealsense", lambda: rs)
+        return rs
+
+    return plug
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Without the checks of the computer, and with few frames of the simulated camera."""
+    for name in ("_python", "_packages", "_loading", "_kernel", "_browser", "_results"):
+        monkeypatch.setattr(doctor, name, lambda: iter(()))
+    monkeypatch.setattr(doctor, "LONGEST_TEST_S", 0.2)
+
+
+def line(lines, check):
+    """The only line of this check; the last, where the camera has two."""
+    found = [one for one in lines if one.check == check]
+    assert found, [one.check for one in lines]
+    return found[-1]
+
+
+def only(generator):
+    (one,) = generator
+    return one
+
+
+# --- the computer ---
+
+
+def test_this_computer_with_the_simulated_camera(capsys):
+    assert doctor.run("simulated") in (0, 1)  # packages of its own are the developer's affair
+    said = capsys.readouterr().out
+    for check in ("Python", "Packages", "Loading", "Kernel", "Browser", "results/", "Camera"):
+        assert f" {check} " in said
+    assert "Simulated D435" in said
+    assert "could not be checked" not in said
+
+
+@pytest.mark.parametrize(
+    ("attribute", "value", "verdict", "says"),
+    [
+        ("version_info", (3, 10, 4), "problem", "3.10.4 .* too old, want 3.11 or newer"),
+        ("version_info", (3, 15, 0), "note", "newer than what the course was tested with"),
+        ("version_info", (3, 12, 1), "ok", "3.12.1 on"),
+        ("maxsize", 2**31 - 1, "problem", "a 32-bit Python"),
+    ],
+)
+def test_python(monkeypatch, attribute, value, verdict, says):
+    monkeypatch.setattr(sys, attribute, value)
+    found = only(doctor._python())
+    assert found.verdict == verdict
+    assert re.search(says, found.says)
+    assert ("install Python 3.13" in found.remedy) == (verdict != "ok")
+
+
+def test_an_intel_mac(monkeypatch):
+    monkeypatch.setattr(sys, "platform", "darwin")
+    monkeypatch.setattr(doctor.platform, "machine", lambda: "x86_64")
+    found = only(doctor._python())
+    assert (found.verdict, "a hub" in found.remedy) == ("problem", True)
+
+
+@pytest.fixture
+def pinned(monkeypatch, tmp_path):
+    """A requirements file with two packages, one of them for another system."""
+    path = tmp_path / "requirements.txt"
+    path.write_text(
+        "numpy==2.4.0 \\\n    --hash=sha256:0\nappnope==1.0 ; sys_platform == 'nowhere' \\\n"
+        "tomlish==9 ; python_full_version >= '3.0'\n",
+        encoding="utf-8",
+    )
+    monkeypatch.setattr(doctor, "PINS", path)
+    installed = {"numpy": "2.4.0", "tomlish": "9"}
+    monkeypatch.setattr(doctor, "_version", lambda name: installed.get(name, ""))
+    monkeypatch.setattr(doctor.metadata, "requires", lambda name: ["numpy>=2.3"])
+    return installed
+
+
+def test_packages_as_pinned(pinned):
+    assert only(doctor._packages()) == Line("Packages", "ok", "all 2 as pinned in requirements.txt")
+
+
+def test_a_missing_package(pinned):
+    del pinned["tomlish"]
+    found = only(doctor._packages())
+    assert (found.verdict, found.says) == ("problem", "not installed: tomlish")
+    assert "pip install -r requirements.txt" in found.remedy
+
+
+def test_another_version_is_a_note_and_one_that_does_not_do_a_problem(pinned):
+    pinned["numpy"] = "2.5.1"
+    found = only(doctor._packages())
+    assert (found.verdict, "numpy 2.5.1 (tested with 2.4.0)" in found.says) == ("note", True)
+    pinned["numpy"] = "1.26.0"
+    first, _ = doctor._packages()
+    assert (first.verdict, first.says) == ("problem", "do not suit the course: numpy 1.26.0 (want "
+                                           ">=2.3)")  # fmt: skip
+
+
+def test_without_a_requirements_file(pinned, monkeypatch, tmp_path):
+    monkeypatch.setattr(doctor, "PINS", tmp_path / "gone.txt")
+    assert only(doctor._packages()).verdict == "note"
+
+
+def test_every_line_of_the_real_requirements_is_understood():
+    text = (results.ROOT / "requirements.txt").read_text(encoding="utf-8")
+    packages = [row for row in text.splitlines() if row and not row.startswith((" ", "#"))]
+    assert len(doctor.pins(results.ROOT / "requirements.txt")) == len(packages)
+
+
+def test_a_package_that_does_not_load(monkeypatch):
+    real = importlib.import_module
+
+    def broken(name):
+        if name == "cv2":
+            raise ImportError("libGL.so.1: cannot open shared object file\nmore")
+        return real(name)
+
+    monkeypatch.setattr(importlib, "import_module", broken)
+    found = only(doctor._loading())
+    assert found.says == "cv2 does not load (libGL.so.1: cannot open shared object file)"
+    assert (found.verdict, "course.py lab" in found.remedy) == ("problem", True)
+
+
+@pytest.mark.parametrize(
+    ("command", "verdict"),
+    [
+        ("python", "ok"),
+        ("python3.11", "ok"),
+        (sys.executable, "ok"),
+        (str(Path("elsewhere") / "bin" / "python"), "problem"),
+    ],
+)
+def test_the_kernel(monkeypatch, command, verdict):
+    from jupyter_client import kernelspec
+
+    spec = SimpleNamespace(argv=[command, "-m", "ipykernel_launcher"], resource_dir="kernels")
+    monkeypatch.setattr(kernelspec.KernelSpecManager, "get_kernel_spec", lambda self, name: spec)
+    found = only(doctor._kernel())
+    assert found.verdict == verdict
+    assert ("jupyter kernelspec remove python3" in found.remedy) == (verdict == "problem")
+
+
+def test_no_kernel(monkeypatch):
+    from jupyter_client import kernelspec
+
+    def none(self, name):
+        raise kernelspec.NoSuchKernel(name)
+
+    monkeypatch.setattr(kernelspec.KernelSpecManager, "get_kernel_spec", none)
+    found = only(doctor._kernel())
+    assert (found.verdict, "there is no kernel python3" in found.says) == ("problem", True)
+
+
+def test_browsers(monkeypatch):
+    assert only(doctor._browser()) == Line("Browser", "ok", "firefox opens the notebooks")
+
+    def none():
+        raise webbrowser.Error("could not locate runnable browser")
+
+    monkeypatch.setattr(webbrowser, "get", none)
+    found = only(doctor._browser())
+    assert (found.verdict, "prints an address" in found.remedy) == ("note", True)
+    monkeypatch.setenv("JUPYTERHUB_SERVICE_PREFIX", "/user/ada/")
+    assert only(doctor._browser()).verdict == "ok"
+
+
+def test_no_screen(monkeypatch):
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.delenv("DISPLAY")
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    found = only(doctor._browser())
+    assert (found.verdict, "ssh -L" in found.remedy) == ("note", True)
+
+
+def test_results_are_tried_without_leaving_anything(tmp_path):
+    assert only(doctor._results()).verdict == "ok"
+    assert not (tmp_path / "results").exists()
+
+
+def test_results_that_cannot_be_written(monkeypatch, tmp_path):
+    def refuse(dir):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", refuse)
+    found = only(doctor._results())
+    assert (found.verdict, "(Permission denied)" in found.says) == ("problem", True)
+    assert "COURSEKIT_RESULTS" in found.remedy
+
+
+def test_results_is_a_file(tmp_path):
+    (tmp_path / "results").write_text("mine", encoding="utf-8")
+    assert only(doctor._results()).verdict == "problem"
+
+
+def test_a_full_disk(monkeypatch):
+    monkeypatch.setattr(doctor.shutil, "disk_usage", lambda path: SimpleNamespace(free=2_000_000))
+    found = only(doctor._results())
+    assert (found.verdict, "only 2 MB" in found.says) == ("problem", True)
+
+
+# --- nothing stops it ---
+
+
+@pytest.mark.parametrize("error", doctor.CONTAINED)
+def test_what_a_check_raises_becomes_a_line(error):
+    def fail():
+        yield Line("Packages", "ok", "so far")
+        raise error("broken")
+
+    first, found = doctor._contained("Packages", fail)
+    assert first.says == "so far"
+    assert (found.verdict, "could not be checked" in found.says) == ("problem", True)
+    assert "course.py lab" in found.remedy
+
+
+def test_a_check_that_fails_does_not_stop_the_others(quick, monkeypatch):
+    def fail():
+        raise OSError("broken")
+
+    monkeypatch.setattr(doctor, "_packages", fail)
+    lines = examine("simulated")
+    assert line(lines, "Packages").verdict == "problem"
+    assert line(lines, "Camera").verdict == "ok"
+
+
+def test_without_numpy_or_any_package_at_all():
+    """As a student may see it: a Python without site-packages; a line for everything, no trace."""
+    result = subprocess.run(
+        [sys.executable, "-S", "-m", "coursekit.doctor"],
+        cwd=results.ROOT,
+        capture_output=True,
+        encoding="utf-8",
+        check=False,
+    )
+    assert (result.returncode, result.stderr) == (1, "")
+    assert "numpy does not load" in " ".join(result.stdout.split())
+    assert "Camera       could not be checked (ModuleNotFoundError" in result.stdout
+    assert "course.py lab" in result.stdout
+
+
+def test_ctrl_c_is_not_contained(quick, monkeypatch):
+    def stop():
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(doctor, "_packages", stop)
+    with pytest.raises(KeyboardInterrupt):
+        examine("simulated")
+
+
+def test_a_line_as_it_is_printed():
+    assert str(Line("USB", "ok", "fine")) == "ok       USB          fine"
+    long = str(Line("USB", "problem", "slow " * 40, "push it " * 30)).splitlines()
+    assert all(len(row) <= doctor.WIDTH for row in long)
+    assert any(row.strip().startswith("-> push it") for row in long)
+
+
+def test_the_exit_code(quick, monkeypatch, capsys):
+    for verdict, code in (("ok", 0), ("note", 0), ("problem", 1)):
+        monkeypatch.setattr(doctor, "checks", lambda camera, v=verdict: [Line("USB", v, "x")])
+        assert doctor.run() == code
+    assert "1 problem: do what stands there" in capsys.readouterr().out
+
+
+# --- no camera, or one that cannot be used ---
+
+
+def test_no_camera_is_fine(quick, plug_in, monkeypatch, tmp_path):
+    plug_in().serials = []
+    monkeypatch.setattr(doctor, "UDEV_FOLDERS", (tmp_path,))
+    monkeypatch.setattr(sys, "platform", "linux")
+    lines = examine()
+    assert {one.verdict for one in lines} == {"ok", "note"}
+    assert "USB 3 port" in line(lines, "USB").remedy
+    assert UDEV in line(lines, "udev rules").remedy
+    assert any("simulated camera stands in, which is fine" in one.says for one in lines)
+    assert line(lines, "Camera").says.startswith("Simulated D435")
+    (tmp_path / "99-realsense-libusb.rules").touch()
+    assert only(doctor._udev()).verdict == "ok"
+
+
+def test_the_variable_is_named(quick, monkeypatch):
+    monkeypatch.setenv("COURSEKIT_CAMERA", "simulated")
+    assert "COURSEKIT_CAMERA names 'simulated'" in examine()[0].says
+
+
+@pytest.fixture
+def no_library(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyrealsense2", None)
+    monkeypatch.setitem(sys.modules, "libusb_package", None)
+
+
+def test_no_driver_is_a_note_unless_a_camera_is_asked_for(quick, no_library):
+    lines = examine()
+    assert line(lines, "Driver").verdict == "note"
+    assert "pip install -r requirements-camera.txt" in line(lines, "Driver").says
+    assert line(lines, "Camera").says.startswith("Simulated D435")
+    for which in ("film.db3", SERIAL):
+        assert [one.verdict for one in examine(which)] == ["problem"]
+
+
+def test_a_driver_that_does_not_load_is_a_problem(quick, monkeypatch, tmp_path):
+    (tmp_path / "pyrealsense2.py").write_text(
+        "raise ImportError('libusb-1.0.so.0: no such file')", encoding="utf-8"
+    )
+    monkeypatch.delitem(sys.modules, "pyrealsense2", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    found = line(examine(), "Driver")
+    assert (found.verdict, "libusb-1.0.so.0" in found.says) == ("problem", True)
+    assert "--force-reinstall -r requirements-camera.txt" in found.says
+
+
+def test_no_permission(quick, plug_in, tmp_path):
+    rs = plug_in()
+    rs.query_error = "failed to open usb interface: 0, error: RS2_USB_STATUS_ACCESS"
+    found = examine()[-1]
+    assert (found.check, found.verdict, UDEV in found.says) == ("USB", "problem", True)
+    rs.query_error, rs.serials = None, []
+    (tmp_path / "1-2").mkdir()
+    (tmp_path / "1-2" / "product").write_text("Intel(R) RealSense(TM) 435\n", encoding="utf-8")
+    found = examine()[-1]
+    assert (found.check, found.verdict, UDEV in found.says) == ("USB", "problem", True)
+
+
+@pytest.mark.parametrize(
+    ("error", "remedy"),
+    [
+        ("Device or resource busy", "another program uses it: close the RealSense Viewer"),
+        ("Couldn't resolve requests", "USB 3 port with a USB 3 cable"),
+        ("something new", "unplug it, plug it in, try again"),
+    ],
+)
+def test_a_camera_that_does_not_start(quick, plug_in, error, remedy):
+    plug_in(start_error=error)
+    found = examine()[-1]
+    assert (found.check, found.verdict) == ("Camera", "problem")
+    assert remedy in found.says
+
+
+def test_another_serial_number(quick, plug_in):
+    plug_in()
+    found = examine("123")[-1]
+    assert (found.verdict, f"there is {SERIAL}" in found.says) == ("problem", True)
+
+
+@pytest.mark.parametrize("which", ["nonsense", "gone.db3"])
+def test_what_is_no_camera(quick, plug_in, which):
+    plug_in()
+    found = examine(which)[-1]
+    assert (found.check, found.verdict, which in found.says) == ("Camera", "problem", True)
+
+
+# --- a camera ---
+
+
+def test_a_camera_in_order(quick, plug_in, monkeypatch):
+    monkeypatch.setattr(doctor, "LONGEST_TEST_S", 60.0)
+    rs = plug_in()
+    lines = examine()
+    assert [one.check for one in lines] == [
+        "Driver", "USB", "USB link", "Firmware", "Camera", "Depth unit", "Baseline", "K of depth",
+        "K of colour", "Frames", "Filled", "Noise",
+    ]  # fmt: skip
+    assert {one.verdict for one in lines} == {"ok"}, [str(one) for one in lines]
+    assert line(lines, "USB").says == f"Intel RealSense D435, serial {SERIAL}"
+    assert line(lines, "Depth unit").says == "1 mm a count (usual: 1 mm)"
+    assert line(lines, "Baseline").says == "50.17 mm (usual: 50 mm to 2 %)"
+    assert line(lines, "K of depth").says.startswith("fx 426.00, fy 426.25, cx 425.50, cy 237.50 ")
+    assert line(lines, "K of colour").says.startswith("fx 613.00, fy 613.25, cx 321.50, cy 237.50")
+    assert line(lines, "Frames").says.startswith("30 in ")
+    assert "100%" in line(lines, "Filled").says
+    assert "for a pixel at 0.70 m, 0.02" in line(lines, "Noise").says
+    assert rs.stops == 1  # and it is let go
+
+
+@pytest.mark.parametrize(
+    ("told", "check", "verdict", "remedy"),
+    [
+        ({"usb_type_descriptor": "2.1"}, "USB link", "problem", "USB 3 port"),
+        ({"firmware_version": "5.9.13.0"}, "Firmware", "note", "RealSense Viewer"),
+        ({"firmware_version": "5.17.0.10"}, "Firmware", "ok", ""),
+    ],
+)
+def test_link_and_firmware(quick, plug_in, told, check, verdict, remedy):
+    plug_in().told.update(told)
+    found = line(examine(), check)
+    assert (found.verdict, remedy in found.remedy) == (verdict, True)
+
+
+def test_a_library_that_reports_no_firmware(quick, plug_in):
+    rs = plug_in()
+    for name in ("firmware_version", "recommended_firmware_version", "usb_type_descriptor"):
+        del rs.told[name]
+    assert {"Firmware", "USB link"}.isdisjoint(one.check for one in examine())
+
+
+def test_unusual_figures(quick, plug_in):
+    rs = plug_in()
+    rs.depth_sensor.options.update(depth_units=1e-4, stereo_baseline=46.0)
+    lines = examine()
+    assert line(lines, "Depth unit").remedy == "if nobody meant it: camera.set(depth_scale_m=0.001)"
+    found = line(lines, "Baseline")
+    assert (found.verdict, "factory calibration" in found.remedy) == ("note", True)
+    del rs.depth_sensor.options["stereo_baseline"]
+    found = line(examine(), "Baseline")
+    assert (found.verdict, "not recorded" in found.says) == ("note", True)
+
+
+@pytest.mark.parametrize(("fy", "cx"), [(640.0, 319.5), (613.0, 380.0)])
+def test_an_unusual_matrix(fy, cx):
+    found = doctor._matrix("K of colour", Intrinsics(640, 480, 613.0, fy, cx, 239.5))
+    assert (found.verdict, "restore it" in found.remedy) == ("note", True)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "seconds", "verdict"),
+    [
+        (range(31, 61), 0.97, "ok"),
+        (range(31, 61), 2.9, "note"),
+        (range(31, 91, 2), 1.0, "note"),
+        ([31], 3.1, "note"),
+    ],
+)
+def test_frames_late_or_lost(numbers, seconds, verdict):
+    found = doctor._arrival(list(numbers), seconds, live=True)
+    assert found.verdict == verdict
+    assert ("plug the camera in directly" in found.remedy) == (verdict == "note")
+
+
+def test_a_camera_that_falls_silent(quick, plug_in):
+    plug_in(frames=30 + 7)
+    found = line(examine(), "Frames")
+    assert (found.verdict, "is it still plugged in" in found.says) == ("problem", True)
+
+
+@pytest.mark.parametrize(("filled", "verdict"), [(0.3, "note"), (0.01, "problem")])
+def test_little_depth(quick, plug_in, filled, verdict):
+    plug_in().filled = filled
+    lines = examine()
+    assert line(lines, "Filled").verdict == verdict
+    assert "clean the front glass" in line(lines, "Filled").remedy
+    assert line(lines, "Noise").says.startswith("no depth in the middle of the image")
+
+
+def test_noisy_depth(quick, plug_in, monkeypatch):
+    monkeypatch.setattr(doctor, "LONGEST_TEST_S", 60.0)
+    plug_in().noise = 12.0
+    found = line(examine(), "Noise")
+    assert (found.verdict, "hold everything still" in found.remedy) == ("note", True)
+
+
+# --- a recording ---
+
+
+def test_a_recording(quick, tmp_path, monkeypatch):
+    real_library()
+    path = tmp_path / "table.db3"
+    with open_camera("simulated") as camera:
+        camera.record(path, 6)
+    monkeypatch.setattr(doctor, "LONGEST_TEST_S", 60.0)
+    lines = examine(str(path))
+    assert {one.verdict for one in lines} == {"ok"}, [str(one) for one in lines]
+    assert "recording table.db3" in line(lines, "Camera").says
+    assert line(lines, "Frames").says.startswith("6 read in ")
+    monkeypatch.setattr(doctor, "TEST_FRAMES", 2)
+    assert line(examine(str(path)), "Noise").verdict == "note"
+
+
+def test_a_damaged_recording(quick, plug_in, tmp_path):
+    plug_in()
+    (tmp_path / "a.db3").write_text("hello", encoding="utf-8")
+    found = examine(str(tmp_path / "a.db3"))[-1]
+    assert (found.verdict, "is not a .db3 recording" in found.says) == ("problem", True)
