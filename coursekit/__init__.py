@@ -24,11 +24,14 @@ if TYPE_CHECKING:
         simulation,
         specifications,
         stereo,
+        submission,
     )
     from coursekit.cameras import open_camera, place
     from coursekit.cameras.capture import capture
     from coursekit.lessons import check, checkpoint, evidence
+    from coursekit.lessons.overview import progress
     from coursekit.plots import drag
+    from coursekit.submission.submit import submit
 
 __all__ = [
     "arm",
@@ -48,10 +51,13 @@ __all__ = [
     "open_camera",
     "place",
     "plots",
+    "progress",
     "results",
     "simulation",
     "specifications",
     "stereo",
+    "submission",
+    "submit",
 ]
 
 _FUNCTIONS = {
@@ -61,7 +67,9 @@ _FUNCTIONS = {
     "check": "coursekit.lessons",
     "checkpoint": "coursekit.lessons",
     "evidence": "coursekit.lessons",
+    "progress": "coursekit.lessons.overview",
     "drag": "coursekit.plots",
+    "submit": "coursekit.submission.submit",
 }
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from coursekit.cameras import CameraError, open_camera
@@ -13,16 +14,17 @@ from coursekit.cameras import CameraError, open_camera
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `coursekit ARGUMENTS` and return its exit code: 0 done, 1 failed, 130 Ctrl-C.
 
-    Wrong usage exits with 2, as argparse does.
+    A report of graded bundles is done whatever is in the bundles; a bundle to hand in is done when
+    it is written. Wrong usage exits with 2, as argparse does.
     """
     options = _parser().parse_args(arguments)
     try:
         options.run(options)
-    except (CameraError, ValueError) as error:
+    except (CameraError, OSError, ValueError) as error:
         print(f"coursekit: {error}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
-        print("coursekit: stopped, nothing was written", file=sys.stderr)
+    except KeyboardInterrupt as stopped:
+        print(f"coursekit: {stopped or 'stopped, nothing was written'}", file=sys.stderr)
         return 130
     return 0
 
@@ -42,6 +44,8 @@ def _parser() -> argparse.ArgumentParser:
     record.add_argument("--overwrite", action="store_true", help="replace an existing file")
     record.set_defaults(run=_record)
     _add_board(commands)
+    _add_submit(commands)
+    _add_grade(commands)
     return parser
 
 
@@ -62,6 +66,41 @@ def _add_board(commands: Any) -> None:
     board.add_argument("--out", required=True, metavar="FILE", help="a .pdf or .png file to write")
     board.add_argument("--overwrite", action="store_true", help="replace an existing file")
     board.set_defaults(run=_board)
+
+
+def _add_submit(commands: Any) -> None:
+    submit = commands.add_parser("submit", help="pack the studio exercise to hand it in")
+    submit.add_argument("--student", required=True, metavar="NAME", help="as your course knows it")
+    submit.add_argument("--distance", type=float, metavar="M", help="where the camera will be, m")
+    submit.add_argument("--frames", type=int, default=1, metavar="N", help="averaged there")
+    submit.add_argument("--dominates", choices=("bias", "noise"), help="which error, there")
+    words = submit.add_mutually_exclusive_group()
+    words.add_argument("--paragraph", default="", metavar="TEXT", help="three sentences: why")
+    words.add_argument("--paragraph-file", metavar="FILE", help="a text file that holds them")
+    submit.add_argument("--folder", metavar="DIR", help="where to write, default: results/")
+    submit.add_argument("--overwrite", action="store_true", help="replace an existing bundle")
+    submit.set_defaults(run=_submit)
+
+
+def _add_grade(commands: Any) -> None:
+    grade = commands.add_parser(
+        "grade",
+        help="grade a folder of bundles",
+        description="Grade every bundle (.zip) in a folder and below it. Stopped with Ctrl-C, the "
+        "same command goes on from there. Nothing that a student wrote is run or unpacked.",
+    )
+    grade.add_argument("folder", metavar="FOLDER", help="what students handed in")
+    grade.add_argument("--out", required=True, metavar="DIR", help="the report: a new folder")
+    grade.add_argument("--workers", type=int, metavar="N", help="processes, default: one a core")
+    grade.add_argument(
+        "--timeout", type=float, default=10.0, metavar="S", help="seconds a bundle, default: 10"
+    )
+    grade.add_argument(
+        "--overwrite",
+        action="store_true",
+        help="replace a finished report; only what has changed is graded",
+    )
+    grade.set_defaults(run=_grade)
 
 
 def _squares(text: str) -> tuple[int, int]:
@@ -91,6 +130,40 @@ def _board(options: argparse.Namespace) -> None:
     print(f"Wrote {path}: {describe(board)}.")
     print("Print at 100 %, check that the bar measures 100 mm, and glue it flat to glass.")
     print(f"In Python: {board!r}")
+
+
+def _submit(options: argparse.Namespace) -> None:
+    from coursekit.submission.submit import submit
+
+    paragraph = options.paragraph
+    if options.paragraph_file:
+        paragraph = Path(options.paragraph_file).read_text(encoding="utf-8")
+    handed = submit(
+        options.student,
+        options.distance,
+        options.dominates,
+        paragraph,
+        options.frames,
+        options.folder,
+        options.overwrite,
+    )
+    if handed.path is None:
+        raise ValueError(str(handed))
+    print(handed)
+
+
+def _grade(options: argparse.Namespace) -> None:
+    from coursekit.submission.batch import grade_folder
+
+    print(
+        grade_folder(
+            options.folder,
+            options.out,
+            options.workers,
+            options.timeout,
+            overwrite=options.overwrite,
+        )
+    )
 
 
 if __name__ == "__main__":

@@ -9,17 +9,24 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 
-from coursekit import boards, geometry, intrinsics, simulation, specifications
+from coursekit import boards, geometry, intrinsics, simulation, specifications, stereo
 from coursekit.cameras.librealsense import LibraryMissing, load_librealsense
 from coursekit.geometry import Intrinsics
 from coursekit.simulation.sessions import corner_session
+from coursekit.submission.batch import grade_folder
+from coursekit.submission.bundle import bundle_bytes
+from coursekit.submission.contents import Stack, Submission
+from coursekit.submission.reader import read_bundle
+from coursekit.submission.worker import grade_file
 
 ROUNDS = 300
 CAMERA = Intrinsics(848, 480, 431.1, 431.1, 436.6, 242.4)
@@ -196,6 +203,50 @@ def bench_intrinsics() -> list[Row]:
     ]  # fmt: skip
 
 
+def bench_grading() -> list[Row]:
+    """A bundle graded, with its page, against the statistics in it; and a folder of them."""
+    whole = full_size_submission()
+    data = bundle_bytes(whole)
+    window, unit = (0, 0, 40, 40), whole.camera.depth_scale_m
+
+    def statistics() -> object:
+        return [stereo.window_stats(stack.counts, window, unit) for stack in whole.stacks]
+
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch, "bundles")
+        folder.mkdir()
+        paths = [folder / f"{i:02d}.zip" for i in range(50)]
+        for path in paths:
+            path.write_bytes(data)
+
+        def one() -> object:
+            return grade_file(str(paths[0]), "00.zip", "")
+
+        def graded_by(workers: int) -> object:
+            out = Path(tempfile.mkdtemp(dir=scratch))
+            return grade_folder(folder, out, workers, progress=False)
+
+        batch = in_turn(3, lambda: graded_by(2), lambda: graded_by(1))
+        return [
+            Row("grade a bundle", "its window_stats() alone", in_turn(50, one, statistics)),
+            Row("50 bundles, 2 processes", "one process", batch,
+                f"{20 * np.median(batch[0]):.0f} s a thousand, wanted: below 60"),
+        ]  # fmt: skip
+
+
+def full_size_submission() -> Submission:
+    """Three distances, 100 frames of 40 x 40 px each, of noise that neighbours share."""
+    sample = read_bundle(specifications.DATA / "sample_bundles" / "ada_good.zip")
+    rng = np.random.default_rng(0)
+    stacks = []
+    for stack in sample.stacks:
+        noise = cv2.blur(rng.normal(0, 9, (40, 40, 100)), (9, 9)).transpose(2, 0, 1)
+        z = stack.distance_m
+        counts = np.rint(z / sample.camera.depth_scale_m + 30 * z**2 * noise).astype(np.uint16)
+        stacks.append(Stack(z, (*stack.window[:2], 40, 40), counts, stack.times_s))
+    return replace(sample, stacks=tuple(stacks))
+
+
 def bench_import() -> Row:
     """`import coursekit` over a bare interpreter."""
     times = in_turn(15, python("import coursekit"), python("pass"))
@@ -213,7 +264,13 @@ def python(code: str) -> Callable[[], object]:
 def main() -> None:
     """Print one table."""
     print(f"{os.cpu_count()} cores, Python {sys.version.split()[0]}; medians (quartiles)")
-    for row in [*bench_deproject(), *bench_stereo(), *bench_intrinsics(), bench_import()]:
+    for row in [
+        *bench_deproject(),
+        *bench_stereo(),
+        *bench_intrinsics(),
+        *bench_grading(),
+        bench_import(),
+    ]:
         print(row)
 
 

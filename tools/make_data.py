@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
-from collections.abc import Iterator
+import zipfile
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import cv2
@@ -18,10 +20,13 @@ from coursekit.cameras.capture import session_card
 from coursekit.cameras.simulated import SimulatedCamera
 from coursekit.hand_eye.poses import Mount
 from coursekit.intrinsics.power import STORED, power
-from coursekit.results import write_bytes, write_json
+from coursekit.results import Quantity, write_bytes, write_json
 from coursekit.simulation.hand_eye_sessions import SIMULATED, rendered_session
 from coursekit.simulation.sessions import Effects, view_poses
 from coursekit.specifications import DATA
+from coursekit.submission.bundle import bundle_bytes, write_bundle
+from coursekit.submission.contents import Conclusion, Stack, Submission
+from coursekit.submission.submit import measured
 
 BOARD = Board("charuco", (9, 6), 0.025)
 SEED, VIEWS = 7, 26
@@ -133,13 +138,139 @@ def hand_eye_sessions() -> None:
         replace(session, names=tuple(files)).save(folder, files, about)
 
 
+SAMPLES = DATA / "sample_bundles"
+SAMPLE_MADE = "2026-03-02T10:00:00+00:00"
+SAMPLE_PX = 20  # a side of the windows: small files
+SAMPLE_WORDS = (
+    "I will mount the camera at 0.45 m and can average ten frames there. What repeats in every "
+    "frame is then larger than what is left of the noise, so a calibration helps and more frames "
+    "do not."
+)
+
+
+def sample_bundles() -> None:
+    """data/sample_bundles/: what students hand in, for tests and for a first try of the grader."""
+    shutil.rmtree(SAMPLES, ignore_errors=True)
+    ada, cleo = _finished("Ada Honest", 21), _finished("Cleo Wrong", 23)
+    for name, submission in (
+        ("ada_good", ada),
+        ("ben_weak", _weak(_finished("Ben Weak", 22))),
+        ("cleo_wrong", _wrong(cleo)),
+        ("dan_copied", _copied(ada, "Dan Copied")),
+        ("eve_formula", replace(ada, student='=HYPERLINK("x")<script>alert(1)</script>')),
+    ):
+        write_bundle(SAMPLES / f"{name}.zip", submission)
+    whole = bundle_bytes(ada)
+    write_bytes(SAMPLES / "hostile_truncated.zip", whole[: len(whole) // 2])
+    write_bytes(SAMPLES / "hostile_bomb.zip", _zip({"depth_0.npy": bytes(30_000_000)}))
+    write_bytes(SAMPLES / "hostile_path.zip", _zip({"../../outside.json": b"{}"}))
+    write_bytes(SAMPLES / "not_a_bundle.zip", b"My camera broke, sorry.\n")
+
+
+def _finished(student: str, seed: int) -> Submission:
+    """What an honest student hands in: the block at three distances before a simulated unit."""
+    camera = SimulatedCamera(seed=seed)
+    camera.set(depth_scale_m=0.0001)
+    stacks = []
+    for distance_m in (0.30, 0.45, 0.60):
+        camera.place("60 mm block", distance_m)
+        frames = camera.frames(100, progress=False)
+        left, top, width, height = ck.stereo.block_face(frames).window
+        left, top = left + (width - SAMPLE_PX) // 2, top + (height - SAMPLE_PX) // 2
+        window = (left, top, SAMPLE_PX, SAMPLE_PX)
+        stacks.append(ck.submission.stack(frames, window, distance_m))
+    table, law = _table(camera, stacks)
+    predicted_mm = 1000 * law.std_m([stack.distance_m for stack in stacks])[0]
+    return replace(
+        measured(camera, stacks, table, law, predicted_mm.tolist(), 0.0, 0.060),
+        student=student,
+        made=SAMPLE_MADE,
+        versions={"coursekit": "0.1.0"},
+        conclusion=Conclusion(0.45, 10, "bias", SAMPLE_WORDS),
+    )
+
+
+def _table(
+    camera: ck.cameras.Camera, stacks: Sequence[Stack]
+) -> tuple[dict[str, Quantity], ck.stereo.NoiseFit]:
+    """The table and the fit of notebook 02."""
+    table, seen = {}, []
+    for stack in stacks:
+        window = (0, 0, SAMPLE_PX, SAMPLE_PX)
+        stats = ck.stereo.window_stats(stack.counts, window, camera.depth_scale_m)
+        seen.append(stats)
+        at = f"at_{1000 * stack.distance_m:.0f}_mm"
+        bias_mm = 1000 * (stats.depth_m - stack.distance_m)
+        std_mm, std_se_mm = 1000 * stats.pixel_std_m, 1000 * stats.pixel_std_error_m
+        table[f"depth_bias_{at}"] = Quantity(bias_mm, "mm", 1000 * stats.depth_error_m, "bias")
+        table[f"depth_std_{at}"] = Quantity(std_mm, "mm", std_se_mm, "noise")
+        table[f"invalid_{at}"] = Quantity(stats.invalid_fraction, "1")
+    law = ck.stereo.fit_noise(
+        [stack.distance_m for stack in stacks],
+        [stats.pixel_std_m for stats in seen],
+        [stats.pixel_dof for stats in seen],
+        camera.depth.fx,
+        camera.baseline_m,
+        camera.depth_scale_m,
+        exponent=2,
+    )
+    return table, law
+
+
+def _weak(whole: Submission) -> Submission:
+    """Too few frames at one distance, a standard error left out, no paragraph."""
+    *others, last = whole.stacks
+    short = replace(last, counts=last.counts[:84], times_s=last.times_s[:84])
+    first, *rest = whole.claims.rows
+    rows = (replace(first, depth_bias_se_mm=None), *rest)
+    return replace(
+        whole,
+        stacks=(*others, short),
+        claims=replace(whole.claims, rows=rows),
+        conclusion=replace(whole.conclusion, paragraph=""),
+    )
+
+
+def _wrong(whole: Submission) -> Submission:
+    """Biases with the sign turned, a standard error for a std, noise said to dominate."""
+    rows = tuple(
+        replace(row, depth_bias_mm=-row.depth_bias_mm, depth_std_mm=row.depth_std_mm / 10)
+        for row in whole.claims.rows
+        if row.depth_bias_mm is not None and row.depth_std_mm is not None
+    )
+    conclusion = replace(whole.conclusion, dominates="noise")
+    return replace(whole, claims=replace(whole.claims, rows=rows), conclusion=conclusion)
+
+
+def _copied(whole: Submission, student: str) -> Submission:
+    """The raw depths of somebody else with a count added or taken away at random."""
+    rng = np.random.default_rng(1)
+    stacks = []
+    for stack in whole.stacks:
+        off = rng.integers(-1, 2, stack.counts.shape)
+        counts = np.where(stack.counts > 0, stack.counts + off, 0).astype(np.uint16)
+        stacks.append(replace(stack, counts=counts))
+    return replace(whole, student=student, stacks=tuple(stacks))
+
+
+def _zip(members: dict[str, bytes]) -> bytes:
+    """A zip with these members, of whatever names and sizes."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members.items():
+            archive.writestr(zipfile.ZipInfo(name), content, zipfile.ZIP_DEFLATED)
+    return buffer.getvalue()
+
+
 if __name__ == "__main__":
     ck.cameras.conventions.store()
     readme_picture()
     intrinsics_session()
     diagnosis_power()
     hand_eye_sessions()
+    sample_bundles()
     print(
         "data/vendor_models.json, data/readme.png, data/intrinsics_session/, "
-        "data/diagnosis_power.json, data/hand_eye_in_hand/, data/hand_eye_to_hand/"
+        "data/diagnosis_power.json, data/hand_eye_in_hand/, data/hand_eye_to_hand/, "
+        "data/sample_bundles/"
     )

@@ -16,6 +16,7 @@ from coursekit.stereo.stacks import (
     cut,
     depth_stack,
     numbers,
+    plane_design,
     rms,
     std_error,
     std_interval,
@@ -149,7 +150,7 @@ def window_stats(depth: Any, window: Window, depth_scale_m: float | None = None)
         pixel_std_unrounded_m=unrounded_std(pixel_std, step),
         mean_std_m=mean_std,
         mean_dof=mean_dof,
-        spatial_std_m=rms([about_plane(frame)[0] for frame in z]),
+        spatial_std_m=_spatial_std(z),
         means_m=level + drift,
         depth_scale_m=step,
     )
@@ -238,12 +239,13 @@ def _squared_correlation(series: Floats) -> float:
 
 def _autocorrelation(series: Floats, lags: int) -> Floats:
     """Autocorrelation (lags,) at lag 1, 2, ... of series (N, P) of known mean, pooled over P."""
-    n = len(series)
+    n, pixels = series.shape
     power = float(np.square(series).sum()) / n
     if power == 0 or n < 3:
         return np.zeros(lags)
-    lagged = [float((series[:-k] * series[k:]).sum()) / (n - k) for k in range(1, lags + 1)]
-    return np.array(lagged) / power
+    flat = np.ascontiguousarray(series).ravel()
+    pairs = ((flat[: -k * pixels], flat[k * pixels :], n - k) for k in range(1, lags + 1))
+    return np.array([np.einsum("i,i->", a, b) / count for a, b, count in pairs]) / power
 
 
 def _correlation_time(own: Floats) -> float:
@@ -336,6 +338,25 @@ def _frozen(deviation: Floats) -> float:
     if deviation.shape[0] < 2 or deviation.size == 0:
         return math.nan
     return float((np.nanmax(np.abs(deviation), axis=0) < 1e-12).mean())
+
+
+def _spatial_std(z: Floats) -> float:
+    """RMS of a stack (N, h, w) about each frame's own plane in 1/Z; see `about_plane`.
+
+    All frames at once, by normal equations: the design has three columns and is centred.
+    """
+    rows, columns = np.indices(z.shape[1:]).reshape(2, -1)
+    design = plane_design(columns, rows, z.shape[1:])
+    flat = z.reshape(len(z), -1)
+    known = np.isfinite(flat)
+    squares = (design[:, :, None] * design[:, None, :]).reshape(-1, 9)
+    normal = (known.astype(np.float64) @ squares).reshape(-1, 3, 3)
+    sure = np.linalg.det(normal) > 1e-3 * np.prod(np.diagonal(normal, axis1=1, axis2=2), axis=1)
+    sure &= known.sum(axis=1) > 3
+    right = np.where(known, 1 / np.where(known, flat, 1.0), 0.0) @ design
+    plane = np.linalg.solve(normal[sure], right[sure, :, None])[..., 0]
+    rest = [about_plane(frame)[0] for frame in z[~sure]]
+    return rms([flat[sure] - 1 / (plane @ design.T), *rest])
 
 
 def _patch_error(residual: Floats) -> float:

@@ -1,0 +1,531 @@
+"""Grades a folder of bundles in a pool of warm processes, which outlives what a bundle does to one.
+
+A bundle that hangs is ended at its time limit, one that kills its process or wants too much memory
+becomes a row with its reason; the batch goes on. Each process is replaced after MAX_TASKS bundles,
+so whatever it gathers is given back. Windows has no limit on a process's memory that it could set
+itself (no module `resource`), and macOS does not enforce it: there the caps of the reader, which
+hold everywhere, are the only ones.
+
+What is finished is kept in the report's folder, one small file a bundle, so a batch that was
+stopped goes on where it was.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import multiprocessing
+import os
+import signal
+import stat
+import sys
+import time
+import unicodedata
+import warnings
+from collections import Counter, deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, TimeoutError, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pebble import ProcessExpired, ProcessPool
+
+from coursekit import results
+from coursekit.submission.report import Line, class_page, grades_csv, not_graded, with_copies
+from coursekit.submission.submit import slug
+from coursekit.submission.worker import grade_file, out_of_memory
+
+TIMEOUT_S = 10.0
+MEMORY_BYTES = 512 * 2**20  # above what a warm process has
+MAX_TASKS = 40  # bundles, then a process is replaced
+PATIENCE_S = 60.0  # beyond the time limit; a pool from which nothing comes so long is replaced
+AHEAD = 3  # bundles a worker that wait in the pool
+HASHED_BYTES = 6 * 2**20  # of a file; larger ones are refused anyway
+
+FAILED = ("timeout", "died", "memory", "error", "lost")  # tried anew by the next run
+CSV, PAGE, STUDENTS, ROWS = "grades.csv", "index.html", "students", ".rows"
+ONE_THREAD = {
+    f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL", "NUMBA", "BLIS")
+} | {"VECLIB_MAXIMUM_THREADS": "1"}
+
+WORKER = "coursekit.submission.worker"
+
+CANNOT_START = (
+    "the processes that grade cannot be started, or end at once. Try --workers 1; if that fails "
+    "too, more memory is needed, or the installation is broken (run `python3 course.py test`)"
+)
+
+Outcome = tuple[Line, str]  # a line in the class, and the page of the student
+Work = Callable[[str, str, str], Outcome]  # of the file's path, its name and the page's
+
+
+class Stopped(KeyboardInterrupt):
+    """Ctrl-C in the middle of a batch; the message says what is kept and how to go on."""
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A file to grade: its path, its name in the folder, what its line is kept under.
+
+    page: the link to its page. Both it and the key come from a hash; nobody's text is a path.
+    """
+
+    path: Path
+    name: str
+    key: str
+
+    @property
+    def page(self) -> str:
+        plain = unicodedata.normalize("NFKD", self.path.stem).encode("ascii", "ignore").decode()
+        return f"{STUDENTS}/{slug(plain)}_{self.key[:12]}.html"
+
+
+@dataclass(frozen=True)
+class Summary:
+    """How a batch went: numbers of bundles, and the folder of the report.
+
+    kept: of those, how many were graded by an earlier run. left_out: files that are no .zip.
+    """
+
+    out: Path
+    graded: int
+    refused: int
+    failed: int
+    flagged: int
+    kept: int
+    left_out: tuple[str, ...]
+    seconds: float
+
+    def __str__(self) -> str:
+        n = self.graded + self.refused + self.failed
+        parts = [f"{self.graded} graded"]
+        if self.refused:
+            parts.append(f"{self.refused} refused")
+        if self.failed:
+            parts.append(f"{self.failed} not graded (time, memory or a crash)")
+        if self.flagged:
+            parts.append(f"{self.flagged} flagged")
+        lines = [f"{_counted(n, 'bundle')} in {self.seconds:.0f} s: {', '.join(parts)}."]
+        if self.kept:
+            lines.append(f"{self.kept} of them had been graded before and have not changed.")
+        if self.left_out:
+            shown = ", ".join(self.left_out[:5]) + (", ..." if len(self.left_out) > 5 else "")
+            lines.append(
+                f"No bundles, so left out: {_counted(len(self.left_out), 'file')}: {shown}"
+            )
+        lines.append(f"Open {self.out / PAGE}; {CSV} beside it goes into a spreadsheet.")
+        return "\n".join(lines)
+
+
+# ---- a batch ------------------------------------------------------------------------------------
+
+
+def grade_folder(
+    folder: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    workers: int | None = None,
+    timeout_s: float = TIMEOUT_S,
+    memory_bytes: int = MEMORY_BYTES,
+    progress: bool = True,
+    overwrite: bool = False,
+) -> Summary:
+    """Grade every bundle (.zip) in a folder and those below it, and write a report of them.
+
+    out: a folder for the report: new, empty, or one that holds a report. workers: processes,
+    default one a core. timeout_s: for a bundle. memory_bytes: for a process, above its resting
+    size. overwrite: replace a finished report; what was graded and has not changed is not graded
+    again, unless the grader has changed. An unfinished one is gone on with in any case.
+    Raises ValueError for a folder that will not do, before any work, Stopped on Ctrl-C, and
+    ChildProcessError when no process can be started.
+    """
+    started = time.monotonic()
+    folder, out = Path(folder), Path(out)
+    workers = _cores() if workers is None else workers
+    for name, value in (("workers", workers), ("timeout_s", timeout_s), ("memory", memory_bytes)):
+        if not value > 0:
+            raise ValueError(f"{name}: got {value!r}, want more than 0")
+    _check_out(out, overwrite)
+    paths, left_out = find(folder, out)
+    for part in (out / STUDENTS, out / ROWS):
+        part.mkdir(parents=True, exist_ok=True)
+    bundles = list(_bundles(folder, paths))
+    lines: dict[str, Line] = {}
+    kept = 0
+    with _bar(len(bundles), progress) as bar:
+
+        def unfinished() -> Iterator[Bundle]:
+            nonlocal kept
+            for bundle in bundles:
+                line = _load(out, bundle)
+                if line is None:
+                    yield bundle
+                else:
+                    kept += 1
+                    lines[bundle.key] = line
+                    bar.update()
+
+        limits = Limits(workers, timeout_s, memory_bytes)
+        try:
+            with contextlib.closing(run(unfinished(), grade_file, limits)) as outcomes:
+                for bundle, outcome in outcomes:
+                    lines[bundle.key] = _store(out, bundle, outcome)
+                    bar.update()
+        except KeyboardInterrupt:
+            raise Stopped(
+                f"stopped after {len(lines)} of {_counted(len(bundles), 'bundle')}, which are "
+                "kept. The same command goes on from there."
+            ) from None
+    done = _finish(out, [lines[bundle.key] for bundle in bundles], {b.page for b in bundles})
+    counts = Counter(_kind(line) for line in done)
+    return Summary(
+        out,
+        counts["graded"],
+        counts["refused"],
+        counts["failed"],
+        sum(any(not flag.note for flag in line.flags) for line in done),
+        kept,
+        left_out,
+        time.monotonic() - started,
+    )
+
+
+def _cores() -> int:
+    """How many processors this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def find(folder: Path, out: Path) -> tuple[list[Path], tuple[str, ...]]:
+    """The .zip files in a folder and below in the order of their names, and what else is there.
+
+    Links are not followed, hidden files and the report itself are not looked at.
+    Raises ValueError for no folder, or one without a bundle.
+    """
+    if not folder.is_dir():
+        raise ValueError(f"{folder}: there is no such folder; want the one with the bundles in it")
+    if out.resolve() == folder.resolve():
+        raise ValueError(f"out: got {out}, the folder of the bundles; want another one")
+    found: list[Path] = []
+    others: list[Path] = []
+    for parent, folders, names in os.walk(folder):
+        at = Path(parent)
+        folders[:] = [name for name in folders if not name.startswith((".", "__MACOSX"))]
+        folders[:] = [name for name in folders if (at / name).resolve() != out.resolve()]
+        for name in names:
+            if not name.startswith("."):
+                (found if name.lower().endswith(".zip") else others).append(at / name)
+    if not found:
+        there = f"only {_counted(len(others), 'other file')}" if others else "nothing"
+        raise ValueError(
+            f"{folder}: there is no bundle (.zip) in it, {there}; "
+            "want the folder with what students handed in"
+        )
+    return (
+        sorted(found, key=lambda path: path.relative_to(folder).as_posix()),
+        tuple(sorted(printable(path.relative_to(folder).as_posix()) for path in others)),
+    )
+
+
+def _bundles(folder: Path, paths: Iterable[Path]) -> Iterator[Bundle]:
+    seen: Counter[str] = Counter()
+    for path in paths:
+        raw = path.relative_to(folder).as_posix()
+        name = printable(raw)
+        seen[name] += 1
+        yield Bundle(path, name if seen[name] == 1 else f"{name} ({seen[name]})", _key(path, raw))
+
+
+def _key(path: Path, name: str) -> str:
+    """What a line is kept under: the file's name and content, and the version of the grader."""
+    hashed = hashlib.sha256(f"{grader_version()}\0{name}\0".encode(errors="surrogateescape"))
+    with contextlib.suppress(OSError):  # its line will say so
+        about = path.lstat()
+        hashed.update(f"{about.st_mode}\0{about.st_size}\0".encode())
+        if stat.S_ISREG(about.st_mode) and about.st_size <= HASHED_BYTES:
+            hashed.update(path.read_bytes())
+    return hashed.hexdigest()
+
+
+_VERSION: list[str] = []
+
+
+def grader_version() -> str:
+    """A hash of everything that decides a grade: the code of this room and of `stereo`, rubric."""
+    if not _VERSION:
+        here = Path(__file__).resolve().parent
+        files = [*here.glob("*.py"), *here.glob("*.toml"), *(here.parent / "stereo").glob("*.py")]
+        hashed = hashlib.sha256()
+        for file in sorted(files):
+            hashed.update(file.name.encode() + b"\0" + file.read_bytes() + b"\0")
+        _VERSION.append(hashed.hexdigest())
+    return _VERSION[0]
+
+
+def printable(text: str) -> str:
+    """A file's name as text that can be written anywhere: no control characters, no surrogates."""
+    clean = text.encode("utf-8", "replace").decode()
+    return "".join("?" if unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") else c for c in clean)
+
+
+# ---- the pool -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Processes, seconds a bundle, and bytes a process above its resting size."""
+
+    workers: int
+    timeout_s: float = TIMEOUT_S
+    memory_bytes: int = MEMORY_BYTES
+
+
+def run(
+    bundles: Iterable[Bundle], work: Work, limits: Limits
+) -> Generator[tuple[Bundle, Outcome], None, None]:
+    """`work` of each bundle, in processes, as it is finished; never an exception of one.
+
+    A bundle that ends its process, or takes too long, has a line that says so. When the pool itself
+    breaks, what was in it is tried once more in a new one.
+    Raises ChildProcessError when no process can be started.
+    """
+    left, lost = iter(bundles), set[str]()
+    again: deque[Bundle] = deque()  # from a pool that broke: one at a time, to find the culprit
+    while True:
+        running: dict[Future[Outcome], Bundle] = {}
+        with _pool(limits) as pool, contextlib.suppress(BrokenProcessPool):
+            while True:
+                alone = again or any(bundle.key in lost for bundle in running.values())
+                while len(running) < (1 if alone else (1 + AHEAD) * limits.workers):
+                    bundle = again.popleft() if again else next(left, None)
+                    if bundle is None:
+                        break
+                    running[_schedule(pool, work, bundle, limits)] = bundle
+                if not running:
+                    return
+                done, _ = wait(running, limits.timeout_s + PATIENCE_S, FIRST_COMPLETED)
+                if not done:
+                    break
+                for future in done:
+                    outcome = _outcome(future, running[future], limits)  # or BrokenProcessPool
+                    yield running.pop(future), outcome
+        for bundle in running.values():
+            if bundle.key in lost:
+                yield bundle, _failed(bundle, "lost", "All processes ended with it, twice.")
+            else:
+                lost.add(bundle.key)
+                again.append(bundle)
+
+
+def _schedule(pool: ProcessPool, work: Work, bundle: Bundle, limits: Limits) -> Future[Outcome]:
+    arguments = (str(bundle.path), bundle.name, bundle.page)
+    try:
+        return pool.schedule(work, arguments, timeout=limits.timeout_s)
+    except RuntimeError as error:  # the pool is no more; the bundle is lost with it
+        lost: Future[Outcome] = Future()
+        lost.set_exception(BrokenProcessPool(str(error)))
+        return lost
+
+
+def _outcome(future: Future[Outcome], bundle: Bundle, limits: Limits) -> Outcome:
+    error = future.exception()  # of a worker: even a SystemExit must not be raised here
+    if error is None:
+        return future.result()
+    if isinstance(error, BrokenProcessPool):
+        raise error
+    if isinstance(error, TimeoutError):
+        says = f"It took longer than {limits.timeout_s:g} s. Grade it with a longer --timeout."
+        return _failed(bundle, "timeout", says)
+    if isinstance(error, ProcessExpired):
+        says = f"It ended the process that graded it ({_ending(error.exitcode)}). Look inside."
+        return _failed(bundle, "died", says)
+    if isinstance(error, MemoryError):
+        return out_of_memory(bundle.name), ""
+    says = f"The grader failed on it ({type(error).__name__}). Please report it with the file."
+    return _failed(bundle, "error", says)
+
+
+def _failed(bundle: Bundle, reason: str, says: str) -> Outcome:
+    return not_graded(bundle.name, reason, says), ""
+
+
+def _ending(code: int) -> str:
+    """An exit code in words: a negative one is a signal's."""
+    with contextlib.suppress(ValueError):
+        if code < 0:
+            return signal.Signals(-code).name
+    return f"exit code {code}"
+
+
+@contextlib.contextmanager
+def _pool(limits: Limits) -> Iterator[ProcessPool]:
+    """A started pool; its processes have one thread for linear algebra and never see a Ctrl-C."""
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    os.environ.update(ONE_THREAD)
+    pool = ProcessPool(
+        max_workers=limits.workers,
+        max_tasks=MAX_TASKS,
+        initializer=_warm_up,
+        initargs=(limits.memory_bytes,),
+        context=_context(),
+    )
+    try:
+        with _no_interrupts():  # what it starts inherits this
+            pool.active  # noqa: B018 - a property that starts it
+        try:
+            pool.schedule(_ready).result(PATIENCE_S)
+        except (BrokenProcessPool, OSError, RuntimeError) as error:  # TimeoutError is an OSError
+            raise ChildProcessError(CANNOT_START) from error
+        yield pool
+    finally:
+        pool.stop()
+        pool.join()
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+@contextlib.contextmanager
+def _no_interrupts() -> Iterator[None]:
+    """Block SIGINT in this thread, and in the threads and processes that are started meanwhile."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _ready() -> None:
+    """What the first process of a pool does to show that it is there."""
+
+
+def _context() -> Any:
+    """How processes are started, none of which inherits anything of this one's memory.
+
+    On Linux from a server that has imported the grader once, so that a new one is warm in
+    milliseconds; elsewhere each imports it itself, in a second or two (forking is not safe there).
+    """
+    if sys.platform != "linux":
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([WORKER])
+    return context
+
+
+def _warm_up(memory_bytes: int) -> None:
+    """Begin a worker: all is imported by now, so the limit is on what bundles take."""
+    warnings.simplefilter("ignore")  # of depths that no camera gives; the grader looks at results
+    limit_memory(memory_bytes)
+
+
+def limit_memory(more_bytes: int) -> None:
+    """Let this process have so much more address space than it has now; where there is a way."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
+    resting = _address_space()
+    with contextlib.suppress(OSError, ValueError):
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        if resting is not None:
+            _, hard = resource.getrlimit(resource.RLIMIT_AS)
+            want = resting + more_bytes
+            resource.setrlimit(resource.RLIMIT_AS, (want, hard))
+
+
+def _address_space() -> int | None:
+    """The address space of this process in bytes, None where the system does not say."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        return pages * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, AttributeError):
+        return None
+
+
+# ---- the report's folder ------------------------------------------------------------------------
+
+
+def _check_out(out: Path, overwrite: bool) -> None:
+    """ValueError unless the folder can take a report without harm to anything else."""
+    if out.is_symlink() or (out.exists() and not out.is_dir()):
+        raise ValueError(f"out: {out} is no folder; want a new or empty one")
+    if not out.exists():
+        return
+    for entry in sorted(out.iterdir()):
+        if not _is_ours(entry):
+            raise ValueError(
+                f"out: {out} holds {entry.name}, which no report does; want a new or empty folder"
+            )
+    if (out / CSV).exists() and not overwrite:
+        raise ValueError(
+            f"out: {out} holds a finished report already: choose another folder, or overwrite it "
+            "(--overwrite; only what is new is graded)"
+        )
+
+
+def _is_ours(entry: Path) -> bool:
+    if entry.is_symlink():
+        return False
+    if entry.is_dir():
+        ending = {STUDENTS: ".html", ROWS: ".json"}.get(entry.name)
+        return ending is not None and all(
+            child.name.endswith((ending, ".part")) and child.is_file() and not child.is_symlink()
+            for child in entry.iterdir()
+        )
+    unfinished = entry.name.endswith(".part") and entry.name.startswith((f".{CSV}.", f".{PAGE}."))
+    return entry.name in (CSV, PAGE) or unfinished
+
+
+def _load(out: Path, bundle: Bundle) -> Line | None:
+    """The line of a bundle that an earlier run has finished with, and whose page is there."""
+    try:
+        line = Line.from_dict(json.loads((out / ROWS / f"{bundle.key}.json").read_bytes()))
+    except (OSError, AttributeError, KeyError, TypeError, ValueError):
+        return None
+    whole = not line.page or (out / line.page).exists()
+    return line if whole and line.reason not in FAILED else None
+
+
+def _store(out: Path, bundle: Bundle, outcome: Outcome) -> Line:
+    """Keep a finished bundle: its page first, so that a line never lacks it."""
+    line, page = outcome
+    if page:
+        results.write_bytes(out / bundle.page, page.encode())
+    content = json.dumps(line.to_dict()).encode()
+    results.write_bytes(out / ROWS / f"{bundle.key}.json", content)
+    return line
+
+
+def _finish(out: Path, lines: list[Line], pages: set[str]) -> list[Line]:
+    """Write what takes the whole class; returns the lines with what they share."""
+    lines = with_copies(lines)
+    results.write_bytes(out / PAGE, class_page(lines).encode())
+    results.write_bytes(out / CSV, grades_csv(lines).encode("utf-8-sig"))  # so spreadsheets see ë
+    for path in (out / STUDENTS).iterdir():
+        if f"{STUDENTS}/{path.name}" not in pages:
+            path.unlink()  # of a bundle that is no more, or an older grader
+    return lines
+
+
+def _kind(line: Line) -> str:
+    if line.points is not None:
+        return "graded"
+    return "failed" if line.reason in FAILED else "refused"
+
+
+def _bar(total: int, progress: bool) -> Any:
+    from tqdm.auto import tqdm
+
+    return tqdm(total=total, unit="bundle", disable=not progress, smoothing=0.1)
+
+
+def _counted(n: int, what: str) -> str:
+    return f"{n} {what}{'s' * (n != 1)}"

@@ -1,0 +1,509 @@
+"""What an instructor should look at: data that cannot be, and data that two students share.
+
+A flag takes no points. It says what was seen, and what else could explain it.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import math
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from coursekit.submission.contents import CameraFacts, Stack, Submission
+    from coursekit.submission.recompute import Measured, Recomputed
+
+    Floats = NDArray[np.float64]
+
+TILES = 6  # a side of the grid on which the noise of a frame is remembered
+SAME_PATTERN = 0.8  # correlation of two time means on that grid
+SAME_FRAME = 0.85  # of two frames' noise
+QUERIES = 12  # frames of a stack that are looked for in others
+FOUND = 8  # of these, for the stacks to be the same measurement
+CLIP = 4.0  # times what is typical: a few changed values must not hide a copy
+CLOCK_S = 1e-8  # no real clock keeps step so well
+RULES = Path(__file__).with_name("rubric.toml")
+
+
+@dataclass(frozen=True)
+class Flag:
+    """code: one word; says: a sentence, with the numbers. note: true where it is no suspicion."""
+
+    code: str
+    says: str
+    note: bool = False
+
+
+@lru_cache(maxsize=1)
+def rules() -> dict[str, Any]:
+    """What rubric.toml holds."""
+    return tomllib.loads(RULES.read_text(encoding="utf-8"))
+
+
+def data_flags(submission: Submission, found: Recomputed, prints: Fingerprint) -> tuple[Flag, ...]:
+    """Flags of one submission, from its raw data alone; prints: its own `fingerprint`."""
+    limits = rules()["flags"]
+    seen = [
+        *_too_clean(submission.camera, found, limits),
+        *_flat(found, limits),
+        *_random_numbers(found, limits),
+        *_simulated(submission),
+        *_times(submission, limits),
+        *_one_stack_twice(prints.stacks),
+    ]
+    return tuple(seen)
+
+
+def _too_clean(camera: CameraFacts, found: Recomputed, limits: dict[str, float]) -> list[Flag]:
+    flags = []
+    for m in found.at:
+        if m.stats.n_frames > 1 and not m.stats.frozen_fraction > 0.5:
+            frames = {frame.tobytes() for frame in m.stack.counts}
+            if len(frames) < m.stats.n_frames:
+                flags.append(
+                    Flag(
+                        "repeated_frames",
+                        f"At {m.distance_m:.2f} m only {len(frames)} of {m.stats.n_frames} frames "
+                        "differ; noise makes every frame different.",
+                    )
+                )
+    product = camera.fx * (camera.baseline_m or 0.05)
+    sigma_d = [
+        m.stats.pixel_std_unrounded_m * product / m.distance_m**2
+        for m in found.at
+        if m.std is not None and m.stats.n_frames > 1
+    ]
+    if sigma_d and max(sigma_d) < limits["least_sigma_d_px"]:
+        flags.append(
+            Flag(
+                "too_clean",
+                f"The noise is that of a disparity good to {max(sigma_d):.4f} px or better, under "
+                f"{limits['least_sigma_d_px']:g} px at every distance: filtered in time, or not "
+                "measured by stereo.",
+            )
+        )
+    return flags
+
+
+def _flat(found: Recomputed, limits: dict[str, float]) -> list[Flag]:
+    """Noise that does not grow with distance; intervals without the widening for scatter."""
+    free = found.free
+    if free is None or free.exponent is None or free.n_distances < 2:
+        return []
+    most = free.exponent + 2 * math.sqrt(free.covariance[1, 1])
+    if most >= limits["flat_exponent"]:
+        return []
+    return [
+        Flag(
+            "not_distance_dependent",
+            f"The noise grows as distance to the power {free.exponent:.2f} (at most {most:.2f}); "
+            "stereo noise grows with its square.",
+        )
+    ]
+
+
+def _random_numbers(found: Recomputed, limits: dict[str, float]) -> list[Flag]:
+    neighbours, patterns = [], []
+    for m in found.at:
+        step_mm = 1e3 * m.scale_m
+        if m.std is None or m.std.value < 0.35 * step_mm or m.stats.n_frames < 8:
+            continue  # rounded away
+        pair = _space(m)
+        if pair is not None:
+            neighbours.append(pair[0])
+            patterns.append(pair[1])
+    flags = []
+    if neighbours and max(neighbours) < limits["white"]:
+        flags.append(
+            Flag(
+                "white_in_space",
+                f"Neighbouring pixels share nothing of their noise (correlation "
+                f"{max(neighbours):+.2f} at most); those of a stereo camera share their matching "
+                "window. Random numbers look like this.",
+            )
+        )
+    if patterns and max(patterns) < limits["pattern"]:
+        flags.append(
+            Flag(
+                "no_pattern",
+                f"The mean of all frames is as flat as independent noise leaves it "
+                f"({max(patterns):.1f} times); a stereo camera repeats a pattern in every frame.",
+            )
+        )
+    return flags
+
+
+def _space(m: Measured) -> tuple[float, float] | None:
+    """Correlation of neighbours' noise in time, and the pattern in the mean, in units of what
+    averaging leaves of noise; None where too few pixels are valid."""
+    counts = m.stack.counts
+    n, height, width = counts.shape
+    good = (counts > 0).all(axis=0)
+    if good.sum() < 25 or height < 4 or width < 4:
+        return None
+    mean = counts.mean(axis=0)
+    deviation = (counts - mean).astype(np.float32)
+    typical = float(np.sqrt(np.square(deviation[:, good]).mean()))
+    wild = np.abs(deviation).max(axis=0) > 8 * max(typical, 1.0)
+    good &= ~wild
+    if good.sum() < 25 or typical == 0:
+        return None
+    deviation *= good
+    power = np.einsum("nij,nij->", deviation, deviation) / good.sum()
+    rho = []
+    for one, two, ok in (
+        (deviation[:, :, :-1], deviation[:, :, 1:], good[:, :-1] & good[:, 1:]),
+        (deviation[:, :-1], deviation[:, 1:], good[:-1] & good[1:]),
+    ):
+        if ok.any():
+            rho.append(float(np.einsum("nij,nij->", one, two)) / int(ok.sum()) / float(power))
+    rows, columns = np.nonzero(good)
+    design = np.stack([np.ones(len(rows)), columns, rows, columns * rows], axis=-1)
+    values = mean[good]
+    residual = values - design @ np.linalg.lstsq(design, values, rcond=None)[0]
+    left = math.sqrt(float(power) / n / max(n - 1, 1))
+    return max(rho, default=1.0), float(residual.std()) / left
+
+
+def _simulated(submission: Submission) -> list[Flag]:
+    camera = submission.camera
+    if camera.source == "simulated":
+        return []
+    reasons = []
+    words = f"{camera.name} {camera.serial}".lower()
+    if "simul" in words or "seed-" in words:
+        reasons.append(f"its name is {camera.name}, {camera.serial}")
+    facts = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+    if any(np.allclose(facts, known, rtol=0, atol=5e-4) for known in _simulated_devices()):
+        reasons.append("its intrinsics are those of the simulated camera to the last digit")
+    if camera.source == "live" and any(_perfect_clock(s.times_s) for s in submission.stacks):
+        reasons.append("its clock has no jitter")
+    if not reasons:
+        return []
+    return [Flag("simulated_as_live", f"Declared as {camera.source}, but {'; '.join(reasons)}.")]
+
+
+@lru_cache(maxsize=1)
+def _simulated_devices() -> tuple[tuple[float, ...], ...]:
+    from coursekit import specifications
+
+    lenses = [specifications.device(name).unit.depth for name in specifications.device_names()]
+    return tuple((k.width, k.height, k.fx, k.fy, k.cx, k.cy) for k in lenses)
+
+
+def _perfect_clock(times: Floats) -> bool:
+    if len(times) < 8 or np.spacing(np.abs(times).max()) > CLOCK_S / 4:
+        return False
+    even = times[0] + (times[-1] - times[0]) / (len(times) - 1) * np.arange(len(times))
+    return bool(np.abs(times - even).max() < CLOCK_S)
+
+
+def _times(submission: Submission, limits: dict[str, float]) -> list[Flag]:
+    reasons = []
+    for stack in submission.stacks:
+        steps = np.diff(stack.times_s)
+        if steps.size == 0:
+            continue
+        back = int((steps <= 0).sum())
+        if back:
+            reasons.append(f"at {stack.distance_m:.2f} m they stand still or go back {back} times")
+        elif float(np.median(steps)) < 1 / limits["fastest_hz"]:
+            rate = 1 / float(np.median(steps))
+            reasons.append(f"at {stack.distance_m:.2f} m they say {rate:.3g} frames a second")
+    reasons += _times_together(submission)
+    if not reasons:
+        return []
+    return [Flag("impossible_times", f"Time stamps that cannot be: {'; '.join(reasons)}.")]
+
+
+def _times_together(submission: Submission) -> list[str]:
+    stacks = [stack for stack in submission.stacks if len(stack.times_s) > 1]
+    reasons = []
+    for i, one in enumerate(stacks):
+        for two in stacks[:i]:
+            both = f"{two.distance_m:.2f} and {one.distance_m:.2f} m"
+            first, second = one.times_s, two.times_s
+            epoch = min(first.min(), second.min()) > 1e9  # a clock that nothing sets back
+            if np.array_equal(first, second):
+                reasons.append(f"those of {both} are the same")
+            elif epoch and first.min() <= second.max() and second.min() <= first.max():
+                reasons.append(f"{both} were measured at the same time")
+    made = datetime.fromisoformat(submission.made).timestamp()
+    last = max((float(stack.times_s.max()) for stack in stacks), default=0.0)
+    if 1e9 < last < 1e10 and last > made + 86_400:
+        reasons.append(f"the last is {(last - made) / 86_400:.0f} days after the bundle was made")
+    return reasons
+
+
+def _one_stack_twice(prints: Sequence[StackPrint]) -> list[Flag]:
+    """Whether one distance was made out of another."""
+    flags = []
+    for i, one in enumerate(prints):
+        for two in prints[:i]:
+            alike = max(_shared(one, two)[0], _shared(two, one)[0])
+            if one.digest == two.digest or alike >= FOUND:
+                both = f"{two.distance_m:.2f} m and {one.distance_m:.2f} m"
+                flags.append(
+                    Flag("one_stack_twice", f"The noise at {both} is the same, frame by frame.")
+                )
+    return flags
+
+
+# --- fingerprints, and who shares what ------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class StackPrint:
+    """What is remembered of a stack.
+
+    digest: of its bytes. pattern (36,): the mean over time on a grid of TILES^2, without its plane.
+    frames (N, 36): of each frame what is not in the mean, without what all tiles share. Each is
+    scaled to a largest value of 127; a constant, a scale and the order of frames do not matter.
+    """
+
+    distance_m: float
+    digest: str
+    pattern: NDArray[np.int8]
+    frames: NDArray[np.int8]
+
+
+@dataclass(frozen=True, eq=False)
+class Fingerprint:
+    """What is remembered of a bundle's raw data to tell whether another one shares it: some 12 kB.
+
+    `to_dict` and `from_dict` take it through JSON.
+    """
+
+    student: str
+    source: str
+    camera: str
+    stacks: tuple[StackPrint, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain text and numbers only."""
+        stacks = [
+            {
+                "distance_m": s.distance_m,
+                "digest": s.digest,
+                "pattern": base64.b64encode(s.pattern.tobytes()).decode("ascii"),
+                "frames": base64.b64encode(s.frames.tobytes()).decode("ascii"),
+            }
+            for s in self.stacks
+        ]
+        return {
+            "student": self.student,
+            "source": self.source,
+            "camera": self.camera,
+            "stacks": stacks,
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Fingerprint:
+        """The inverse of `to_dict`."""
+        stacks = tuple(
+            StackPrint(
+                s["distance_m"],
+                s["digest"],
+                np.frombuffer(base64.b64decode(s["pattern"]), np.int8),
+                np.frombuffer(base64.b64decode(s["frames"]), np.int8).reshape(-1, TILES**2),
+            )
+            for s in data["stacks"]
+        )
+        return cls(data["student"], data["source"], data["camera"], stacks)
+
+
+@dataclass(frozen=True)
+class Copy:
+    """Bundles that share raw data: their keys, in order, and a sentence about them.
+
+    note: true where that is no suspicion, as with two simulations of one camera.
+    """
+
+    keys: tuple[str, ...]
+    code: str  # "identical" or "nearly_identical"
+    says: str
+    note: bool = False
+
+
+def fingerprint(submission: Submission) -> Fingerprint:
+    """See `Fingerprint`."""
+    camera = submission.camera
+    return Fingerprint(
+        submission.student,
+        camera.source,
+        f"{camera.name}, {camera.serial}",
+        tuple(_stack_print(stack) for stack in submission.stacks),
+    )
+
+
+def _stack_print(stack: Stack) -> StackPrint:
+    counts = stack.counts
+    n, height, width = counts.shape
+    digest = hashlib.blake2b(
+        repr(counts.shape).encode() + np.ascontiguousarray(counts).tobytes(), digest_size=16
+    ).hexdigest()
+    blank = np.zeros(TILES**2, np.int8)
+    if min(height, width) < TILES:
+        return StackPrint(stack.distance_m, digest, blank, np.zeros((0, TILES**2), np.int8))
+    valid = counts > 0
+    seen = valid.sum(axis=0)
+    mean = counts.sum(axis=0) / np.maximum(seen, 1)
+    deviation = (counts - mean.astype(np.float32)) * valid
+    few = np.abs(deviation[:: max(1, n // 16)])
+    scale = max(float(np.sqrt(np.square(few).mean())), 1e-9)
+    scale = max(float(np.sqrt(np.square(np.minimum(few, 3 * scale)).mean())), 0.25)
+    clipped = np.clip(deviation, -CLIP * scale, CLIP * scale)
+    mean = mean + clipped.sum(axis=0) / np.maximum(seen, 1)  # a wild value no longer moves it
+    deviation = np.clip((counts - mean.astype(np.float32)) * valid, -CLIP * scale, CLIP * scale)
+    tiles = _tiles(deviation)
+    tiles -= tiles.mean(axis=1, keepdims=True)
+    return StackPrint(stack.distance_m, digest, _bytes(_pattern(mean, seen > 0)), _bytes(tiles))
+
+
+def _pattern(mean: Floats, known: NDArray[np.bool_]) -> Floats:
+    """A mean image (h, w) without its plane, on the grid (36,); a hole counts as on the plane."""
+    if known.sum() < 12:
+        return np.zeros(TILES**2)
+    rows, columns = np.indices(mean.shape) - 0.5 * np.array(mean.shape)[:, None, None]
+    design = np.stack([np.ones(mean.shape), columns, rows], axis=-1)
+    residual = np.zeros(mean.shape)
+    use = known
+    for _ in range(2):
+        plane = np.linalg.lstsq(design[use], mean[use], rcond=None)[0]
+        residual = np.where(known, mean - design @ plane, 0.0)
+        size = np.abs(residual)
+        use = known & (size <= max(5 * float(np.median(size[known])), 0.5))
+        if use.sum() < 12:
+            break
+    limit = 5 * max(float(np.median(np.abs(residual[known]))), 0.1)
+    return np.asarray(_tiles(np.clip(residual, -limit, limit)[None])[0], np.float64)
+
+
+def _tiles(images: NDArray[Any]) -> NDArray[Any]:
+    """Images (N, h, w) averaged over TILES x TILES parts: (N, 36)."""
+    n, height, width = images.shape
+    down, across = (_averaging(size).astype(images.dtype) for size in (height, width))
+    return np.asarray(down.T @ images @ across).reshape(n, TILES**2)
+
+
+@lru_cache(maxsize=128)
+def _averaging(size: int) -> Floats:
+    """(size, TILES): column t averages part t of `size` samples."""
+    part = np.arange(size) * TILES // size
+    member = (part[:, None] == np.arange(TILES)).astype(np.float64)
+    return member / member.sum(axis=0)
+
+
+def _bytes(values: NDArray[Any]) -> NDArray[np.int8]:
+    largest = np.abs(values).max(axis=-1, keepdims=True)
+    return np.rint(127 * values / np.where(largest > 1e-6, largest, np.inf)).astype(np.int8)
+
+
+def _unit(values: NDArray[np.int8]) -> NDArray[np.float32]:
+    """Rows (..., 36) of length 1; rows of zeros stay."""
+    rows = values.astype(np.float32)
+    length = np.sqrt(np.square(rows).sum(axis=-1, keepdims=True))
+    return np.asarray(rows / np.where(length > 0, length, 1.0), np.float32)
+
+
+def _queries(frames: NDArray[np.int8]) -> NDArray[np.int8]:
+    """Up to QUERIES frames, evenly spread."""
+    if len(frames) <= QUERIES:
+        return frames
+    return frames[np.linspace(0, len(frames) - 1, QUERIES).round().astype(int)]
+
+
+def _shared(one: StackPrint, two: StackPrint) -> tuple[int, bool]:
+    """How many of some frames of `one` are in `two`, and whether they are exactly the same."""
+    ask = _queries(one.frames)
+    if len(ask) < FOUND or len(two.frames) < FOUND:
+        return 0, False
+    likeness = _unit(ask) @ _unit(two.frames).T
+    hits = likeness.max(axis=1) >= SAME_FRAME
+    best = two.frames[likeness.argmax(axis=1)]
+    return int(hits.sum()), bool((best[hits] == ask[hits]).all())
+
+
+def compare(prints: Mapping[str, Fingerprint]) -> list[Copy]:
+    """Bundles whose raw data are identical or nearly so, by the keys of `prints`.
+
+    Found whatever the order and number of the frames, with a few values changed, a constant added,
+    or noise of +-1 count. Identical ones make one `Copy` together, nearly identical ones one a
+    pair; of several identical bundles only the first is compared further.
+    """
+    groups: dict[tuple[str, ...], list[str]] = {}
+    for key, fingerprint_ in prints.items():
+        digests = tuple(sorted(stack.digest for stack in fingerprint_.stacks))
+        groups.setdefault(digests or (key,), []).append(key)
+    copies = [_identical(keys, prints) for keys in groups.values() if len(keys) > 1]
+    return copies + _nearly([keys[0] for keys in groups.values()], prints)
+
+
+def _identical(keys: Sequence[str], prints: Mapping[str, Fingerprint]) -> Copy:
+    many = f"{len(keys)} bundles have" if len(keys) > 2 else "Two bundles have"
+    says, note = f"{many} the same raw depths, byte for byte", _innocent(keys, prints, True)
+    return Copy(tuple(keys), "identical", f"{says}{': ' + note if note else ''}.", bool(note))
+
+
+def _innocent(keys: Sequence[str], prints: Mapping[str, Fingerprint], exact: bool) -> str:
+    """Why they may well be the same; empty where nothing says so."""
+    some = [prints[key] for key in keys]
+    if len({" ".join(p.student.casefold().split()) for p in some}) == 1:
+        return "they are of one student"
+    if exact and {p.source for p in some} == {"simulated"} and len({p.camera for p in some}) == 1:
+        return f"{some[0].camera} gives everybody the same"
+    return ""
+
+
+def _nearly(keys: Sequence[str], prints: Mapping[str, Fingerprint]) -> list[Copy]:
+    """Pairs of bundles with frames in common."""
+    stacks = [(key, stack) for key in keys for stack in prints[key].stacks if len(stack.frames)]
+    if len(stacks) < 2:
+        return []
+    patterns = _unit(np.array([stack.pattern for _, stack in stacks]))
+    frames = [_unit(stack.frames) for _, stack in stacks]
+    found: dict[tuple[str, str], dict[float, tuple[int, bool]]] = {}
+    rank = {key: i for i, key in enumerate(keys)}
+    for i, (key, stack) in enumerate(stacks):
+        alike = np.flatnonzero(patterns @ patterns[i] > SAME_PATTERN)
+        others = [j for j in alike if stacks[j][0] != key and len(frames[j]) >= FOUND]
+        ask = _queries(stack.frames)
+        if not others or len(ask) < FOUND:
+            continue
+        likeness = _unit(ask) @ np.concatenate([frames[j] for j in others]).T
+        starts = np.cumsum([0, *(len(frames[j]) for j in others[:-1])])
+        hits = (np.maximum.reduceat(likeness, starts, axis=1) >= SAME_FRAME).sum(axis=0)
+        for j, number in zip(others, hits.tolist(), strict=True):
+            if number >= FOUND:
+                other = stacks[j][0]
+                pair = (key, other) if rank[key] < rank[other] else (other, key)
+                exact = stack.digest == stacks[j][1].digest or _shared(stack, stacks[j][1])[1]
+                part = found.setdefault(pair, {})
+                before = part.get(stack.distance_m, (0, False))
+                part[stack.distance_m] = max(before, (number, exact))
+    return [_near_pair(pair, part, prints) for pair, part in found.items()]
+
+
+def _near_pair(
+    pair: tuple[str, str],
+    part: Mapping[float, tuple[int, bool]],
+    prints: Mapping[str, Fingerprint],
+) -> Copy:
+    exact = all(same for _, same in part.values())
+    where = " and ".join(f"{z:.2f} m" for z in sorted(part))
+    share = sum(number for number, _ in part.values()) / (QUERIES * len(part))
+    kind = "the same" if exact else "nearly the same"
+    says = f"The frames at {where} are {kind} ({min(share, 1):.0%} of those looked for were found)"
+    note = _innocent(pair, prints, exact)
+    return Copy(pair, "nearly_identical", f"{says}{': ' + note if note else ''}.", bool(note))

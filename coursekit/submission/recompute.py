@@ -1,0 +1,157 @@
+"""What the raw depths of a submission say: bias, noise and holes at each distance, and the law."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from coursekit.stereo import NoiseFit, WindowStats, fit_noise, window_stats
+from coursekit.stereo.windows import effective_frames, series_std
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from coursekit.submission.contents import Stack, Submission
+
+    Floats = NDArray[np.float64]
+    Interval = tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """A number and its standard error, both in the unit in which it is claimed."""
+
+    value: float
+    se: float
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """One distance; None is what its raw depths do not say.
+
+    bias, std in mm. bias_se_mm holds the tape's error, bias_se_apart_mm does not. invalid: as a
+    fraction; its standard error is that of a mean over frames.
+    """
+
+    stack: Stack
+    scale_m: float
+    stats: WindowStats
+    bias: Estimate | None
+    bias_se_mm: float | None
+    bias_se_apart_mm: float | None
+    std: Estimate | None
+    invalid: Estimate
+
+    @property
+    def distance_m(self) -> float:
+        """By tape."""
+        return self.stack.distance_m
+
+    @cached_property
+    def z_mm(self) -> Floats:
+        """Raw depths (N, h, w), mm, NaN where invalid."""
+        counts = self.stack.counts
+        return np.where(counts > 0, counts * (1e3 * self.scale_m), np.nan)
+
+    def noise_of_mean_mm(self, frames: int) -> float | None:
+        """Std of one pixel's mean over `frames` frames, as they correlate in this stack.
+
+        The number of independent frames in a stack of N, `effective_frames`, is scaled to `frames`.
+        """
+        if self.std is None:
+            return None
+        n = len(self.stack.counts)
+        if frames == 1 or n < 5:
+            return self.std.value / math.sqrt(frames)
+        pixels = self.stack.counts.reshape(n, -1).astype(np.float64)
+        pixels = pixels[:, (pixels > 0).all(axis=0)]
+        independent = float(n)
+        if pixels.shape[1]:
+            independent, _ = effective_frames(pixels - pixels.mean(axis=0))
+        share = (independent - 1) / (n - 1)
+        return self.std.value / math.sqrt(1 + (frames - 1) * share)
+
+
+@dataclass(frozen=True, eq=False)
+class Recomputed:
+    """All distances, in order, and the noise law with the exponent held at 2 and free.
+
+    law, free: None where the stds do not give it; why_no_law then says so in a sentence.
+    """
+
+    at: tuple[Measured, ...]
+    law: NoiseFit | None
+    free: NoiseFit | None
+    why_no_law: str = ""
+
+
+def recompute(submission: Submission) -> Recomputed:
+    """What the raw depths say, by the same functions as notebook 02 uses."""
+    stacks = sorted(submission.stacks, key=lambda stack: stack.distance_m)
+    scale, tape = submission.camera.depth_scale_m, submission.tape_sigma_m
+    at = tuple(_measured(stack, scale, tape) for stack in stacks)
+    law, why = _law(submission, at, 2.0)
+    several = sum(m.std is not None and m.std.value > 0 for m in at) > 1
+    free = _law(submission, at, None)[0] if law is not None and several else None
+    return Recomputed(at, law, free, why)
+
+
+def _measured(stack: Stack, scale: float, tape: float) -> Measured:
+    _, height, width = stack.counts.shape
+    with np.errstate(all="ignore"):  # depths that no camera gives; what is not finite is dropped
+        stats = window_stats(stack.counts, (0, 0, width, height), scale)
+    bias = _finite(1e3 * (stats.depth_m - stack.distance_m))
+    bias_se = _finite(1e3 * stats.depth_error_m)
+    std, std_se = _finite(1e3 * stats.pixel_std_m), _finite(1e3 * stats.pixel_std_error_m)
+    return Measured(
+        stack=stack,
+        scale_m=scale,
+        stats=stats,
+        bias=None if bias is None or bias_se is None else Estimate(bias, bias_se),
+        bias_se_mm=None if bias_se is None else math.hypot(bias_se, 1e3 * tape),
+        bias_se_apart_mm=bias_se,
+        std=None if std is None or std_se is None else Estimate(std, std_se),
+        invalid=_invalid(stack),
+    )
+
+
+def _invalid(stack: Stack) -> Estimate:
+    """The invalid fraction and its standard error, from how it changes from frame to frame."""
+    each = (stack.counts == 0).mean(axis=(1, 2))
+    least = 0.5 / stack.counts.size  # half a sample
+    std, squares = series_std(each)
+    se = std / math.sqrt(max(squares, 1.0)) if math.isfinite(std) else 0.0
+    return Estimate(float(each.mean()), max(se, least))
+
+
+def _law(
+    submission: Submission, at: tuple[Measured, ...], exponent: float | None
+) -> tuple[NoiseFit | None, str]:
+    known = [m for m in at if m.std is not None]
+    camera = submission.camera
+    if not known:
+        return None, "there are no depths to get it from"
+    try:
+        with np.errstate(all="ignore"):
+            fit = fit_noise(
+                [m.distance_m for m in known],
+                [m.stats.pixel_std_m for m in known],
+                [m.stats.pixel_dof for m in known],
+                camera.fx,
+                camera.baseline_m,
+                camera.depth_scale_m,
+                exponent,
+            )
+    except (ValueError, np.linalg.LinAlgError) as error:
+        return None, " ".join(str(error).split())
+    if not (math.isfinite(fit.sigma_d_px) and np.isfinite(fit.covariance).all()):
+        return None, "the stds do not follow any law"
+    return fit, ""
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None

@@ -1,0 +1,65 @@
+"""`ck.progress()`: what was answered, what is kept, what to do next."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+import coursekit as ck
+from coursekit import lessons, results
+from coursekit.lessons.checkpoints import Choice
+from coursekit.results import Quantity
+
+CAMERA = SimpleNamespace(source="live", name="D435 on the bench")
+
+
+@pytest.fixture(autouse=True)
+def _own_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COURSEKIT_RESULTS", str(tmp_path))
+
+
+def right_letter(choice: Choice) -> str:
+    return next(letter for letter, option in choice.lettered().items() if option.right)
+
+
+def test_a_beginner() -> None:
+    now = ck.progress()
+    assert [s.notebook for s in now.standings][0::4] == ["01_pinhole", "05_error_budget"]
+    assert sum(s.checkpoints for s in now.standings) == len(lessons.checkpoints())
+    assert sum(s.exercises[1] for s in now.standings) == len(lessons.exercises())
+    assert now.next.startswith("Begin with notebook 01_pinhole")
+    assert "0 of" in repr(now)
+
+
+def test_first_tries_later_ones_and_results() -> None:
+    choices = [c for n, c in lessons.checkpoints().items() if isinstance(c, Choice)]
+    one, two, three = choices[:3]
+    one.answer(right_letter(one))
+    two.answer(next(letter for letter in "ABC" if letter != right_letter(two)))
+    two.answer(right_letter(two))
+    three.answer(next(letter for letter in "ABC" if letter != right_letter(three)))
+    results.save("01_pinhole", CAMERA, {"fx": Quantity(430.0, "px")})
+
+    now = ck.progress()
+    assert sum(s.first_try for s in now.standings) == 1
+    assert sum(s.later for s in now.standings) == 1
+    assert three.name.partition(".")[2] in {name for s in now.standings for name in s.open}
+    assert now.standings[0].result.startswith("from D435 on the bench (live), 20")
+    assert now.next.startswith("Next: ")
+    assert "02_depth_noise" in now.next
+    assert "D435 on the bench" in now._repr_html_()
+
+
+def test_a_damaged_result_is_named() -> None:
+    (results.folder() / "01_pinhole.json").write_text("{", encoding="utf-8")
+    now = ck.progress()
+    assert "cannot be read" in now.standings[0].result
+    assert "01_pinhole" in now.next
+
+
+def test_when_all_is_kept_it_names_what_is_open() -> None:
+    for standing in ck.progress().standings:
+        results.save(standing.notebook, CAMERA, {"fx": Quantity(430.0, "px")})
+    assert "Still open" in ck.progress().next

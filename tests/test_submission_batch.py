@@ -1,0 +1,477 @@
+"""A folder of bundles is graded to its end, whatever is in it, and goes on where it was stopped."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterable
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hostile_bundles import hostile
+from hostile_bundles import submission as tiny
+from sample_submissions import honest
+
+from coursekit import cli
+from coursekit.specifications import DATA
+from coursekit.submission import batch
+from coursekit.submission.batch import Bundle, Limits, grade_folder
+from coursekit.submission.bundle import bundle_bytes, write_bundle
+from coursekit.submission.report import Line, not_graded
+from coursekit.submission.rubric import grade
+from coursekit.submission.worker import grade_file
+
+SAMPLES = DATA / "sample_bundles"
+GRADED = ("ada_good", "ben_weak", "cleo_wrong", "dan_copied", "eve_formula")
+REFUSED = {
+    "hostile_bomb": "zip_bomb",
+    "hostile_path": "path_traversal",
+    "hostile_truncated": "truncated",
+    "not_a_bundle": "not_a_zip",
+}
+
+
+def table(out: Path) -> list[dict[str, str]]:
+    """The rows of a report's grades.csv."""
+    return list(csv.DictReader(io.StringIO((out / "grades.csv").read_text(encoding="utf-8-sig"))))
+
+
+def quick(folder: Path, names: Iterable[str]) -> Path:
+    """A folder of small valid bundles."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        write_bundle(folder / f"{name}.zip", tiny(student=name))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory) -> Path:
+    """The report on the sample bundles."""
+    out = tmp_path_factory.mktemp("samples") / "report"
+    said = str(grade_folder(SAMPLES, out, workers=2, progress=False))
+    assert said.startswith("9 bundles in ")
+    assert "5 graded, 4 refused, 2 flagged." in said
+    return out
+
+
+# --- what comes out ---
+
+
+def test_every_sample_bundle_has_its_row_in_the_order_of_names(report):
+    rows = table(report)
+    assert [row["file"] for row in rows] == sorted(path.name for path in SAMPLES.iterdir())
+    by_name = {row["file"].removesuffix(".zip"): row for row in rows}
+    for name in GRADED:
+        assert by_name[name]["status"] == "graded"
+    for name, reason in REFUSED.items():
+        assert by_name[name]["status"] == f"not graded: {reason}"
+        assert len(by_name[name]["says"]) > 30
+        assert by_name[name]["points"] == ""
+    points = {name: float(by_name[name]["percent"]) for name in GRADED}
+    assert points["ada_good"] == 100
+    assert points["cleo_wrong"] < points["ben_weak"] < 100
+
+
+def test_copies_are_flagged_and_cost_nothing(report):
+    flags = {row["file"].removesuffix(".zip"): row["flags"] for row in table(report)}
+    assert flags["ada_good"] == flags["dan_copied"] == "nearly_identical"
+    assert flags["ben_weak"] == flags["eve_formula"] == ""  # the simulated camera is everybody's
+    assert {r["percent"] for r in table(report) if "dan" in r["file"]} == {"100.0"}
+
+
+def test_what_students_wrote_stays_text(report):
+    (row,) = [row for row in table(report) if row["file"] == "eve_formula.zip"]
+    assert row["student"].startswith("'=HYPERLINK")
+    for page in (report / "index.html", *(report / "students").iterdir()):
+        text = page.read_text(encoding="utf-8")
+        assert "<script" not in text
+        assert "&lt;script&gt;" in text or "eve_formula" not in page.name
+
+
+def test_the_report_holds_a_page_a_student_and_nothing_else(report):
+    assert sorted(path.name for path in report.iterdir()) == sorted(
+        [".rows", "grades.csv", "index.html", "students"]
+    )
+    pages = sorted(path.name for path in (report / "students").iterdir())
+    assert [page.rpartition("_")[0] for page in pages] == list(GRADED)
+    index = (report / "index.html").read_text(encoding="utf-8")
+    for page in pages:
+        assert f'href="students/{page}"' in index
+    lines = [json.loads(path.read_bytes()) for path in (report / ".rows").iterdir()]
+    assert len(lines) == 9
+
+
+def test_the_same_bytes_come_out_however_many_processes_there_are(report, tmp_path):
+    grade_folder(SAMPLES, tmp_path / "one", workers=1, progress=False)
+    for path in report.rglob("*"):
+        if path.is_file():
+            assert (tmp_path / "one" / path.relative_to(report)).read_bytes() == path.read_bytes()
+
+
+def test_a_batch_grades_as_the_rubric_does(tmp_path):
+    whole = honest(seed=5)
+    path = write_bundle(tmp_path / "a.zip", whole)
+    line, page = grade_file(str(path), "a.zip", "students/a.html")
+    found = grade(whole)
+    assert (line.points, line.of, line.items) == (found.points, found.of, found.items)
+    assert line.page == "students/a.html"
+    assert page.startswith("<!doctype html>")
+
+
+def test_every_hostile_bundle_is_a_row_with_its_reason(tmp_path):
+    cases = list(hostile())
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for i, case in enumerate(cases):
+        (folder / f"{i:03d}.zip").write_bytes(case.data)
+    summary = grade_folder(folder, tmp_path / "out", workers=2, progress=False)
+    assert (summary.graded, summary.failed) == (0, 0)
+    assert summary.refused == len(cases) > 30
+    for row, case in zip(table(tmp_path / "out"), cases, strict=True):
+        assert row["status"] == f"not graded: {case.reason}"
+
+
+# --- what a bundle can do to a process ---
+
+
+def misbehave(path: str, name: str, page: str) -> tuple[Line, str]:
+    """What a bundle does that the reader let through: its name says it."""
+    if "hang" in name:
+        time.sleep(3600)
+    if "spin" in name:
+        while True:
+            pass
+    if "kill" in name:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if "crash" in name:
+        os.abort()
+    if "exit" in name:
+        os._exit(3)
+    if "quit" in name:
+        raise SystemExit(4)
+    if "interrupt" in name:
+        raise KeyboardInterrupt
+    if "memory" in name:
+        np.ones(2**31)
+    if "raise" in name:
+        raise KeyError(name)
+    threads = os.environ["OPENBLAS_NUM_THREADS"]
+    return not_graded(name, "well", f"{os.getpid()} {threads}"), "page"
+
+
+def outcomes(names: Iterable[str], limits: Limits, work=misbehave) -> dict[str, Line]:
+    """What `run` makes of bundles of these names."""
+    bundles = [Bundle(Path(name), name, name) for name in names]
+    return {bundle.name: line for bundle, (line, _) in batch.run(bundles, work, limits)}
+
+
+def test_the_batch_outlives_whatever_a_bundle_does_to_its_process():
+    bad = {
+        "hang": "timeout",
+        "kill": "died",
+        "spin": "timeout",
+        "crash": "died",
+        "exit": "died",
+        "quit": "error",
+        "interrupt": "error",
+        "raise": "error",
+    }
+    names = [f"good {i}" for i in range(8)]
+    for i, name in enumerate(bad):
+        names.insert(2 * i, name)
+    before = dict(os.environ)
+    found = outcomes(names, Limits(2, timeout_s=1.5))
+    assert dict(os.environ) == before
+    assert sorted(found) == sorted(names)
+    assert {name: found[name].reason for name in bad} == bad
+    assert {found[f"good {i}"].reason for i in range(8)} == {"well"}
+    assert found["good 0"].says.split()[1] == "1"  # thread for linear algebra
+    assert "SIGKILL" in found["kill"].says
+    assert "longer than 1.5 s" in found["hang"].says
+    assert all(found[name].points is None for name in bad)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="nothing else holds to a limit of memory")
+def test_a_bundle_that_wants_too_much_memory_is_a_row_and_its_process_lives():
+    found = outcomes(["good 0", "memory", "good 1"], Limits(1, memory_bytes=2**28))
+    assert found["memory"].reason == "memory"
+    assert found["good 0"].says == found["good 1"].says  # the same process
+
+
+def test_processes_that_start_from_nothing_do_the_same(monkeypatch):
+    """As on Windows and macOS."""
+    monkeypatch.setattr(batch, "_context", lambda: multiprocessing.get_context("spawn"))
+    found = outcomes(["good 0", "kill", "good 1"], Limits(1))
+    assert [found[name].reason for name in ("good 0", "kill", "good 1")] == ["well", "died", "well"]
+    assert found["good 1"].says.split()[1] == "1"
+
+
+def test_processes_are_replaced_after_some_bundles(monkeypatch):
+    monkeypatch.setattr(batch, "MAX_TASKS", 3)
+    found = outcomes([f"good {i}" for i in range(12)], Limits(1))
+    assert (
+        len({line.says for line in found.values()}) == 5
+    )  # 12, and the one that shows it is there
+
+
+def fail(memory_bytes: int) -> None:
+    raise OSError("no memory for that")
+
+
+def test_processes_that_cannot_start_are_said(monkeypatch):
+    monkeypatch.setattr(batch, "_warm_up", fail)
+    with pytest.raises(ChildProcessError, match="cannot be started"):
+        outcomes(["good"], Limits(1))
+
+
+def test_a_pool_that_breaks_is_replaced_and_its_bundles_are_tried_again(monkeypatch):
+    real, broken = batch._outcome, []
+
+    def breaks(future, bundle, limits):
+        if bundle.name == "always" or (bundle.name == "once" and not broken):
+            broken.append(bundle.name)
+            raise BrokenProcessPool
+        return real(future, bundle, limits)
+
+    monkeypatch.setattr(batch, "_outcome", breaks)
+    found = outcomes(["a", "once", "b", "always", "c"], Limits(1))
+    assert {name: line.reason for name, line in found.items() if line.reason != "well"} == {
+        "always": "lost"
+    }
+    assert sorted(found) == ["a", "always", "b", "c", "once"]
+
+
+# --- stopping and going on ---
+
+
+def test_what_is_graded_is_not_graded_again(tmp_path):
+    folder, out = quick(tmp_path / "in", "abcd"), tmp_path / "out"
+    assert grade_folder(folder, out, 1, progress=False).kept == 0
+    before = (out / "grades.csv").read_bytes()
+    with pytest.raises(ValueError, match="holds a finished report already"):
+        grade_folder(folder, out, 1, progress=False)
+    assert grade_folder(folder, out, 1, progress=False, overwrite=True).kept == 4
+    assert (out / "grades.csv").read_bytes() == before
+
+    write_bundle(folder / "b.zip", tiny(student="New"), overwrite=True)
+    (folder / "d.zip").rename(folder / "e.zip")
+    (next((out / ".rows").glob("*.json"))).write_bytes(b"{")
+    summary = grade_folder(folder, out, 1, progress=False, overwrite=True)
+    assert summary.kept in (1, 2)
+    assert [row["student"] for row in table(out)] == ["a", "New", "c", "d"]
+    assert len(list((out / "students").iterdir())) == 4  # the old pages of b and d are gone
+
+
+def test_a_changed_grader_grades_anew(tmp_path, monkeypatch):
+    folder, out = quick(tmp_path / "in", "ab"), tmp_path / "out"
+    grade_folder(folder, out, 1, progress=False)
+    monkeypatch.setattr(batch, "grader_version", lambda: "another")
+    assert grade_folder(folder, out, 1, progress=False, overwrite=True).kept == 0
+
+
+def test_what_failed_is_tried_again(tmp_path, monkeypatch):
+    folder, out = quick(tmp_path / "in", ["a", "kill"]), tmp_path / "out"
+    monkeypatch.setattr(batch, "grade_file", misbehave)
+    first = grade_folder(folder, out, 1, progress=False)
+    assert (first.failed, first.graded) == (1, 0)
+    assert "1 not graded (time, memory or a crash)" in str(first)
+    monkeypatch.setattr(batch, "grade_file", grade_file)
+    again = grade_folder(folder, out, 1, progress=False, overwrite=True)
+    assert (again.failed, again.graded, again.kept) == (0, 1, 1)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C goes another way there")
+def test_ctrl_c_keeps_what_is_done_and_the_same_command_goes_on(tmp_path):
+    folder, out = tmp_path / "in", tmp_path / "out"
+    folder.mkdir()
+    data = (SAMPLES / "ada_good.zip").read_bytes()
+    for i in range(80):
+        (folder / f"{i:03d}.zip").write_bytes(data)
+    command = [sys.executable, "-m", "coursekit.cli", "grade", str(folder), "--out", str(out)]
+    running = subprocess.Popen(
+        [*command, "--workers", "2"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + 60
+    while len(list(out.glob(".rows/*.json"))) < 5 and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.killpg(running.pid, signal.SIGINT)  # as a terminal does: to all of them
+    said, error = running.communicate(timeout=60)
+    assert running.returncode == 130
+    assert said == ""
+    assert "bundles, which are kept. The same command goes on from there." in error
+    assert "Traceback" not in error
+    assert not (out / "grades.csv").exists()
+    done = len(list(out.glob(".rows/*.json")))
+    assert 5 <= done < 80
+    for path in out.rglob("*"):
+        assert not path.name.endswith(".part")
+
+    for path in list(folder.iterdir())[5:]:  # enough to see that it goes on
+        if not list(out.glob(f"students/{path.stem}_*")):
+            path.unlink()
+    command += ["--workers", "1"]
+    finished = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert finished.returncode == 0, finished.stderr
+    assert f"{done} of them had been graded before" in finished.stdout
+
+
+# --- folders ---
+
+
+def test_only_bundles_are_looked_at(tmp_path):
+    folder = quick(tmp_path / "in", ["b", "A"])
+    quick(folder / "late" / "Ada_17", ["studio"])
+    quick(folder / "__MACOSX", ["no"])
+    (folder / "._b.zip").write_bytes(b"")
+    (folder / "essay.pdf").write_bytes(b"")
+    (folder / "UPPER.ZIP").write_bytes((folder / "b.zip").read_bytes())
+    elsewhere = quick(tmp_path / "elsewhere", ["secret"])
+    (folder / "linked").symlink_to(elsewhere)
+    summary = grade_folder(folder, folder / "report", 1, progress=False)
+    assert summary.left_out == ("essay.pdf",)
+    assert "left out: 1 file: essay.pdf" in str(summary)
+    names = [row["file"] for row in table(folder / "report")]
+    assert names == ["A.zip", "UPPER.ZIP", "b.zip", "late/Ada_17/studio.zip"]
+    again = grade_folder(folder, folder / "report", 1, progress=False, overwrite=True)
+    assert again.kept == 4  # the report in the folder is no bundle of it
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names")
+def test_what_is_no_file_is_refused_and_nothing_waits_for_it(tmp_path):
+    folder = quick(tmp_path / "in", ["a"])
+    os.mkfifo(folder / "pipe.zip")
+    (folder / "gone.zip").symlink_to(tmp_path / "nowhere")
+    summary = grade_folder(folder, tmp_path / "out", 1, timeout_s=5, progress=False)
+    assert (summary.graded, summary.refused, summary.failed) == (1, 2, 0)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="such names cannot be made elsewhere")
+def test_names_of_files_are_never_paths_or_code(tmp_path):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    data = bundle_bytes(tiny(student="../../up"))
+    names = [
+        b"=1+1.zip",
+        b"<b>.zip",
+        b"a\nb.zip",
+        b"\xff\xfe.zip",
+        b"?.zip",
+        b"\xff.zip",
+        b"\xfe.zip",
+    ]
+    for name in names:
+        (folder / os.fsdecode(name)).write_bytes(data)
+    out = tmp_path / "out"
+    summary = grade_folder(folder, out, 1, progress=False)
+    assert summary.graded == len(names)
+    assert len({row["file"] for row in table(out)}) == len(names)
+    assert [path.parent for path in out.rglob("*.html")].count(out / "students") == len(names)
+    for path in (out / "students").iterdir():
+        assert path.name.isascii()
+        assert path.name.removesuffix(".html").replace("_", "").isalnum()
+    assert "<b>" not in (out / "index.html").read_text(encoding="utf-8")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in", "out"]
+
+
+@pytest.mark.parametrize("what", ["file", "link", "folder", "page", "rows", "itself", "a file"])
+def test_a_folder_with_anything_else_in_it_is_not_touched(what, tmp_path):
+    folder, out = quick(tmp_path / "in", ["a"]), tmp_path / "out"
+    if what == "itself":
+        out = folder
+    elif what == "a file":
+        out.write_text("mine", encoding="utf-8")
+    else:
+        (out / "students").mkdir(parents=True)
+        (out / ".rows").mkdir()
+        made = {
+            "file": out / "thesis.tex",
+            "page": out / "students" / "photo.jpg",
+            "rows": out / ".rows" / "x.py",
+        }
+        if what in made:
+            made[what].write_text("mine", encoding="utf-8")
+        elif what == "link":
+            (out / "grades.csv").symlink_to(tmp_path / "elsewhere")
+        else:
+            (out / "mine").mkdir()
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(ValueError, match="out: "):
+        grade_folder(folder, out, 1, progress=False, overwrite=True)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"folder": "nowhere"}, "there is no such folder"),
+        ({"folder": "empty"}, "there is no bundle"),
+        ({"folder": "papers"}, "only 1 other file"),
+        ({"workers": 0}, "workers: got 0"),
+        ({"timeout_s": 0.0}, "timeout_s: got 0.0"),
+        ({"timeout_s": float("nan")}, "timeout_s: got nan"),
+    ],
+)
+def test_what_cannot_be_is_said_before_anything_is_made(change, message, tmp_path):
+    quick(tmp_path / "in", ["a"])
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "papers").mkdir()
+    (tmp_path / "papers" / "a.pdf").write_bytes(b"")
+    arguments = {"folder": "in", "out": tmp_path / "out", "progress": False} | change
+    arguments["folder"] = tmp_path / arguments["folder"]
+    with pytest.raises(ValueError, match=message):
+        grade_folder(**arguments)
+    assert not (tmp_path / "out").exists()
+
+
+# --- the command ---
+
+
+def test_the_command_says_what_to_do_next(tmp_path, capsys):
+    folder, out = quick(tmp_path / "in", ["a"]), tmp_path / "out"
+    (folder / "b.zip").write_bytes(b"nothing")
+    command = ["grade", str(folder), "--out", str(out), "--workers", "1", "--timeout", "20"]
+    assert cli.main(command) == 0
+    said = capsys.readouterr()
+    assert "1 graded, 1 refused" in said.out
+    assert f"Open {out / 'index.html'}" in said.out
+    assert "2/2" in said.err  # the progress bar
+
+    assert cli.main(command) == 1
+    assert "--overwrite" in capsys.readouterr().err
+    assert cli.main([*command, "--overwrite"]) == 0
+    assert "2 of them had been graded before" in capsys.readouterr().out
+    assert cli.main(["grade", str(tmp_path / "x"), "--out", str(out)]) == 1
+    assert capsys.readouterr().err.startswith("coursekit: ")
+    with pytest.raises(SystemExit) as wrong:
+        cli.main(["grade", str(folder)])
+    assert wrong.value.code == 2
+
+
+def test_nothing_of_the_grader_is_loaded_with_the_course():
+    code = "import sys, coursekit; coursekit.submission; print('pebble' in sys.modules)"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert said.stdout == "False\n"
+
+
+def test_a_summary_counts_and_names(tmp_path):
+    summary = batch.Summary(Path("report"), 3, 0, 0, 0, 0, tuple("abcdefg"), 1.2)
+    assert str(summary) == (
+        "3 bundles in 1 s: 3 graded.\n"
+        "No bundles, so left out: 7 files: a, b, c, d, e, ...\n"
+        f"Open {Path('report') / 'index.html'}; grades.csv beside it goes into a spreadsheet."
+    )
+    assert "1 bundle in" in str(replace(summary, graded=1))

@@ -1,0 +1,335 @@
+"""Handing in: what is kept, what is said before packing, what is written and what never is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sample_submissions import PARAGRAPH, honest
+
+import coursekit as ck
+from coursekit import cli, results
+from coursekit.cameras.simulated import SimulatedCamera
+from coursekit.lessons import progress
+from coursekit.results import Quantity
+from coursekit.submission.bundle import write_bundle
+from coursekit.submission.contents import Conclusion, Row, Submission
+from coursekit.submission.reader import read_bundle
+from coursekit.submission.rubric import check, grade
+from coursekit.submission.submit import (
+    MEASURED,
+    NOBODY,
+    bundle_name,
+    keep,
+    load,
+    outcomes,
+    relative,
+    slug,
+    stack,
+    submit,
+)
+from tools import build_notebooks
+
+
+@pytest.fixture
+def own_results(tmp_path, monkeypatch) -> Path:
+    folder = tmp_path / "results"
+    monkeypatch.setenv("COURSEKIT_RESULTS", str(folder))
+    monkeypatch.chdir(tmp_path)
+    return folder
+
+
+@pytest.fixture
+def kept(own_results) -> Submission:
+    """An honest measurement, as the notebook keeps it."""
+    whole = replace(honest(seed=3), student=NOBODY, conclusion=Conclusion(), outcomes={})
+    write_bundle(own_results / MEASURED, whole)
+    return whole
+
+
+def right_conclusion(kept: Submission) -> dict[str, object]:
+    """The conclusion that the kept measurement bears out."""
+    for dominates in ("bias", "noise"):
+        conclusion = Conclusion(0.45, 30, dominates, PARAGRAPH)
+        if not check(replace(kept, conclusion=conclusion)):
+            break
+    return {"distance_m": 0.45, "frames": 30, "dominates": dominates, "paragraph": PARAGRAPH}
+
+
+# --- what notebook 02 keeps ---
+
+
+@pytest.fixture(scope="module")
+def block() -> tuple:
+    """A camera, its frames of the block at 0.45 m, and the block's face in them."""
+    camera = SimulatedCamera(seed=7)
+    camera.set(depth_scale_m=0.0001)
+    camera.place("60 mm block", 0.45)
+    frames = camera.frames(12, progress=False)
+    return camera, frames, ck.stereo.block_face(frames)
+
+
+def test_a_stack_is_the_window_of_each_frame(block):
+    _, frames, face = block
+    found = stack(frames, face.window, 0.45)
+    left, top, width, height = face.window
+    for i, frame in enumerate(frames):
+        assert np.array_equal(found.counts[i], frame.depth[top : top + height, left : left + width])
+        assert found.times_s[i] == frame.time_s
+    assert found.counts.dtype == np.uint16
+    assert found.counts.base is None or found.counts.nbytes == found.counts.base.nbytes
+
+
+def test_what_is_kept_says_exactly_what_the_notebook_says(block, own_results):
+    camera, frames, face = block
+    stats, intrinsics = face.stats, camera.depth
+    law = ck.stereo.fit_noise(
+        [0.45], [stats.pixel_std_m], [stats.pixel_dof], intrinsics.fx, camera.baseline_m,
+        camera.depth_scale_m, exponent=2,
+    )  # fmt: skip
+    table = {
+        "depth_bias_at_450_mm": Quantity(1000 * (stats.depth_m - 0.45), "mm", 0.3, "bias"),
+        "depth_std_at_450_mm": Quantity(face.depth_std_mm, "mm", face.depth_std_error_mm, "noise"),
+        "invalid_at_450_mm": Quantity(stats.invalid_fraction, "1"),
+    }
+    path = keep(camera, [stack(frames, face.window, 0.45)], table, law, [0.7], 0.001, 0.06)
+    assert path == own_results / MEASURED
+
+    found = load()
+    assert found.camera.fx == intrinsics.fx
+    assert (found.camera.serial, found.camera.source) == (camera.serial, "simulated")
+    assert found.camera.baseline_m == camera.baseline_m
+    assert (found.tape_sigma_m, found.caliper_m) == (0.001, 0.06)
+    assert found.claims.sigma_d_interval_px == law.sigma_d_interval_px
+    assert found.claims.exponent is None  # it was held at 2, so none is quoted
+    assert found.plot.measured_mm == (face.depth_std_mm,)
+    assert found.plot.predicted_mm == (0.7,)
+    (row,), (raw,) = found.claims.rows, found.stacks
+    again = ck.stereo.window_stats(raw.counts, (0, 0, *raw.window[2:]), camera.depth_scale_m)
+    assert row.depth_std_mm == 1000 * again.pixel_std_m
+    assert row.depth_bias_mm == 1000 * (again.depth_m - 0.45)
+    assert row.invalid_fraction == again.invalid_fraction
+    assert ck.stereo.fit_noise(
+        [0.45], [again.pixel_std_m], [again.pixel_dof], found.camera.fx, found.camera.baseline_m,
+        found.camera.depth_scale_m, exponent=2,
+    ).sigma_d_px == found.claims.sigma_d_px  # fmt: skip
+
+
+def test_a_fitted_exponent_is_claimed_and_what_is_not_in_the_table_is_left_out(block, own_results):
+    camera, frames, face = block
+    one = stack(frames, face.window, 0.45)
+    two = replace(one, distance_m=0.60)
+    law = ck.stereo.fit_noise([0.45, 0.60], [6e-4, 1.1e-3], 900, 431.0, 0.05)
+    found = {"depth_std_at_450_mm": Quantity(0.6, "mm", 0.01, "noise")}
+    keep(camera, [one, two], found, law, [0.7, 1.2], 0.0, 0.06)
+    claims = load().claims
+    assert claims.exponent == law.exponent
+    assert claims.exponent_interval == pytest.approx(law.exponent_interval)
+    assert claims.rows == (Row(0.45, depth_std_mm=0.6, depth_std_se_mm=0.01), Row(0.60))
+    assert load().plot is None
+
+
+def test_nothing_is_kept_of_what_cannot_be_handed_in(block, own_results):
+    camera, frames, face = block
+    law = ck.stereo.fit_noise([0.45], [6e-4], 900, 431.0, 0.05, exponent=2)
+    one = stack(frames, face.window, 0.45)
+    with pytest.raises(ValueError, match="caliper_m: got 60"):
+        keep(camera, [one], {}, law, [], 0.0, 60.0)
+    found = {"depth_std_at_450_mm": Quantity(0.6, "mm", 0.01, "noise")}
+    with pytest.raises(ValueError, match="plot: got 1 distances"):
+        keep(camera, [one], found, law, [0.7, 1.2, 1.9], 0.0, 0.06)
+    assert not own_results.exists()
+
+
+# --- what is said, and what is written ---
+
+
+def test_without_a_measurement_it_says_what_to_run(own_results):
+    handed = submit("Ada")
+    assert handed.path is None
+    assert "studio cells of notebook 02" in repr(handed)
+    assert not own_results.exists()
+
+
+def test_without_a_name_it_says_all_that_is_missing_and_writes_nothing(kept, own_results):
+    handed = submit()
+    assert handed.path is None
+    assert [says.partition(":")[0] for says in handed.says] == ["Bias or noise", "Paragraph"]
+    assert "needs your name" in repr(handed)
+    assert all(f"- {says}" in repr(handed) for says in handed.says)
+    assert [path.name for path in own_results.iterdir()] == [MEASURED]
+    assert submit("  ").path is None
+
+
+def test_an_honest_student_gets_full_points_for_what_passes_here(kept, own_results):
+    handed = submit("Ada Lovelace", **right_conclusion(kept))
+    assert handed.says == ()
+    assert handed.path == own_results / "studio_1_Ada_Lovelace.zip"
+    assert "Wrote results/studio_1_Ada_Lovelace.zip" in repr(handed)
+    assert str(own_results.parent) not in repr(handed) + handed._repr_html_()
+    packed = read_bundle(handed.path)
+    assert packed.student == "Ada Lovelace"
+    assert packed.conclusion.paragraph == PARAGRAPH
+    found = grade(packed)
+    assert found.points == found.of == 100
+    for one, two in zip(packed.stacks, kept.stacks, strict=True):
+        assert np.array_equal(one.counts, two.counts)
+
+
+def test_what_is_weak_is_said_in_the_graders_words_and_packed_all_the_same(kept, own_results):
+    *others, last = kept.stacks
+    short = replace(last, counts=last.counts[:84], times_s=last.times_s[:84])
+    write_bundle(own_results / MEASURED, replace(kept, stacks=(*others, short)), overwrite=True)
+    handed = submit("Ben")
+    assert handed.path is not None
+    assert any(says.startswith("0.60 m has 84 frames, 100 are needed") for says in handed.says)
+    assert handed.says == check(read_bundle(handed.path))
+
+
+def test_a_bundle_is_never_overwritten_without_being_told(kept, own_results):
+    first = submit("Ada").path
+    before = first.read_bytes()
+    again = submit("Ada", **right_conclusion(kept))
+    assert again.path is None
+    assert "is there already and stays as it is" in repr(again)
+    assert first.read_bytes() == before
+    assert submit("Ada", **right_conclusion(kept), overwrite=True).path == first
+    assert read_bundle(first).conclusion.paragraph == PARAGRAPH
+
+
+def test_a_disk_that_is_full_leaves_nothing_half_written(kept, own_results, monkeypatch):
+    def full(self, content):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OSError, match="No space left"):
+        submit("Ada")
+    assert [path.name for path in own_results.iterdir()] == [MEASURED]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"distance_m": "far"}, "distance_m: got 'far'"),
+        ({"distance_m": math.nan}, "distance_m: got nan"),
+        ({"frames": 0}, "frames: got 0"),
+        ({"dominates": "both"}, "dominates: got 'both', want one of bias, noise"),
+        ({"paragraph": "x" * 6000}, "paragraph: got 6000 characters"),
+        ({"student": "A\nB"}, "student: holds the character"),
+        ({"student": "---"}, "student: got '---', want some letters"),
+        ({"student": "x" * 101}, "student: got 101 characters"),
+    ],
+)
+def test_an_argument_that_cannot_be_is_named_and_nothing_is_written(
+    arguments, message, kept, own_results
+):
+    with pytest.raises(ValueError, match=message):
+        submit(**{"student": "Ada"} | arguments)
+    assert [path.name for path in own_results.iterdir()] == [MEASURED]
+
+
+def test_a_damaged_measurement_says_so(kept, own_results):
+    (own_results / MEASURED).write_bytes(b"PK nonsense")
+    with pytest.raises(ValueError, match=r"studio_1\.measured: .* notebook 02 again"):
+        submit("Ada")
+
+
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [
+        ("Ada Lovelace", "studio_1_Ada_Lovelace.zip"),
+        ("../../etc/passwd", "studio_1_etc_passwd.zip"),
+        ("C:\\CON", "studio_1_C_CON.zip"),
+        ("Zoë O'Neill-Łukasiewicz", "studio_1_Zoë_O_Neill_Łukasiewicz.zip"),
+        ("李 小龙", "studio_1_李_小龙.zip"),
+        ("x" * 90, f"studio_1_{'x' * 40}.zip"),
+        (". .", "studio_1_unnamed.zip"),
+    ],
+)
+def test_a_name_is_never_a_path(name, file):
+    assert bundle_name(name) == file
+    assert Path(file).name == file
+    assert len(file.encode()) < 200
+    assert slug(slug(name)) == slug(name)
+
+
+def test_paths_are_said_as_somebody_in_the_course_would_type_them(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert relative(tmp_path / "out" / "a.zip") == "out/a.zip"
+    assert relative(results.ROOT / "results" / "a.zip") == "results/a.zip"
+    monkeypatch.chdir(results.ROOT / "notebooks")
+    assert relative(results.ROOT / "results" / "a.zip") == "results/a.zip"
+    assert relative(tmp_path / "out" / "a.zip") == "out/a.zip"
+
+
+def test_what_was_answered_goes_along(kept, own_results):
+    results.write_json(
+        own_results / progress.FILE,
+        {
+            "depth_noise.width": [{"kind": "wrong"}, {"kind": "right"}],
+            "depth_noise.robust_depth": [{"kind": "core right"}],
+            "pinhole.zoom": [{"kind": "right"}],
+        },
+    )
+    found = outcomes()
+    assert {name: (o.right, o.attempts) for name, o in found.items()} == {
+        "depth_noise.width": (True, 2),
+        "depth_noise.robust_depth": (False, 1),
+    }
+    assert read_bundle(submit("Ada").path).outcomes == found
+
+
+def test_the_page_shows_it_escaped():
+    shown = ck.submission.Handed(None, "<b>", ("<script>",))._repr_html_()
+    assert "<script>" not in shown
+    assert "&lt;script&gt;" in shown
+
+
+# --- the command line ---
+
+
+def test_the_command_packs_and_refuses_like_the_function(kept, own_results, capsys):
+    words = own_results / "words.txt"
+    words.write_text(PARAGRAPH, encoding="utf-8")
+    right = right_conclusion(kept)
+    arguments = ["submit", "--student", "Ada", "--distance", "0.45", "--frames", "30"]
+    arguments += ["--dominates", str(right["dominates"]), "--paragraph-file", str(words)]
+    assert cli.main(arguments) == 0
+    assert "Wrote results/studio_1_Ada.zip, 3 distances" in capsys.readouterr().out
+    assert read_bundle(own_results / "studio_1_Ada.zip").conclusion.paragraph == PARAGRAPH
+
+    assert cli.main(arguments) == 1
+    assert "is there already" in capsys.readouterr().err
+    assert cli.main([*arguments, "--overwrite"]) == 0
+    assert cli.main([*arguments, "--folder", str(own_results / "x")]) == 0
+    assert (own_results / "x" / "studio_1_Ada.zip").exists()
+    assert cli.main(["submit", "--student", "A", "--paragraph-file", "nowhere"]) == 1
+    assert "nowhere" in capsys.readouterr().err
+
+
+def test_the_command_without_a_measurement_exits_with_1(own_results, capsys):
+    assert cli.main(["submit", "--student", "Ada"]) == 1
+    assert "studio cells of notebook 02" in capsys.readouterr().err
+
+
+# --- the notebook ---
+
+
+def test_a_notebook_with_a_name_hands_in_what_it_says(tmp_path):
+    """The bundle of an executed notebook is graded: every number of the table is right."""
+    import nbformat
+
+    path = build_notebooks.NOTEBOOKS / "02_depth_noise.ipynb"
+    notebook = nbformat.read(path, as_version=4)
+    cells = {cell.id: cell for cell in notebook.cells}
+    cells["hand-in-submit"].source = f"ck.submit('Ada', 0.45, 'bias', {PARAGRAPH!r}, frames=30)\n"
+    build_notebooks.execute(
+        notebook, path.stem, path.parent, build_notebooks.kernel_environment(tmp_path)
+    )
+    found = grade(read_bundle(tmp_path / "results" / "studio_1_Ada.zip"))
+    assert [item.says for item in found.items if item.verdict != "right"] == []
+    assert found.points == 100
+    assert [flag for flag in found.flags if not flag.note] == []
