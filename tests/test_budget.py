@@ -15,6 +15,7 @@ from coursekit.budget import (
     ErrorTerm,
     GraspAxes,
     View,
+    autocorrelation,
     effective_frames,
     lesson_budget,
     lesson_view,
@@ -188,6 +189,17 @@ def test_autocorrelation_and_floor() -> None:
     assert one.noise_m == pytest.approx(math.hypot(1e-3, 2e-4))
     assert one.at(frames=100).noise_m == pytest.approx(math.hypot(1e-4, 2e-4))
     assert one.at(frames=10**6).noise_m == pytest.approx(2e-4, rel=1e-4)
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.13, 0.5, 0.98])
+def test_the_autocorrelation_of_frames_comes_back(rho: float) -> None:
+    assert autocorrelation(200, effective_frames(200, rho)) == pytest.approx(rho, abs=1e-9)
+
+
+@pytest.mark.parametrize(("frames", "effective"), [(1, 1.0), (10, 0.9), (10, 10.1), (10, 1.0)])
+def test_an_impossible_number_of_frames_is_named(frames: int, effective: float) -> None:
+    with pytest.raises(ValueError, match=r"frames: got|effective: got"):
+        autocorrelation(frames, effective)
 
 
 def test_averaging_leaves_bias_alone() -> None:

@@ -1,21 +1,26 @@
-"""Remake the computed files in data/: `.venv/bin/python tools/make_data.py`."""
+"""Remake the computed files in data/: `.venv/bin/python -m tools.make_data [NAME ...]`."""
 
 from __future__ import annotations
 
 import io
 import json
 import shutil
+import sys
+import tempfile
 import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
+import nbformat
 import numpy as np
 
 import coursekit as ck
 from coursekit.arm import ArmErrors
 from coursekit.boards import Board
 from coursekit.boards.folder import SESSION
+from coursekit.budget.handover import REFERENCE
 from coursekit.cameras.capture import session_card
 from coursekit.cameras.simulated import SimulatedCamera
 from coursekit.hand_eye.poses import Mount
@@ -27,6 +32,7 @@ from coursekit.specifications import DATA
 from coursekit.submission.bundle import bundle_bytes, write_bundle
 from coursekit.submission.contents import Conclusion, Stack, Submission
 from coursekit.submission.submit import measured
+from tools import build_notebooks
 
 BOARD = Board("charuco", (9, 6), 0.025)
 SEED, VIEWS = 7, 26
@@ -148,6 +154,17 @@ SAMPLE_WORDS = (
 )
 
 
+def reference_results() -> None:
+    """data/reference_results/: what notebooks 1 to 4 find on the simulated camera and arm."""
+    with tempfile.TemporaryDirectory() as scratch:
+        environment = build_notebooks.kernel_environment(Path(scratch))
+        for path in build_notebooks.find([])[:4]:
+            notebook = nbformat.read(path, as_version=4)
+            build_notebooks.execute(notebook, path.stem, path.parent, environment)
+            result = Path(scratch) / "results" / f"{path.stem}.json"
+            write_bytes(REFERENCE / result.name, result.read_bytes())
+
+
 def sample_bundles() -> None:
     """data/sample_bundles/: what students hand in, for tests and for a first try of the grader."""
     shutil.rmtree(SAMPLES, ignore_errors=True)
@@ -262,15 +279,21 @@ def _zip(members: dict[str, bytes]) -> bytes:
     return buffer.getvalue()
 
 
+MAKERS = {
+    "vendor_models.json": ck.cameras.conventions.store,
+    "readme.png": readme_picture,
+    "intrinsics_session": intrinsics_session,
+    "diagnosis_power.json": diagnosis_power,
+    "hand_eye_sessions": hand_eye_sessions,
+    "reference_results": reference_results,  # of the sessions, so after them
+    "sample_bundles": sample_bundles,
+}
+
+
 if __name__ == "__main__":
-    ck.cameras.conventions.store()
-    readme_picture()
-    intrinsics_session()
-    diagnosis_power()
-    hand_eye_sessions()
-    sample_bundles()
-    print(
-        "data/vendor_models.json, data/readme.png, data/intrinsics_session/, "
-        "data/diagnosis_power.json, data/hand_eye_in_hand/, data/hand_eye_to_hand/, "
-        "data/sample_bundles/"
-    )
+    names = sys.argv[1:] or list(MAKERS)
+    if unknown := [name for name in names if name not in MAKERS]:
+        sys.exit(f"there is no {unknown[0]!r}; there are {', '.join(MAKERS)}")
+    for name in names:
+        print(f"data/{name} ...", flush=True)
+        MAKERS[name]()

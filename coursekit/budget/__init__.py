@@ -30,7 +30,7 @@ from coursekit.budget.propagate import (
     propagate,
 )
 from coursekit.budget.tables import lesson_budget, lesson_view, wrist_budget
-from coursekit.budget.terms import ErrorTerm, effective_frames
+from coursekit.budget.terms import ErrorTerm, autocorrelation, effective_frames
 from coursekit.budget.view import AXES, GraspAxes, View, looking_down
 
 __all__ = [
@@ -56,6 +56,7 @@ __all__ = [
     "Success",
     "Target",
     "View",
+    "autocorrelation",
     "beside",
     "best_distance",
     "centring_tolerance_m",

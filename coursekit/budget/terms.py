@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 Along = Literal["image", "ray", "scale", "disparity", "turn", "shift", "intrinsics"]
+MOST_ALIKE = 0.9999  # two frames; beyond it an autocorrelation says nothing more
 SIGMAS = 2.0  # a bias known by its standard deviation is taken to reach so many of them
 
 
@@ -210,3 +211,21 @@ def effective_frames(frames: int, autocorrelation: float = 0.0) -> float:
         raise ValueError(f"autocorrelation: got {rho!r}, want between -1 and 1")
     inflation = (1 + rho) / (1 - rho) - 2 * rho * (1 - rho**frames) / (frames * (1 - rho) ** 2)
     return frames / inflation
+
+
+def autocorrelation(frames: int, effective: float) -> float:
+    """The rho with which N frames are worth `effective` independent ones: `effective_frames` undone.
+
+    0 where they are worth all N. Raises ValueError for fewer than two frames, and for an effective
+    number that is not above 1 and at most N.
+    """
+    from scipy.optimize import brentq
+
+    if not isinstance(frames, (int, np.integer)) or frames < 2:
+        raise ValueError(f"frames: got {frames!r}, want a whole number, 2 or more")
+    if not 1 < effective <= frames:
+        raise ValueError(f"effective: got {effective!r}, want above 1 and at most {frames}")
+    least = effective_frames(frames, MOST_ALIKE)
+    if effective <= least:
+        return MOST_ALIKE
+    return float(brentq(lambda rho: effective_frames(frames, rho) - effective, 0.0, MOST_ALIKE))

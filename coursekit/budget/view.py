@@ -30,7 +30,7 @@ def looking_down(tilt_deg: float = 0.0) -> Floats:
         raise ValueError(f"tilt_deg: got {tilt_deg!r}, want an angle in degrees")
     c, s = math.cos(math.radians(tilt_deg)), math.sin(math.radians(tilt_deg))
     T = np.eye(4)
-    T[:3, :3] = [[0, -1, 0], [-c, 0, s], [-s, 0, -c]]
+    T[:3, :3] = np.array([[0, -1, 0], [-c, 0, s], [-s, 0, -c]])
     return T
 
 
