@@ -14,19 +14,19 @@ from coursekit.cameras import CameraError, open_camera
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `coursekit ARGUMENTS` and return its exit code: 0 done, 1 failed, 130 Ctrl-C.
 
-    A report of graded bundles is done whatever is in the bundles; a bundle to hand in is done when
-    it is written. Wrong usage exits with 2, as argparse does.
+    The doctor's is 1 when it found a problem. A report of graded bundles is done whatever is in the
+    bundles; a bundle to hand in is done when it is written. Wrong usage exits with 2, as argparse
+    does.
     """
     options = _parser().parse_args(arguments)
     try:
-        options.run(options)
+        return options.run(options) or 0
     except (CameraError, OSError, ValueError) as error:
         print(f"coursekit: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt as stopped:
         print(f"coursekit: {stopped or 'stopped, nothing was written'}", file=sys.stderr)
         return 130
-    return 0
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -46,7 +46,23 @@ def _parser() -> argparse.ArgumentParser:
     _add_board(commands)
     _add_submit(commands)
     _add_grade(commands)
+    _add_doctor(commands)
     return parser
+
+
+def _add_doctor(commands: Any) -> None:
+    doctor = commands.add_parser(
+        "doctor", help="say what works here, and what to do about the rest"
+    )
+    which = "auto (default), simulated, a serial number or a recording"
+    doctor.add_argument("--camera", default="auto", metavar="WHICH", help=which)
+    doctor.set_defaults(run=_doctor)
+
+
+def _doctor(options: argparse.Namespace) -> int:
+    from coursekit.doctor import run
+
+    return run(options.camera)
 
 
 def _add_board(commands: Any) -> None:

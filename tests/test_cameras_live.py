@@ -32,7 +32,7 @@ def plug_in(monkeypatch, tmp_path):
 
 def put_on_usb(folder, product):
     (folder / "1-2").mkdir()
-    (folder / "1-2" / "product").write_text(product)
+    (folder / "1-2" / "product").write_text(product, encoding="utf-8")
 
 
 # --- opening ---
@@ -158,7 +158,9 @@ def test_plugged_in_but_invisible_to_the_library_is_not_simulated(plug_in, tmp_p
     plug_in().serials = []
     put_on_usb(tmp_path, "USB Keyboard\n")
     assert open_camera().source == "simulated"
-    (tmp_path / "1-2" / "product").write_text("Intel(R) RealSense(TM) Depth Camera 435\n")
+    (tmp_path / "1-2" / "product").write_text(
+        "Intel(R) RealSense(TM) Depth Camera 435\n", encoding="utf-8"
+    )
     with pytest.raises(CameraError, match=r"a RealSense is plugged in, .* udev rules"):
         open_camera()
 
@@ -414,7 +416,9 @@ def test_without_the_library_nothing_is_recorded(no_library, tmp_path):
 
 
 def test_a_library_that_does_not_load_says_so(monkeypatch, tmp_path):
-    (tmp_path / "pyrealsense2.py").write_text("raise ImportError('libusb-1.0.so.0: no such file')")
+    (tmp_path / "pyrealsense2.py").write_text(
+        "raise ImportError('libusb-1.0.so.0: no such file')", encoding="utf-8"
+    )
     monkeypatch.delitem(sys.modules, "pyrealsense2", raising=False)
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(LibraryMissing, match=r"does not load \(libusb-1\.0\.so\.0: no such file"):

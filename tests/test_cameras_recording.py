@@ -291,10 +291,10 @@ def test_frames_that_do_not_reach_the_disk_are_noticed(rs, tmp_path, monkeypatch
 
 def test_an_existing_file_is_kept_unless_told(rs, tmp_path):
     path = tmp_path / "a.db3"
-    path.write_text("precious")
+    path.write_text("precious", encoding="utf-8")
     with pytest.raises(ValueError, match=r"^path: .*a\.db3 exists already: choose another name"):
         RandomCamera().record(path, 1)
-    assert path.read_text() == "precious"
+    assert path.read_text(encoding="utf-8") == "precious"
     RandomCamera().record(path, 2, overwrite=True)
     assert depth_frame_numbers(path) == [7, 14]
 
@@ -400,13 +400,25 @@ def zipped(path):
     [
         ("empty.db3", lambda path: path.touch(), "is empty: copy it again"),
         ("empty.bag", lambda path: path.touch(), "is empty: copy it again"),
-        ("text.db3", lambda path: path.write_text("hello"), r"is not a \.db3 recording, though"),
-        ("text.bag", lambda path: path.write_text("hello"), r"is not a \.bag recording, though"),
+        (
+            "text.db3",
+            lambda path: path.write_text("hello", encoding="utf-8"),
+            r"is not a \.db3 recording, though",
+        ),
+        (
+            "text.bag",
+            lambda path: path.write_text("hello", encoding="utf-8"),
+            r"is not a \.bag recording, though",
+        ),
         ("zip.bag", zipped, r"is not a \.bag recording, though"),
         ("zip.db3", zipped, r"is not a \.db3 recording, though"),
         ("foreign.db3", foreign, "not from a RealSense; copy it again"),
         ("robot.db3", robot, "not from a RealSense; copy it again"),
-        ("header.bag", lambda path: path.write_text("#ROSBAG V2.0\n"), "damaged, incomplete"),
+        (
+            "header.bag",
+            lambda path: path.write_text("#ROSBAG V2.0\n", encoding="utf-8"),
+            "damaged, incomplete",
+        ),
         ("folder.db3", lambda path: path.mkdir(), "is a folder: name the"),
         ("film.mp4", lambda path: path.touch(), r"its name must end in \.db3 or \.bag"),
         ("GOOD.DB3", lambda path: path.touch(), r"its name must end in \.db3 or \.bag, in lower"),

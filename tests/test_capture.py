@@ -120,7 +120,7 @@ def test_the_simulated_camera_is_moved_and_says_so(tmp_path, capsys):
     assert [view.name for view in seen] == [f"view_{number:03d}.png" for number in range(4)]
     assert all(len(view) >= 16 for view in seen)
     assert list((tmp_path / "views").glob("*.part")) == []
-    card = json.loads((tmp_path / "views" / "session.json").read_text())
+    card = json.loads((tmp_path / "views" / "session.json").read_text(encoding="utf-8"))
     assert (card["serial"], card["board"]["squares"]) == ("seed-7", [9, 6])
 
 

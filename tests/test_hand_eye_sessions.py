@@ -236,7 +236,7 @@ def shipped() -> list[HandEyeSession]:
 def small(tmp_path) -> Path:
     """A folder with the first six views of a shipped session."""
     lines = (SHIPPED[0] / "poses.csv").read_text("utf-8").splitlines(keepends=True)
-    (tmp_path / "poses.csv").write_text("".join(lines[:7]))
+    (tmp_path / "poses.csv").write_text("".join(lines[:7]), encoding="utf-8")
     for name in ["session.json", *(f"view_{i:02d}.jpg" for i in range(6))]:
         shutil.copy(SHIPPED[0] / name, tmp_path / name)
     return tmp_path
@@ -280,8 +280,8 @@ def test_shipped_sessions_show_the_error_of_the_arm(shipped) -> None:
 
 
 def test_truth_is_only_for_simulated_sessions(small) -> None:
-    card = json.loads((small / "session.json").read_text())
-    (small / "session.json").write_text(json.dumps(card | {"source": "my arm"}))
+    card = json.loads((small / "session.json").read_text(encoding="utf-8"))
+    (small / "session.json").write_text(json.dumps(card | {"source": "my arm"}), encoding="utf-8")
     with pytest.raises(ValueError, match="nobody knows its X"):
         truth_of(small)
     with pytest.raises(ValueError, match=r"has no session\.json"):
@@ -299,22 +299,24 @@ def test_save_and_read_again(small, tmp_path) -> None:
     np.testing.assert_allclose(again.times, session.times)
     assert again.board == session.board
     assert again.intrinsics == session.intrinsics
-    assert json.loads((folder / "session.json").read_text())["origin"] == "a test"
+    assert json.loads((folder / "session.json").read_text(encoding="utf-8"))["origin"] == "a test"
     with pytest.raises(ValueError, match=r"images: no 'view_00.jpg'"):
         session.save(folder, {})
 
 
 def test_joint_angles_alone_are_enough(small) -> None:
-    lines = (small / "poses.csv").read_text().splitlines()
+    lines = (small / "poses.csv").read_text(encoding="utf-8").splitlines()
     drop = set(range(1, 8))
     kept = [",".join(c for i, c in enumerate(line.split(",")) if i not in drop) for line in lines]
-    (small / "poses.csv").write_text("\ufeff" + "\r\n".join(kept))  # as Excel on Windows saves
+    (small / "poses.csv").write_text(
+        "\ufeff" + "\r\n".join(kept), encoding="utf-8"
+    )  # as Excel on Windows saves
     session = read(small)
     np.testing.assert_allclose(session.T_base_gripper, widowx().forward(session.q))
 
 
 def test_bad_rows_are_named_and_the_rest_is_used(small) -> None:
-    lines = (small / "poses.csv").read_text().splitlines()
+    lines = (small / "poses.csv").read_text(encoding="utf-8").splitlines()
     cells = [line.split(",") for line in lines]
     cells[1][1] = "0,3"  # becomes two cells: a decimal comma
     cells[2][4] = "2.0"
@@ -324,7 +326,7 @@ def test_bad_rows_are_named_and_the_rest_is_used(small) -> None:
     shutil.copy(small / "view_05.jpg", small / "view_06.jpg")
     rows.append("view_06.jpg" + rows[6][len("view_05.jpg") :])
     (small / "view_05.jpg").write_bytes(b"")
-    (small / "poses.csv").write_text("\n".join(rows))
+    (small / "poses.csv").write_text("\n".join(rows), encoding="utf-8")
     session = read(small)
     assert session.names == ("view_03.jpg", "view_04.jpg", "view_06.jpg")
     said = {skip.name: skip.reason for skip in session.skipped}
@@ -350,11 +352,13 @@ def test_folders_that_are_no_session(small, tmp_path) -> None:
         read(tmp_path / "bare", **known)
     (small / "session.json").unlink()
     assert len(read(small, **known)) == 6
-    text = (small / "poses.csv").read_text()
-    (small / "poses.csv").write_text(text.replace("qw", "w").replace("q5", "joint_5"))
+    text = (small / "poses.csv").read_text(encoding="utf-8")
+    (small / "poses.csv").write_text(
+        text.replace("qw", "w").replace("q5", "joint_5"), encoding="utf-8"
+    )
     with pytest.raises(ValueError, match="no column 'qw'"):
         read(small, **known)
-    (small / "poses.csv").write_text("\n".join(text.splitlines()[:3]))
+    (small / "poses.csv").write_text("\n".join(text.splitlines()[:3]), encoding="utf-8")
     with pytest.raises(ValueError, match="2 usable pairs"):
         read(small, **known)
 

@@ -506,7 +506,7 @@ def test_attempts_are_kept_in_order(own_results: Path) -> None:
     PITCH.answer(500)
     PITCH.answer(2000)
     lessons.check("pinhole.project", right)
-    kept = json.loads((own_results / "progress.json").read_text())
+    kept = json.loads((own_results / "progress.json").read_text(encoding="utf-8"))
     assert [a["kind"] for a in kept["pinhole.pitch"]] == ["wrong", "right"]
     rows = dict(lessons.evidence("pinhole").rows())
     assert "pitch: right at try 2" in " ".join(rows.values())
@@ -525,16 +525,16 @@ def test_evidence_of_the_core() -> None:
 
 
 def test_a_damaged_record_is_set_aside(own_results: Path) -> None:
-    (own_results / "progress.json").write_text("{half")
+    (own_results / "progress.json").write_text("{half", encoding="utf-8")
     PITCH.answer(2000)
     assert len(progress.read()["pinhole.pitch"]) == 1
-    assert (own_results / "progress.damaged.json").read_text() == "{half"
+    assert (own_results / "progress.damaged.json").read_text(encoding="utf-8") == "{half"
 
 
 def test_a_record_that_cannot_be_written_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "file").write_text("")
+    (tmp_path / "file").write_text("", encoding="utf-8")
     monkeypatch.setenv("COURSEKIT_RESULTS", str(tmp_path / "file" / "inside"))
     verdict = PITCH.answer(2000)
     assert verdict.kind == "right"

@@ -187,7 +187,7 @@ def test_a_scene_that_is_there_is_kept_unless_told(recorded_set, tmp_path):
         played.place(BLOCK, 0.45)
         assert len(played.frames(2)) == 2
         assert played.depth_scale_m == 0.001
-    assert len(json.loads((folder / "index.json").read_text())["scenes"]) == 3
+    assert len(json.loads((folder / "index.json").read_text(encoding="utf-8"))["scenes"]) == 3
 
 
 def test_one_set_is_of_one_camera(recorded_set, tmp_path):
@@ -264,7 +264,7 @@ def test_a_bad_set_is_refused(tmp_path, arguments, message):
     ],
 )
 def test_a_damaged_index_says_so(tmp_path, content, message):
-    (tmp_path / "index.json").write_text(content)
+    (tmp_path / "index.json").write_text(content, encoding="utf-8")
     with pytest.raises(CameraError, match=rf"index\.json is damaged \(.*{message}"):
         open_camera(tmp_path)
 

@@ -82,7 +82,7 @@ def test_only_quantities_are_saved(own_results: Path) -> None:
 )
 def test_damaged_files_are_named(damage) -> None:
     path = results.save("01_pinhole", CAMERA, {"fx": Quantity(1.0, "px")})
-    path.write_text(damage(path.read_text()))
+    path.write_text(damage(path.read_text(encoding="utf-8")), encoding="utf-8")
     with pytest.raises(ValueError, match=r"01_pinhole\.json"):
         results.load("01_pinhole")
 
@@ -130,12 +130,12 @@ def test_a_missing_file_is_a_missing_file() -> None:
 
 def test_a_failed_write_leaves_the_old_file(own_results: Path) -> None:
     path = results.save("01_pinhole", CAMERA, {"fx": Quantity(1.0, "px")})
-    before = path.read_text()
+    before = path.read_text(encoding="utf-8")
     with pytest.raises(ValueError, match="not JSON compliant"):
         results.write_json(path, {"x": float("nan")})
     with pytest.raises(TypeError):
         results.write_json(path, {"x": object()})
-    assert path.read_text() == before
+    assert path.read_text(encoding="utf-8") == before
     assert len(list(own_results.iterdir())) == 1
     assert json.loads(before)["quantities"]["fx"]["value"] == 1.0
 

@@ -112,7 +112,9 @@ def test_the_d455_follows_the_rule_of_the_d435():
 @pytest.mark.real
 @needs_real
 def test_d435_unit_is_the_recorded_one():
-    recorded = json.loads((Path(REAL) / "realsense_d435/intrinsics.json").read_text())
+    recorded = json.loads(
+        (Path(REAL) / "realsense_d435/intrinsics.json").read_text(encoding="utf-8")
+    )
     unit = device("D435").unit
     for mine, theirs in (("fx", "fx"), ("fy", "fy"), ("cx", "ppx"), ("cy", "ppy")):
         assert getattr(unit.color, mine) == recorded["color"][theirs]
@@ -126,7 +128,7 @@ def test_d435_unit_is_the_recorded_one():
 @needs_real
 def test_opencv_left_is_the_published_calibration():
     path = Path(REAL) / "opencv_chessboard/left_intrinsics_published.txt"
-    numbers = [float(n) for n in re.findall(r"-?\d+\.\d+", path.read_text())][:8]
+    numbers = [float(n) for n in re.findall(r"-?\d+\.\d+", path.read_text(encoding="utf-8"))][:8]
     left = lens("opencv_left").intrinsics
     assert numbers == [left.fx, left.cx, left.cy, *left.coeffs]
 
@@ -203,7 +205,9 @@ def test_a_missing_file_or_coefficient_is_named(tmp_path):
         device("D435", tmp_path)
     shutil.copy(DATA / "lenses.toml", tmp_path)
     text = (tmp_path / "lenses.toml").read_text(encoding="utf-8")
-    (tmp_path / "lenses.toml").write_text(text.replace("coeffs = [", "coeffs = [0.0, ", 1))
+    (tmp_path / "lenses.toml").write_text(
+        text.replace("coeffs = [", "coeffs = [0.0, ", 1), encoding="utf-8"
+    )
     with pytest.raises(ValueError, match=r"\[opencv_left\]: coeffs"):
         lens("opencv_left", tmp_path)
 

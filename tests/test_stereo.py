@@ -989,7 +989,10 @@ def test_depth_quality_of_nothing_is_nan():
 
 def test_published_figures_agree_with_each_other():
     series = {
-        s["id"]: s for s in json.loads((DATA / "published_depth_noise.json").read_text())["series"]
+        s["id"]: s
+        for s in json.loads((DATA / "published_depth_noise.json").read_text(encoding="utf-8"))[
+            "series"
+        ]
     }
     assert all(s["source"] and s["quantity"] for s in series.values())
     model = series["d435_mapping_model"]

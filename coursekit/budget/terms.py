@@ -214,7 +214,7 @@ def effective_frames(frames: int, autocorrelation: float = 0.0) -> float:
 
 
 def autocorrelation(frames: int, effective: float) -> float:
-    """The rho with which N frames are worth `effective` independent ones: `effective_frames` undone.
+    """The rho with which N frames are worth `effective` ones: `effective_frames` undone.
 
     0 where they are worth all N. Raises ValueError for fewer than two frames, and for an effective
     number that is not above 1 and at most N.

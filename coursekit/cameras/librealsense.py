@@ -106,5 +106,7 @@ def start_problem(what: str, error: RuntimeError) -> str:
 
 def _realsense_on_usb() -> bool:
     """Whether the operating system (Linux only) sees a RealSense on USB."""
-    names = (path.read_text(errors="replace") for path in USB_DEVICES.glob("*/product"))
+    names = (
+        path.read_text(errors="replace", encoding="utf-8") for path in USB_DEVICES.glob("*/product")
+    )
     return any("RealSense" in name for name in names)

@@ -444,7 +444,7 @@ def limit_memory(more_bytes: int) -> None:
 def _address_space() -> int | None:
     """The address space of this process in bytes, None where the system does not say."""
     try:
-        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
         return pages * os.sysconf("SC_PAGE_SIZE")
     except (OSError, ValueError, AttributeError):
         return None

@@ -40,7 +40,7 @@ def camera(rs, folder):
 
 
 def test_reports_what_its_owners_published(camera, folder):
-    published = json.loads((folder / "intrinsics.json").read_text())
+    published = json.loads((folder / "intrinsics.json").read_text(encoding="utf-8"))
     for intrinsics, expected in (
         (camera.depth, published["depth"]),
         (camera.color, published["color"]),

@@ -32,7 +32,7 @@ def folder():
 @pytest.fixture(scope="module")
 def pairs(folder):
     """T_base_gripper and T_camera_board, (50, 4, 4) each; the camera stands beside the arm."""
-    samples = np.array(json.loads((folder / "pose_samples.json").read_text()))
+    samples = np.array(json.loads((folder / "pose_samples.json").read_text(encoding="utf-8")))
     return samples[:, 0], samples[:, 1]
 
 

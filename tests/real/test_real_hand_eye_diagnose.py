@@ -24,7 +24,7 @@ def pairs() -> tuple[np.ndarray, np.ndarray]:
     if not os.environ.get("COURSEKIT_REAL_DATA"):
         pytest.skip("COURSEKIT_REAL_DATA is not set: it names the folder of real data")
     folder = Path(os.environ["COURSEKIT_REAL_DATA"]) / "moveit_hand_eye"
-    samples = np.array(json.loads((folder / "pose_samples.json").read_text()))
+    samples = np.array(json.loads((folder / "pose_samples.json").read_text(encoding="utf-8")))
     return samples[:, 0], samples[:, 1]
 
 

@@ -1,0 +1,101 @@
+"""The static pages in a real browser, opened from disk."""
+
+import os
+import shutil
+
+import pytest
+
+from tools import build_site
+
+pytestmark = pytest.mark.browser
+
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
+QUIET = "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-sync"
+NO_NEWS = "--disable-background-networking --disable-component-update"
+PAGES = [*build_site.page_names().values()]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("site")
+    build_site.write(build_site.site(), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def browser():
+    if CHROMIUM is None and os.environ.get("CI") == "true":
+        pytest.fail("no Chromium, and CI must run this test")
+    if CHROMIUM is None:
+        pytest.skip("not run: no Chromium")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        arguments = f"{QUIET} {NO_NEWS}".split()
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=arguments)
+        yield browser
+        browser.close()
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+@pytest.mark.parametrize("name", PAGES)
+def test_a_page_opens_from_disk(folder, browser, name, width):
+    page = browser.new_page(viewport={"width": width, "height": 844})
+    page.set_default_timeout(20_000)
+    asked, failed, errors = [], [], []
+    page.on("request", lambda request: asked.append(request.url))
+    page.on("requestfailed", lambda request: failed.append(request.url))
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("console", lambda message: errors.append(message.text))
+    page.goto((folder / name).as_uri(), wait_until="load")
+    page.evaluate("document.fonts.ready.then(() => true)")
+
+    assert len(asked) >= 2  # the page and its style sheet
+    assert [url for url in asked if not url.startswith(folder.as_uri())] == []
+    assert (failed, errors) == ([], [])
+    assert page.evaluate("[...document.images].every(i => i.complete && i.naturalWidth > 0)")
+    assert page.evaluate("document.documentElement.scrollWidth") == width
+    assert page.locator("h1").is_visible()
+    for details in page.locator("details:not(.toc details)").all():
+        assert details.get_attribute("open") is None
+    page.close()
+
+
+def test_links_lead_through_the_course(folder, browser):
+    page = browser.new_page()
+    page.set_default_timeout(20_000)
+    page.goto((folder / "index.html").as_uri())
+    titles = page.locator(".card h3").all_text_contents()
+    page.locator(".card a").first.click()
+    for title in titles[1:]:
+        page.locator("a[rel=next]").first.click()
+        assert page.locator("h1").text_content() == title
+    page.close()
+
+
+def test_an_answer_opens(folder, browser):
+    page = browser.new_page()
+    page.set_default_timeout(20_000)
+    page.goto((folder / PAGES[1]).as_uri())
+    answer = page.locator("details.answer").first
+    assert not answer.locator("pre").is_visible()
+    answer.locator("summary").click()
+    assert answer.locator("pre").is_visible()
+    page.close()
+
+
+def test_fences_are_as_high_as_their_matrix(folder, browser):
+    """The font that comes along has the table MATH: without one, nothing stretches."""
+    page = browser.new_page()
+    page.set_default_timeout(20_000)
+    page.goto((folder / PAGES[1]).as_uri())
+    page.evaluate("document.fonts.ready.then(() => true)")
+    heights = page.locator("mo:has(+ mtable), mo + mtable").evaluate_all(
+        "all => all.map(e => e.getBoundingClientRect().height)"
+    )
+    assert len(heights) >= 6
+    for fence, matrix in zip(heights[::2], heights[1::2], strict=True):
+        assert fence == pytest.approx(matrix, rel=0.15)
+    page.close()

@@ -1,0 +1,555 @@
+"""The course on Linux, Windows and macOS, as far as one machine can tell: by reading the code.
+
+Also what a hub needs (`.binder`), because nothing here can build its image.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import re
+import stat
+import subprocess
+import sys
+import tomllib
+from collections import Counter
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import pytest
+from packaging.markers import Marker
+
+from coursekit.doctor import NEWEST_TESTED, OLDEST, pins
+
+ROOT = Path(__file__).resolve().parents[1]
+BINDER = ROOT / ".binder"
+SHIPPED = ("coursekit", "tools")
+ALL = (*SHIPPED, "tests")
+SYSTEMS = {
+    "linux": {"sys_platform": "linux", "platform_system": "Linux", "os_name": "posix"},
+    "win32": {"sys_platform": "win32", "platform_system": "Windows", "os_name": "nt"},
+    "darwin": {"sys_platform": "darwin", "platform_system": "Darwin", "os_name": "posix"},
+}
+ONE_SYSTEM_ONLY = re.compile(
+    "curses|fcntl|grp|msvcrt|nt|posix|pty|pwd|readline|resource|syslog|termios|tty|_?winapi|winreg"
+)
+NOT_ON_WINDOWS = re.compile(
+    r"os\.(chown|fork|forkpty|get(e?[ug]id|pgid|sid)|killpg|mkfifo|nice|sched_getaffinity|setsid|"
+    r"statvfs|sysconf|uname)|signal\.(pthread_sigmask|alarm|SIG(ALRM|HUP|KILL|USR1))"
+)
+MODE = re.compile(r"[rwaxbt+]+")
+
+
+def sources(*folders: str) -> list[Path]:
+    """The Python files of these folders, and those of the project's own folder."""
+    inside = [path for folder in folders for path in sorted((ROOT / folder).rglob("*.py"))]
+    return [*inside, *sorted(ROOT.glob("*.py"))]
+
+
+LOOKED_AT = (ast.Attribute, ast.BinOp, ast.Call, ast.Constant, ast.Import, ast.ImportFrom)
+
+
+@cache
+def nodes(path: Path) -> list[ast.AST]:
+    """The parts of a file's syntax that a rule looks at, each with its `parent`."""
+    return with_parents(ast.parse(path.read_text(encoding="utf-8")))
+
+
+def with_parents(module: ast.Module) -> list[ast.AST]:
+    looked_at = []
+    for node in ast.walk(module):
+        for child in ast.iter_child_nodes(node):
+            child.parent = node
+        if isinstance(node, LOOKED_AT):
+            looked_at.append(node)
+    return looked_at
+
+
+def found(is_fault: Callable[[Any], bool], *folders: str) -> list[str]:
+    """Where the code of these folders has a node that is a fault: file, line, what it says."""
+    return [
+        f"{path.relative_to(ROOT).as_posix()}:{node.lineno}: {ast.unparse(node)[:80]}"
+        for path in sources(*folders)
+        for node in nodes(path)
+        if is_fault(node)
+    ]
+
+
+def dotted(node: ast.AST) -> str:
+    """A name such as os.path.join as text, empty for anything else."""
+    if isinstance(node, ast.Attribute):
+        owner = dotted(node.value)
+        return owner and f"{owner}.{node.attr}"
+    return node.id if isinstance(node, ast.Name) else ""
+
+
+def name_of(call: ast.Call) -> str:
+    """The last part of the name of the function that is called."""
+    func = call.func
+    return func.attr if isinstance(func, ast.Attribute) else getattr(func, "id", "")
+
+
+def ancestors(node: ast.AST) -> Iterator[ast.AST]:
+    while hasattr(node, "parent"):
+        node = node.parent
+        yield node
+
+
+def keywords(call: ast.Call) -> dict[str | None, ast.expr]:
+    return {keyword.arg: keyword.value for keyword in call.keywords}
+
+
+# --- encodings ---
+
+
+def without_encoding(call: ast.AST) -> bool:
+    """Whether a call reads or writes text in whatever encoding the system prefers."""
+    if not isinstance(call, ast.Call) or {"encoding", None} & set(keywords(call)):
+        return False
+    name = name_of(call)
+    if name == "read_text":
+        return not call.args
+    if name == "write_text":
+        return len(call.args) < 2
+    if name not in ("open", "fdopen", "TemporaryFile", "NamedTemporaryFile"):
+        return False
+    given = [*call.args, *call.keywords]
+    values = [getattr(one, "value", None) for one in given]
+    values = [getattr(value, "value", value) for value in values]
+    modes = [value for value in values if isinstance(value, str) and MODE.fullmatch(value)]
+    if any("b" in mode for mode in modes):
+        return False
+    method = isinstance(call.func, ast.Attribute)  # Path.open(); not sensor.open(profiles)
+    return bool(modes) or (name == "open" and not (method and given))
+
+
+def test_text_is_read_and_written_as_utf_8() -> None:
+    assert found(without_encoding, *ALL) == []
+
+
+@pytest.mark.parametrize(
+    ("code", "fault"),
+    [
+        ("open('a')", True),
+        ("open('a', 'w')", True),
+        ("p.open()", True),
+        ("p.open('a+')", True),
+        ("p.read_text()", True),
+        ("p.read_text(errors='replace')", True),
+        ("p.write_text('x')", True),
+        ("NamedTemporaryFile(mode='w')", True),
+        ("open('a', 'rb')", False),
+        ("open('a', encoding='utf-8')", False),
+        ("p.open(mode='wb')", False),
+        ("p.read_text('utf-8')", False),
+        ("p.write_text('x', 'utf-8')", False),
+        ("sensor.open(profiles)", False),
+        ("TemporaryFile(dir=d)", False),
+    ],
+)
+def test_the_search_for_encodings_finds_what_it_should(code: str, fault: bool) -> None:
+    assert without_encoding(ast.parse(code, mode="eval").body) is fault
+
+
+# --- no shell, no paths as text ---
+
+
+def asks_a_shell(node: ast.AST) -> bool:
+    return isinstance(node, ast.Call) and (
+        "shell" in keywords(node)
+        or dotted(node.func) in ("os.system", "os.popen", "subprocess.getoutput")
+        or name_of(node) == "create_subprocess_shell"
+    )
+
+
+def test_no_shell_is_asked() -> None:
+    assert found(asks_a_shell, *ALL) == []
+
+
+def glued(node: ast.AST) -> bool:
+    """Whether a path is put together as text: os.path.join, `a + "/b"`, `Path("a\\b")`."""
+    if isinstance(node, ast.Call):
+        first = node.args[0] if node.args else None
+        constant = isinstance(first, ast.Constant) and isinstance(first.value, str)
+        backslash = constant and "\\" in first.value
+        is_path = dotted(node.func) in ("Path", "pathlib.Path", "open")
+        return dotted(node.func) == "os.path.join" or (is_path and backslash)
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
+        sides = [side.value for side in (node.left, node.right) if isinstance(side, ast.Constant)]
+        return any(str(side).startswith(("/", "\\")) for side in sides)
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Div):  # folder / "a\\b"
+        return isinstance(node.right, ast.Constant) and "\\" in str(node.right.value)
+    return False
+
+
+def test_paths_are_put_together_by_pathlib() -> None:
+    assert found(glued, *SHIPPED) == []
+
+
+@pytest.mark.parametrize(
+    ("code", "fault"),
+    [
+        ("os.path.join(a, b)", True),
+        ("folder + '/b.csv'", True),
+        (r"Path('data\\b.csv')", True),
+        (r"folder / 'data\\b.csv'", True),
+        ("folder / 'data' / 'b.csv'", False),
+        ("a + 'b'", False),
+    ],
+)
+def test_the_search_for_glue_finds_what_it_should(code: str, fault: bool) -> None:
+    assert glued(ast.parse(code, mode="eval").body) is fault
+
+
+def of_one_system(node: ast.AST) -> bool:
+    """Whether it is an absolute path, of Linux or of Windows."""
+    folders = "etc|home|proc|sys|tmp|usr|var|opt|dev|lib"
+    return isinstance(node, ast.Constant) and bool(
+        re.fullmatch(rf"/({folders})(/\S*)?|[A-Z]:\\\S*", str(node.value))
+    )
+
+
+def test_a_path_of_one_system_is_an_extra() -> None:
+    """What is there on Linux only serves what the course can do without."""
+    allowed = re.compile(
+        r"coursekit/(doctor\.py:\d+: '.*/udev/rules\.d'|cameras/librealsense\.py:\d+: "
+        r"'/sys/bus/usb/devices'|submission/\w+\.py:\d+: '/proc/self/statm')"
+    )
+    assert [one for one in found(of_one_system, *SHIPPED) if not allowed.match(one)] == []
+
+
+# --- processes and modules of one system ---
+
+
+def starts_a_process_its_own_way(node: ast.AST) -> bool:
+    """Not by "spawn"; behind a question "forkserver" will do, which copies no memory either."""
+    if not isinstance(node, ast.Call):
+        return False
+    if name_of(node) in ("get_context", "set_start_method"):
+        how = [getattr(argument, "value", None) for argument in node.args]
+        return how != ["spawn"] and not (how == ["forkserver"] and is_guarded(node))
+    if name_of(node) in ("ProcessPoolExecutor", "ProcessPool"):
+        return not {"mp_context", "context"} & set(keywords(node))
+    text = dotted(node.func)
+    return bool(re.fullmatch(r"(multiprocessing|mp)\.(Pool|Process|Queue|Manager)", text))
+
+
+def test_processes_are_started_in_a_way_that_every_system_has() -> None:
+    assert found(starts_a_process_its_own_way, *ALL) == []
+
+
+def is_guarded(node: ast.AST) -> bool:
+    """Whether code runs only where a question about the system, or a try, lets it.
+
+    A question is asked around it, or before it in the function that it would leave.
+    """
+    asks = re.compile(r"sys\.platform|os\.name|platform\.system|hasattr\((os|signal),")
+    inner = node
+    for outer in ancestors(node):
+        if isinstance(outer, ast.Try) and inner in outer.body:
+            caught = " ".join(ast.unparse(h.type) for h in outer.handlers if h.type)
+            if re.search("ImportError|AttributeError", caught):
+                return True
+        if isinstance(outer, (ast.If, ast.IfExp, ast.BoolOp)) and asks.search(ast.unparse(outer)):
+            return True
+        if isinstance(outer, ast.FunctionDef):
+            before = [part for part in outer.body if part.lineno < node.lineno]
+            marks = " ".join(map(ast.unparse, outer.decorator_list))
+            leaves = any(
+                isinstance(part, ast.If)
+                and asks.search(ast.unparse(part.test))
+                and isinstance(part.body[-1], (ast.Return, ast.Raise))
+                for part in before
+            )
+            in_body = node not in list(ast.walk(ast.Module(outer.decorator_list, [])))
+            if leaves or (in_body and re.search(r"posix\b|skipif\(.*(platform|os)", marks)):
+                return True
+        inner = outer
+    return False
+
+
+def imports_what_one_system_has(node: ast.AST) -> bool:
+    names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+    if isinstance(node, ast.ImportFrom):
+        names = [node.module or ""]
+    return any(map(ONE_SYSTEM_ONLY.fullmatch, names)) and not is_guarded(node)
+
+
+def test_modules_of_one_system_are_imported_behind_a_question() -> None:
+    assert found(imports_what_one_system_has, *ALL) == []
+
+
+def uses_what_windows_lacks(node: ast.AST) -> bool:
+    named = isinstance(node, ast.Attribute) and NOT_ON_WINDOWS.fullmatch(dotted(node))
+    return bool(named) and not is_guarded(node)
+
+
+def test_functions_of_one_system_are_called_behind_a_question() -> None:
+    assert found(uses_what_windows_lacks, *ALL) == []
+
+
+@pytest.mark.parametrize(
+    ("code", "guarded"),
+    [
+        ("import fcntl", False),
+        ("if sys.platform == 'win32':\n    pass\nelse:\n    import fcntl", True),
+        ("try:\n    import resource\nexcept ImportError:\n    pass", True),
+        ("try:\n    import resource\nexcept OSError:\n    pass", False),
+        ("def f():\n    if os.name == 'nt':\n        return\n    import pwd", True),
+        ("def f():\n    if x:\n        return\n    import pwd", False),
+        ("@posix\ndef f():\n    import pwd", True),
+    ],
+)
+def test_the_search_for_guards_finds_what_it_should(code: str, guarded: bool) -> None:
+    (node,) = [one for one in with_parents(ast.parse(code)) if isinstance(one, ast.Import)]
+    assert is_guarded(node) is guarded
+
+
+# --- the files of the repository ---
+
+
+def git(*arguments: str, given: str | None = None) -> str:
+    """What git says; the test is skipped where there is no git, or no repository."""
+    try:
+        result = subprocess.run(
+            ["git", "-C", str(ROOT), *arguments],
+            input=given,
+            capture_output=True,
+            encoding="utf-8",
+            check=True,
+        )
+    except (OSError, subprocess.CalledProcessError) as error:
+        pytest.skip(f"no git here: {error}")
+    return result.stdout
+
+
+def committed() -> list[str]:
+    """The names of all files that are in the repository, or would be with the next commit."""
+    said = git("ls-files", "--cached", "--others", "--exclude-standard", "-z")
+    return sorted(name for name in set(said.split("\0")) if name and (ROOT / name).exists())
+
+
+def faults_of(name: str) -> str:
+    """Why a file cannot have this name on Windows, or in a zip for it; empty if it can."""
+    device = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])(\..*)?", re.IGNORECASE)
+    for part in PurePosixPath(name).parts:
+        if device.fullmatch(part):
+            return "a device"
+        if re.search(r'[<>:"\\|?*\x00-\x1f]', part):
+            return "a character"
+        if part.endswith((".", " ")) or part.startswith(" "):
+            return "a dot or space at the end"
+        if not part.isascii():
+            return "a letter that systems store in different ways"
+    return "its length" if len(name) > 120 else ""  # of 259, the rest is the user's folder
+
+
+@pytest.mark.parametrize(
+    ("name", "fault"),
+    [
+        ("data/aux.csv", "a device"),
+        ("COM1", "a device"),
+        ("a/b:c.txt", "a character"),
+        ("a./b", "a dot or space at the end"),
+        ("été.txt", "a letter that systems store in different ways"),
+        ("a/" * 70, "its length"),
+        ("data/auxiliary.csv", ""),
+        (".ci/run", ""),
+    ],
+)
+def test_names_that_windows_cannot_have(name: str, fault: str) -> None:
+    assert faults_of(name) == fault
+
+
+def test_every_file_can_be_checked_out_anywhere() -> None:
+    names = committed()
+    assert {name: faults_of(name) for name in names if faults_of(name)} == {}
+    folders = {str(p) for name in names for p in PurePosixPath(name).parents}
+    alike = Counter(name.casefold() for name in [*names, *folders])
+    assert [name for name, count in alike.items() if count > 1] == []
+
+
+def test_there_are_no_links() -> None:
+    assert [row for row in git("ls-files", "--stage").splitlines() if row.startswith("120")] == []
+    assert [name for name in committed() if (ROOT / name).is_symlink()] == []
+
+
+def test_every_checkout_has_the_same_bytes() -> None:
+    """Text has one line feed a line on every system, and nothing else is touched."""
+    names = committed()
+    said = git("check-attr", "-z", "--stdin", "text", "eol", given="\0".join(names))
+    fields = said.split("\0")
+    rules: dict[str, dict[str, str]] = {}
+    for name, attribute, value in zip(fields[::3], fields[1::3], fields[2::3], strict=False):
+        rules.setdefault(name, {})[attribute] = value
+    for name in names:
+        content = (ROOT / name).read_bytes()
+        if rules[name]["text"] == "unset":
+            continue  # of a binary kind: git leaves it as it is
+        assert is_text(content), f".gitattributes: {name} is binary, name its kind there"
+        assert rules[name] == {"text": "auto", "eol": "lf"}, name
+        assert b"\r" not in content, f"{name} has carriage returns"
+
+
+def is_text(content: bytes) -> bool:
+    try:
+        return "\0" not in content.decode("utf-8")
+    except UnicodeDecodeError:
+        return False
+
+
+@pytest.mark.parametrize("kind", ["npz", "npy", "png", "jpg", "zip", "pdf", "bag", "db3"])
+def test_binary_kinds_are_named(kind: str) -> None:
+    said = git("check-attr", "text", "--", f"data/a.{kind}")
+    assert said.strip().endswith("text: unset")
+
+
+# --- the same pins for every Python and system ---
+
+
+REQUIREMENTS = ("requirements.txt", "requirements-camera.txt", "requirements-test.txt")
+PYTHONS = [f"3.{minor}" for minor in range(OLDEST[1], NEWEST_TESTED[1] + 1)]
+
+
+def chosen(file: str, python: str, system: str, machine: str) -> dict[str, list[str]]:
+    """The versions that a requirements file gives each package there."""
+    about = {
+        **SYSTEMS[system],
+        "python_version": python,
+        "python_full_version": f"{python}.4",
+        "platform_machine": machine,
+        "platform_python_implementation": "CPython",
+        "implementation_name": "cpython",
+    }
+    versions: dict[str, list[str]] = {}
+    for pin in pins(ROOT / file):
+        if not pin.marker or Marker(pin.marker).evaluate(about):
+            versions.setdefault(pin.name, []).append(pin.version)
+    return versions
+
+
+PLACES = (("linux", "x86_64"), ("linux", "aarch64"), ("win32", "AMD64"), ("darwin", "arm64"))
+
+
+@pytest.mark.parametrize("python", PYTHONS)
+@pytest.mark.parametrize("file", REQUIREMENTS)
+def test_one_version_of_each_package_for_every_system(file: str, python: str) -> None:
+    everywhere: dict[str, str] = {}
+    for place in PLACES:
+        for name, versions in chosen(file, python, *place).items():
+            assert len(versions) == 1, (name, place)
+            assert everywhere.setdefault(name, versions[0]) == versions[0], (name, place)
+
+
+@pytest.mark.parametrize("python", PYTHONS)
+def test_what_the_course_asks_for_is_pinned_for_every_system(python: str) -> None:
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    dependencies = tomllib.loads(text)["project"]["dependencies"]
+    wanted = {re.split(r"[<>=~! ]", one)[0].replace("_", "-").lower() for one in dependencies}
+    for place in PLACES:
+        names = {name.replace("_", "-").lower() for name in chosen(REQUIREMENTS[0], python, *place)}
+        assert wanted <= names, place
+    drivers = ["pyrealsense2" in chosen(REQUIREMENTS[1], python, *place) for place in PLACES]
+    assert drivers == [True, False, True, False]
+
+
+def test_the_oldest_python_is_the_same_everywhere() -> None:
+    import course
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert project["requires-python"] == ">=" + ".".join(map(str, OLDEST))
+    assert course.MINIMUM == OLDEST
+    assert course.RECOMMENDED in PYTHONS
+
+
+# --- the hub ---
+
+
+def test_the_hub_installs_the_courses_pins() -> None:
+    rows = (BINDER / "requirements.txt").read_text(encoding="utf-8").splitlines()
+    rows = [row for row in rows if row and not row.startswith("#")]
+    assert rows[:3] == ["--require-hashes", "--only-binary :all:", "-r ../requirements.txt"]
+    for row in rows[2:]:
+        option, name = row.split()
+        assert (option, (BINDER / name).is_file()) == ("-r", True)
+    python = (BINDER / "runtime.txt").read_text(encoding="utf-8").strip()
+    assert python.removeprefix("python-") in PYTHONS
+    allowed = {"README.md", "overrides.json", "postBuild", "requirements.txt", "runtime.txt"}
+    assert {path.name for path in BINDER.iterdir()} == allowed | {"start"}
+
+
+def test_what_the_hub_runs_exists() -> None:
+    """Scripts with line feeds and a first line, and every file and module that they name."""
+    import coursekit.warm_up
+
+    for name in ("postBuild", "start"):
+        content = (BINDER / name).read_bytes()
+        assert content.startswith(b"#!/bin/bash\n")
+        assert b"\r" not in content
+        if os.name != "nt":
+            assert (BINDER / name).stat().st_mode & stat.S_IXUSR
+    build = (BINDER / "postBuild").read_text(encoding="utf-8")
+    modules = re.findall(r"python -m (\S+)", build)
+    assert modules == ["pip", "coursekit.warm_up"]
+    assert callable(coursekit.warm_up.compile_all)
+    for name in re.findall(r"\.binder/\S+", build):
+        assert (ROOT / name).is_file()
+    import course
+
+    for word in course.EDITABLE:
+        assert f" {word}" in build
+    assert course.OVERRIDES.startswith("share/jupyter/lab/settings")
+    assert "share/jupyter/lab/settings" in build
+    settings = json.loads((BINDER / "overrides.json").read_text(encoding="utf-8"))
+    assert list(settings.values()) == [course.NO_NEWS]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a hub's images are Linux")
+class TestStart:
+    """The script that starts a student's server."""
+
+    @staticmethod
+    def start(home: Path, *command: str, **environment: str) -> str:
+        result = subprocess.run(
+            ["bash", str(BINDER / "start"), *command],
+            env={"HOME": str(home), "PATH": os.environ["PATH"], **environment},
+            capture_output=True,
+            encoding="utf-8",
+            check=True,
+        )
+        assert result.stderr == ""
+        return result.stdout
+
+    def variables(self, home: Path, **environment: str) -> dict[str, str]:
+        rows = self.start(home, "env", **environment).splitlines()
+        return dict(row.split("=", 1) for row in rows if "=" in row)
+
+    def test_the_simulated_camera_and_results_at_home(self, tmp_path: Path) -> None:
+        said = self.variables(tmp_path)
+        assert said["COURSEKIT_CAMERA"] == "simulated"
+        assert said["COURSEKIT_RESULTS"] == str(tmp_path / "results")
+        said = self.variables(tmp_path, COURSEKIT_CAMERA="auto", COURSEKIT_RESULTS="elsewhere")
+        assert (said["COURSEKIT_CAMERA"], said["COURSEKIT_RESULTS"]) == ("auto", "elsewhere")
+
+    @pytest.mark.parametrize(
+        ("limit", "threads"), [("4", "4"), ("1.5", "1"), ("0.5", "1"), (".5", "1"), ("", "2")]
+    )
+    def test_threads(self, tmp_path: Path, limit: str, threads: str) -> None:
+        said = self.variables(tmp_path, CPU_LIMIT=limit)
+        assert {said[f"{name}_NUM_THREADS"] for name in ("NUMBA", "OMP", "OPENBLAS")} == {threads}
+
+    def test_notebooks_come_home_once(self, tmp_path: Path) -> None:
+        self.start(tmp_path, "true")
+        there = tmp_path / "notebooks"
+        names = sorted(path.name for path in (ROOT / "notebooks").glob("[0-9]*.ipynb"))
+        assert sorted(path.name for path in there.iterdir()) == names
+        (there / names[0]).write_text("my answers", encoding="utf-8")
+        self.start(tmp_path, "true")
+        assert (there / names[0]).read_text(encoding="utf-8") == "my answers"
+
+    def test_where_the_project_is_the_home_folder_nothing_is_copied(self, tmp_path: Path) -> None:
+        self.start(tmp_path, "true", REPO_DIR=str(tmp_path))
+        assert list(tmp_path.iterdir()) == []
