@@ -144,7 +144,14 @@ def save(
 
 def load(lesson: str) -> Result:
     """Read `results/<lesson>.json`; FileNotFoundError if there is none, ValueError if damaged."""
-    path = _path(lesson)
+    try:
+        return read(_path(lesson))
+    except ValueError as error:
+        raise ValueError(f"{error}. Run notebook {lesson} again.") from error
+
+
+def read(path: Path) -> Result:
+    """A result in another folder; errors as for `load`."""
     content = read_json(path)
     try:
         if content.pop("format") != FORMAT:
@@ -156,7 +163,7 @@ def load(lesson: str) -> Result:
             raise ValueError(f"source is {result.source!r}")
         return result
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path.name}: {error}. Run notebook {lesson} again.") from error
+        raise ValueError(f"{path.name}: {error}") from error
 
 
 def save_arrays(lesson: str, **arrays: np.ndarray) -> Path:

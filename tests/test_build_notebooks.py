@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 
@@ -218,6 +219,69 @@ def test_these_are_no_machine_paths(text):
 
 def test_the_stored_notebooks_are_in_order():
     assert [text for path in build_notebooks.find([]) for text in problems(path)] == []
+
+
+# ---- repeating ----------------------------------------------------------------------------------
+
+
+def test_what_repeats_passes_and_nothing_is_written(built, built_text, monkeypatch, capsys):
+    monkeypatch.setattr(build_notebooks, "NOTEBOOKS", built.parent)
+    assert build_notebooks.main(["--check", "--run"]) == 0
+    first, second = capsys.readouterr().out.splitlines()
+    assert first == "01_toy twice ... the same"
+    assert re.fullmatch(r"2 executions, \d+ s", second)
+    assert built.read_text(encoding="utf-8") == built_text
+    assert list(built.parent.iterdir()) == [built]
+
+
+def test_cells_that_do_not_repeat_or_are_out_of_date_are_named(tmp_path, monkeypatch, capsys):
+    sources = {
+        "fine": "print('1')",
+        "drawn": "import random\nprint(f'{random.random():.9f}')",
+        "table": "from IPython.display import HTML, display\ndisplay(HTML('<b>2</b>'))",
+        "figure": PICTURE.format("b'one'"),
+        "other": PICTURE.format("bytes(random.sample(range(256), 9))"),
+    }
+    path = toy(sources, tmp_path / "01_toy.ipynb")
+    build_notebooks.build(path)
+    edit(path, change("table", outputs=data(**{"text/html": ["<b>3</b>"]})))
+    edit(path, lambda n: picture(n).update({"image/png": "AAAA"}))  # a pixel drawn elsewhere
+    monkeypatch.setattr(build_notebooks, "NOTEBOOKS", tmp_path)
+    assert build_notebooks.main(["--check", "--run"]) == 1
+    stored = "what is stored is not what an execution gives"
+    second = "the second execution gives something else than the first"
+    assert capsys.readouterr().out.splitlines()[:-1] == [
+        "01_toy twice ... differs or fails",
+        f"01_toy: cell drawn (stdout): {stored}",
+        f"01_toy: cell table (text/html, text/plain): {stored}",
+        f"01_toy: cell drawn (stdout): {second}",
+        f"01_toy: cell other (image/png): {second}",
+    ]
+
+
+PICTURE = (
+    "import base64\nshown = base64.b64encode({}).decode()\n"
+    "display({{'image/png': shown, 'text/plain': '<Figure>'}}, raw=True)"
+)
+
+
+def picture(notebook):
+    return cell_of(notebook, "figure")["outputs"][0]["data"]
+
+
+def test_a_cell_that_fails_is_named_when_run_for_a_check(tmp_path, monkeypatch, capsys):
+    path = toy({"once": "print('1')"}, tmp_path / "01_toy.ipynb")
+    build_notebooks.build(path)
+    edit(path, change("once", source=["1 / 0"]))
+    monkeypatch.setattr(build_notebooks, "NOTEBOOKS", tmp_path)
+    assert build_notebooks.main(["--check", "--run"]) == 1
+    assert "01_toy, cell once: ZeroDivisionError: division by zero" in capsys.readouterr().out
+
+
+def test_run_without_check_is_refused(capsys):
+    with pytest.raises(SystemExit):
+        build_notebooks.main(["--run"])
+    assert "--run belongs to --check" in capsys.readouterr().err
 
 
 # ---- what nbval makes of it ---------------------------------------------------------------------

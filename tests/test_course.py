@@ -41,8 +41,8 @@ def project(tmp_path: Path, course: ModuleType) -> Path:
         (root / folder).mkdir(parents=True)
     (root / "course.py").write_bytes((ROOT / "course.py").read_bytes())
     for name in {name for step in course.STEPS for name in step.inputs}:
-        (root / name).write_text(f"# {name}\n")
-    (root / "tools/bench.py").write_text("print('bench ran')\n")
+        (root / name).write_text(f"# {name}\n", encoding="utf-8")
+    (root / "tools/bench.py").write_text("print('bench ran')\n", encoding="utf-8")
     (root / "stand-ins/ensurepip").mkdir(parents=True)
     (root / "stand-ins/ensurepip/__init__.py").touch()
     (root / "stand-ins/ensurepip/__main__.py").write_text(
@@ -52,7 +52,8 @@ def project(tmp_path: Path, course: ModuleType) -> Path:
         f"(folder / 'pip/__main__.py').write_text({PIP!r})\n"
         "(folder / 'coursekit').mkdir()\n"
         "(folder / 'coursekit/__init__.py').touch()\n"
-        "(folder / 'coursekit/warm_up.py').touch()\n"
+        "(folder / 'coursekit/warm_up.py').touch()\n",
+        encoding="utf-8",
     )
     return root
 
@@ -87,7 +88,7 @@ def run(root: Path, *arguments: str, **environment: str) -> tuple[int, str]:
 def calls(root: Path) -> list[str]:
     """What pip was asked to install since the last look."""
     file = root / "calls.txt"
-    lines = file.read_text().splitlines() if file.exists() else []
+    lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
     file.unlink(missing_ok=True)
     return [line.split()[-1] for line in lines]
 
@@ -95,8 +96,8 @@ def calls(root: Path) -> list[str]:
 def pip_waiting(root: Path) -> int:
     """The process number of the stand-in for pip, once it waits."""
     for _ in range(1000):
-        if (root / "pid").exists() and (root / "pid").read_text().endswith("."):
-            return int((root / "pid").read_text()[:-1])
+        if (root / "pid").exists() and (root / "pid").read_text(encoding="utf-8").endswith("."):
+            return int((root / "pid").read_text(encoding="utf-8")[:-1])
         time.sleep(0.02)
     raise TimeoutError("the stand-in for pip did not start")
 
@@ -121,10 +122,12 @@ def test_first_run_installs_and_second_run_does_nothing(project: Path) -> None:
     code, output = run(project)
     assert (code, calls(project)) == (0, ALL), output
     assert "Setting up the course" in output
-    log = (project / "build/setup.log").read_text()
+    log = (project / "build/setup.log").read_text(encoding="utf-8")
     assert log.count("--require-hashes --only-binary :all: -r requirements") == 2
     overrides = project / ".venv/share/jupyter/lab/settings/overrides.json"
-    notification = json.loads(overrides.read_text())["@jupyterlab/apputils-extension:notification"]
+    notification = json.loads(overrides.read_text(encoding="utf-8"))[
+        "@jupyterlab/apputils-extension:notification"
+    ]
     assert notification == {"fetchNews": "false", "checkForUpdates": False}
 
     before = (project / "build/setup.log").stat().st_mtime_ns
@@ -143,20 +146,22 @@ def test_only_what_changed_is_installed_again_in_place(project: Path) -> None:
         ("pyproject.toml", ["."]),
         ("requirements-test.txt", []),  # only "test" needs it
     ):
-        (project / changed).write_text("# changed\n")
+        (project / changed).write_text("# changed\n", encoding="utf-8")
         code, output = run(project)
         assert (code, calls(project)) == (0, wanted), output
     assert (project / ".venv/kept").exists()
-    (project / "coursekit/kernels.py").write_text("# changed\n")
+    (project / "coursekit/kernels.py").write_text("# changed\n", encoding="utf-8")
     code, output = run(project)
     assert (code, calls(project), "Fast parts: done" in output) == (0, [], True)
 
 
 def test_test_adds_its_tools_runs_every_check_and_names_those_that_failed(project: Path) -> None:
-    (project / "tools/build_notebooks.py").write_text("print('checked the notebooks')\n")
+    (project / "tools/build_notebooks.py").write_text(
+        "print('checked the notebooks')\n", encoding="utf-8"
+    )
     for name, status in (("ruff", 0), ("mypy", 3), ("pytest", 0)):
         lines = f"import sys; print('{name}', *sys.argv[1:]); sys.exit({status})"
-        (project / f"{name}.py").write_text(lines)
+        (project / f"{name}.py").write_text(lines, encoding="utf-8")
     code, output = run(project, "test", "-k", "some")
     assert "requirements-test.txt" in calls(project)
     assert code == 1
@@ -170,16 +175,19 @@ def test_test_adds_its_tools_runs_every_check_and_names_those_that_failed(projec
         "-- stored outputs of the notebooks",
         "checked the notebooks",
         "-- pytest",
-        "pytest -k some",
+        "pytest -n 2 --dist loadscope --no-loadscope-reorder -k some",
         "Failed: mypy",
     ]
-    (project / "mypy.py").write_text("")
+    (project / "mypy.py").write_text("", encoding="utf-8")
     code, output = run(project, "test")
-    assert (code, output.splitlines()[-1]) == (0, "pytest")
+    assert (code, output.splitlines()[-1]) == (
+        0,
+        "pytest -n 2 --dist loadscope --no-loadscope-reorder",
+    )
 
 
 @posix
-@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.parametrize("end", [getattr(signal, "SIGKILL", signal.SIGTERM), signal.SIGTERM])
 def test_interrupted_set_up_is_made_anew(project: Path, end: signal.Signals) -> None:
     child = start(project, WAIT="requirements.txt")
     pip = pip_waiting(project)
@@ -232,13 +240,13 @@ def test_moved_folder_and_vanished_python_are_repaired(project: Path) -> None:
 def test_environment_of_somebody_else_is_left_alone(project: Path) -> None:
     theirs = project / ".venv/pyvenv.cfg"
     theirs.parent.mkdir()
-    theirs.write_text("home = elsewhere")
+    theirs.write_text("home = elsewhere", encoding="utf-8")
     code, output = run(project)
     assert code == 1
     assert "was not made by course.py, so it stays as it is" in output
     assert "Rename it" in output
     assert list(theirs.parent.iterdir()) == [theirs]
-    assert theirs.read_text() == "home = elsewhere"
+    assert theirs.read_text(encoding="utf-8") == "home = elsewhere"
 
 
 @posix
@@ -272,7 +280,7 @@ def test_failed_set_up_says_why_and_names_the_log(project: Path) -> None:
     assert "the network did not answer" in output
     assert "bench ran" not in output
     log = Path(output.splitlines()[-1].removeprefix("The full output is in "))
-    assert failure in log.read_text()
+    assert failure in log.read_text(encoding="utf-8")
     code, output = run(project)
     assert (code, calls(project), "Replacing" in output) == (0, ALL, False)
 
@@ -372,7 +380,7 @@ def test_cause_is_recognised(course: ModuleType, wanted: str, said: str) -> None
 
 def stand_in(folder: Path, name: str, status: int) -> None:
     file = folder / name
-    file.write_text(f"#!/bin/sh\nexit {status}\n")
+    file.write_text(f"#!/bin/sh\nexit {status}\n", encoding="utf-8")
     file.chmod(0o755)
 
 

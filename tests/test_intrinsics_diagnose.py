@@ -24,7 +24,8 @@ from coursekit.intrinsics import causes, extended
 from coursekit.intrinsics.diagnose import blur_lengths_px, diagnose
 from coursekit.intrinsics.fit import calibrate
 from coursekit.intrinsics.metric_scale import depth_at_corners, depth_scale, robot_scale
-from coursekit.intrinsics.power import power, stored_power
+from coursekit.intrinsics.power import stored_power
+from coursekit.simulation.diagnosis_power import power
 from coursekit.simulation.sessions import Effects, Truth, corner_session
 
 NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from coursekit.boards import Board
 from coursekit.geometry import Intrinsics
-from coursekit.intrinsics.power import power
+from coursekit.simulation.diagnosis_power import power
 from coursekit.simulation.sessions import (
     Effects,
     Truth,

@@ -3,6 +3,8 @@
 build_notebooks.py [NAME ...]             execute, normalise and store in place
 build_notebooks.py --into DIR [NAME ...]  execute copies into DIR, on the real camera if any
 build_notebooks.py --check [NAME ...]     say what is wrong with the stored notebooks
+build_notebooks.py --check --run [...]    and execute each twice, which must give the same bytes,
+                                          and what is stored but for figures; nothing is written
 """
 
 from __future__ import annotations
@@ -16,6 +18,8 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +44,8 @@ METADATA = {
 }
 PER_RUN = {"collapsed", "ExecuteTime", "execution", "scrolled", "trusted"}  # cell metadata
 WIDGET_VIEW = "application/vnd.jupyter.widget-view+json"
+FIGURES = frozenset({"image/png"})  # another release of a library rounds a pixel's shade otherwise
+NOTHING: frozenset[str] = frozenset()
 LONGEST_CELL = 15
 CELL_TIMEOUT_S = 600
 PARTS = ("stub", "check", "answer")
@@ -96,12 +102,18 @@ def execute(notebook: Any, name: str, folder: Path, environment: Mapping[str, st
 
 def build(path: Path) -> int:
     """Execute a notebook and store it in place, normalised; returns the number of code cells."""
+    notebook = _executed(path)
+    _store(path, notebook)
+    return len(code_cells(notebook))
+
+
+def _executed(path: Path) -> Any:
+    """The notebook as it would be stored after an execution now."""
     notebook = _load(path)
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
         execute(notebook, path.stem, path.parent, kernel_environment(Path(scratch)))
     normalise(notebook)
-    _store(path, notebook)
-    return len(code_cells(notebook))
+    return notebook
 
 
 def execute_copy(path: Path, into: Path) -> int:
@@ -271,6 +283,43 @@ def _of_exercises(notebook: Notebook) -> Iterator[str]:
                     yield f"cell {cell.get('id')}: does not define {function}()"
 
 
+# ---- repeating ----------------------------------------------------------------------------------
+
+
+def repeat(path: Path) -> list[str]:
+    """Execute a notebook twice and say what differs, one line each; nothing is stored."""
+    import nbformat
+
+    first, second = _executed(path), _executed(path)
+    found = [
+        f"{cell}: what is stored is not what an execution gives"
+        for cell in _differing(_load(path), first, FIGURES)
+    ]
+    found += [
+        f"{cell}: the second execution gives something else than the first"
+        for cell in _differing(first, second)
+    ]
+    if not found and nbformat.writes(first) != nbformat.writes(second):
+        found = ["two executions differ outside the content of outputs"]
+    return [f"{path.stem}: {text}" for text in found]
+
+
+def _differing(before: Notebook, after: Notebook, but: frozenset[str] = NOTHING) -> Iterator[str]:
+    """The code cells whose outputs differ, each with the kinds of output that do."""
+    for old, new in zip(code_cells(before), code_cells(after), strict=True):
+        both = zip_longest(_kinds(old), _kinds(new), fillvalue=("", None))
+        kinds = {kind or other for (kind, a), (other, b) in both if (kind, a) != (other, b)} - but
+        if kinds:
+            yield f"cell {old.get('id')} ({', '.join(sorted(kinds))})"
+
+
+def _kinds(cell: Cell) -> Iterator[tuple[str, Any]]:
+    """What a cell's outputs consist of: (stream name or MIME type, content)."""
+    for output in cell["outputs"]:
+        yield output.get("name", output["output_type"]), output.get("text")
+        yield from sorted(output.get("data", {}).items())
+
+
 # ---- the command line ---------------------------------------------------------------------------
 
 
@@ -292,6 +341,22 @@ def check(paths: list[Path]) -> int:
     if found:
         print(f"{len(found)} problems. After an edit, run: python tools/build_notebooks.py")
     return 1 if found else 0
+
+
+def check_by_running(paths: list[Path]) -> int:
+    """Two notebooks at a time: each has one busy process, and most computers have two cores."""
+    started, failed = time.monotonic(), 0
+    with ThreadPoolExecutor(2) as pool:
+        for path, result in [(path, pool.submit(repeat, path)) for path in paths]:
+            print(f"{path.stem} twice ... ", end="", flush=True)
+            try:
+                found = result.result()
+            except (NotebookFailed, ValueError) as error:
+                found = [str(error)]
+            failed += bool(found)
+            print("differs or fails" if found else "the same", *found, sep="\n", flush=True)
+    print(f"{2 * len(paths)} executions, {time.monotonic() - started:.0f} s")
+    return 1 if failed else 0
 
 
 def run(paths: list[Path], into: Path | None) -> int:
@@ -317,12 +382,17 @@ def main(arguments: list[str] | None = None) -> int:
     mode = parser.add_mutually_exclusive_group()
     mode.add_argument("--into", type=Path, metavar="DIR")
     mode.add_argument("--check", action="store_true")
+    parser.add_argument("--run", action="store_true", help="with --check: execute, and compare")
     asked = parser.parse_args(arguments)
+    if asked.run and not asked.check:
+        parser.error("--run belongs to --check; without either, the notebooks are executed anyway")
     try:
         paths = find(asked.names)
     except ValueError as error:
         parser.error(str(error))
-    return check(paths) if asked.check else run(paths, asked.into)
+    if not asked.check:
+        return run(paths, asked.into)
+    return check(paths) or (check_by_running(paths) if asked.run else 0)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,8 @@ from coursekit.budget.handover import REFERENCE
 from coursekit.cameras.capture import session_card
 from coursekit.cameras.simulated import SimulatedCamera
 from coursekit.hand_eye.poses import Mount
-from coursekit.intrinsics.power import STORED, power
+from coursekit.intrinsics.power import STORED
+from coursekit.simulation.diagnosis_power import power
 from coursekit.results import Quantity, write_bytes, write_json
 from coursekit.simulation.hand_eye_sessions import SIMULATED, rendered_session
 from coursekit.simulation.sessions import Effects, view_poses

@@ -296,7 +296,7 @@ def _find(lesson: str, reference: Path) -> Found:
 def _stand_in(path: Path) -> tuple[Result | None, str]:
     """The reference, and what becomes of the rows that need it."""
     try:
-        return _read(path), "the reference is used"
+        return results.read(path), "the reference is used"
     except FileNotFoundError:
         return None, f"and there is no reference {path.name}"
     except ValueError as error:
@@ -315,19 +315,6 @@ def _lacking(lesson: str, result: Result) -> tuple[str, ...]:
 
 def _first(quantities: dict[str, Quantity], names: str) -> str | None:
     return next((name for name in names.split("|") if name in quantities), None)
-
-
-def _read(path: Path) -> Result:
-    """A reference file; it has the format of `results`, in another folder."""
-    content = results.read_json(path)
-    try:
-        if content.pop("format") != results.FORMAT:
-            raise ValueError("written by another version of the course")
-        quantities = {k: Quantity(**v) for k, v in content.pop("quantities").items()}
-        covariances = {k: Covariance(**v) for k, v in content.pop("covariances", {}).items()}
-        return Result(**content, quantities=quantities, covariances=covariances)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path.name}: {error}") from error
 
 
 def _root(matrix: Floats) -> Floats:

@@ -25,6 +25,7 @@ from coursekit.boards import Board, BoardNotFound, Detection, Detections, detect
 from coursekit.boards.folder import SESSION
 from coursekit.geometry import invert_transform, project, transform_points
 from coursekit.hand_eye.poses import Mount, camera_board, check_mount, turned
+from coursekit.hand_eye.session import HandEyeSession
 from coursekit.simulation.board_images import render_board
 from coursekit.simulation.hand_eye_poses import (
     BORDER_PX,
@@ -42,8 +43,6 @@ from coursekit.specifications import device
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    from coursekit.hand_eye.session import HandEyeSession
 
     Floats = NDArray[np.float64]
 
@@ -384,8 +383,6 @@ def _reported(
     truth: HandEyeTruth, q: Floats, dq: Floats, seen: Detections
 ) -> tuple[HandEyeSession, HandEyeTruth]:
     """The session as a student has it, mistakes and all."""
-    from coursekit.hand_eye.session import HandEyeSession  # imports this room, by intrinsics.power
-
     setup, mistakes = truth.setup, truth.mistakes
     if mistakes.degrees == "joints":
         q = np.asarray(np.degrees(q), np.float64)
