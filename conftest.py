@@ -4,13 +4,19 @@ This file is beside the notebooks' folder, not in tests/, so that it holds for `
 """
 
 import os
+import random
 import tempfile
+from itertools import chain
 from pathlib import Path
 
 import pytest
 
 from tools.build_notebooks import kernel_environment
 
+# Before NumPy is loaded: two processes of tests with two threads each wait for one another, and the
+# digits of a test should not depend on how many cores a computer has. Numba's threads change none.
+for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(threads, "1")
 SCRATCH = pytest.StashKey[Path]()
 
 
@@ -19,6 +25,18 @@ def pytest_configure(config):
     config.add_cleanup(scratch.cleanup)
     config.stash[SCRATCH] = Path(scratch.name)
     os.environ["COURSEKIT_RESULTS"] = str(Path(scratch.name) / "results")
+
+
+def pytest_collection_modifyitems(items):
+    """COURSEKIT_SHUFFLE=7 shuffles the modules and the tests in each, but not the cells."""
+    if seed := os.environ.get("COURSEKIT_SHUFFLE"):
+        order, modules = random.Random(seed), {}
+        for item in items:
+            modules.setdefault(item.path, []).append(item)
+        for module in modules.values():
+            if module[0].path.suffix != ".ipynb":
+                order.shuffle(module)
+        items[:] = chain.from_iterable(order.sample(list(modules.values()), len(modules)))
 
 
 @pytest.hookimpl(wrapper=True)

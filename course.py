@@ -4,6 +4,7 @@ python3 course.py lab     open the notebooks in JupyterLab (more options: those 
 python3 course.py test    check everything (more options: those of pytest)
 python3 course.py run     execute every notebook into build/, without a browser
 python3 course.py bench   time the parts that must be fast
+python3 course.py site    make web pages of the notebooks, to read without running: build/site/
 
 The first of these makes the folder .venv and installs everything into it, once.
 To take it all away again, delete the project folder.
@@ -133,6 +134,8 @@ KERNELS = (
 )
 COMPILED = (COURSE, *(f"coursekit/{name}.py" for name in KERNELS))
 COMPILE = ("-m", "coursekit.warm_up")
+# A module's tests, and the cells of a notebook, stay together in one of the two processes.
+TWO_PROCESSES = ("-n", "2", "--dist", "loadscope", "--no-loadscope-reorder")
 STEPS = (
     Step("course", "Packages", (COURSE,), (*HASHED, COURSE)),
     Step("test", "Test tools", (TEST,), (*HASHED, TEST)),
@@ -363,7 +366,7 @@ def set_up(for_tests: bool = False) -> None:
 def locked() -> Iterator[None]:
     """Let one course.py at a time change .venv; the system frees the lock when its holder ends."""
     LOCK.parent.mkdir(exist_ok=True)
-    with LOCK.open("a") as file:
+    with LOCK.open("ab") as file:
         os.set_inheritable(file.fileno(), True)
         if not try_lock(file):
             print("Another set-up of this folder is under way: waiting for it to end.")
@@ -372,7 +375,7 @@ def locked() -> Iterator[None]:
         yield
 
 
-def try_lock(file: IO[str]) -> bool:
+def try_lock(file: IO[bytes]) -> bool:
     try:
         if sys.platform == "win32":
             msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
@@ -470,7 +473,7 @@ def test(arguments: list[str]) -> int:
         ("ruff format", ("-m", "ruff", "format", "--check")),
         ("mypy", ("-m", "mypy")),
         ("stored outputs of the notebooks", ("tools/build_notebooks.py", "--check")),
-        ("pytest", ("-m", "pytest", *arguments)),
+        ("pytest", ("-m", "pytest", *TWO_PROCESSES, *arguments)),
     )
     failed = []
     for name, command in checks:
@@ -492,12 +495,17 @@ def bench(arguments: list[str]) -> int:
     return run_python("tools/bench.py", *arguments)
 
 
+def site(arguments: list[str]) -> int:
+    set_up()
+    return run_python("-m", "tools.build_site", *arguments)
+
+
 def interrupt(*_: object) -> None:
     raise KeyboardInterrupt
 
 
 def main(arguments: list[str]) -> int:
-    commands = {"lab": lab, "test": test, "run": run, "bench": bench}
+    commands = {"lab": lab, "test": test, "run": run, "bench": bench, "site": site}
     command = arguments[0] if arguments else ""
     if command not in commands:
         print(__doc__)
