@@ -6,6 +6,7 @@ give a ratio that means something. Medians are printed, with the quartiles behin
 
 from __future__ import annotations
 
+import functools
 import os
 import subprocess
 import sys
@@ -18,9 +19,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from coursekit import boards, geometry, intrinsics, simulation, specifications, stereo
+from coursekit import (
+    boards,
+    budget,
+    geometry,
+    hand_eye,
+    intrinsics,
+    simulation,
+    specifications,
+    stereo,
+)
 from coursekit.cameras.librealsense import LibraryMissing, load_librealsense
 from coursekit.geometry import Intrinsics
+from coursekit.simulation.hand_eye_sessions import hand_eye_session
 from coursekit.simulation.sessions import corner_session
 from coursekit.submission.batch import grade_folder
 from coursekit.submission.bundle import bundle_bytes
@@ -203,6 +214,40 @@ def bench_intrinsics() -> list[Row]:
     ]  # fmt: skip
 
 
+def bench_hand_eye() -> list[Row]:
+    """X refined on reprojection errors, with its covariance, against one of OpenCV's solvers."""
+    session, _ = hand_eye_session("eye_in_hand", seed=0)
+    solve = functools.partial(hand_eye.solve, session.T_base_gripper, session.T_camera_board)
+
+    def refined() -> object:
+        return session.solve()
+
+    def park() -> object:
+        return solve(session.mount, "park")
+
+    times = in_turn(20, refined, park)
+    seconds = f"{1000 * np.median(times[0]):.0f} ms, wanted: below 2000"
+    return [Row(f"X refined, {len(session)} poses", "OpenCV's Park", times, seconds)]
+
+
+def bench_budget() -> list[Row]:
+    """A million samples of the whole chain, against drawing that many random numbers."""
+    view = budget.lesson_view()
+    twist = np.diag([1e-5] * 3 + [1e-6] * 3)
+    covariances = budget.Covariances(np.eye(2), 7e-4, np.eye(4), hand_eye=twist, arm=twist)
+    n = 1_000_000
+
+    def samples() -> object:
+        return budget.monte_carlo(budget.Chain(view), covariances, n, seed=0)
+
+    def numbers() -> object:
+        return np.random.default_rng(0).standard_normal((19, n))
+
+    times = in_turn(5, samples, numbers)
+    seconds = f"{np.median(times[0]):.2f} s, wanted: below 2"
+    return [Row("Monte Carlo, 1e6 samples", "19e6 normal numbers", times, seconds)]
+
+
 def bench_grading() -> list[Row]:
     """A bundle graded, with its page, against the statistics in it; and a folder of them."""
     whole = full_size_submission()
@@ -268,6 +313,8 @@ def main() -> None:
         *bench_deproject(),
         *bench_stereo(),
         *bench_intrinsics(),
+        *bench_hand_eye(),
+        *bench_budget(),
         *bench_grading(),
         bench_import(),
     ]:

@@ -25,8 +25,8 @@ from coursekit.cameras.capture import session_card
 from coursekit.cameras.simulated import SimulatedCamera
 from coursekit.hand_eye.poses import Mount
 from coursekit.intrinsics.power import STORED
-from coursekit.simulation.diagnosis_power import power
 from coursekit.results import Quantity, write_bytes, write_json
+from coursekit.simulation.diagnosis_power import power
 from coursekit.simulation.hand_eye_sessions import SIMULATED, rendered_session
 from coursekit.simulation.sessions import Effects, view_poses
 from coursekit.specifications import DATA
