@@ -54,7 +54,7 @@ REMEDY: dict[Verdict, str] = {
     "help",
     "pose_dependent": "let the calibration estimate the arm's joint zeros, or calibrate where you "
     "grasp; a camera that is turned (fixed camera) or a shifted finger or wrist camera looks like "
-    "this too, and the shares below say which is likelier",
+    "this too, and the shares of the scatter say which is likelier",
     "cannot_tell_yet": "repeat the grasp, at places and turns all over the table",
 }
 ELSEWHERE = "grasp in other places, all over the table"

@@ -196,7 +196,7 @@ CHECKPOINTS = (
         value=5 * math.tan(math.radians(43.5)),
         unit="mm",
         why="The edge is 43.5 degrees off the axis, and depth leaks sideways with the tangent of "
-        "that angle, 0.95. A depth error is a lateral error, except in the middle of the image.",
+        "that angle, 0.95. A depth error is a sideways error, except in the middle of the image.",
         classics=(
             Classic(
                 0.0,

@@ -580,7 +580,7 @@ CHECKPOINTS = (
     ),
     Choice(
         name="intrinsics.bowed_board",
-        question="The board is a sheet of paper whose middle stands 1 mm proud of its rim. Thirty "
+        question="The board is a sheet of paper whose middle is 1 mm higher than its rim. Thirty "
         "views with all the tilt that one could wish. What happens?",
         options=(
             Option(
@@ -597,7 +597,7 @@ CHECKPOINTS = (
                 "RMS stays below 0.4 px, but fx is wrong by two to three percent, and k1 with it",
                 "The fit has no parameter for the bow, so it uses the ones it has: a smaller fx (a "
                 "larger one if the board is hollow), another k1. fx comes with a small stated "
-                "sigma, and is many of them wrong.",
+                "sigma, and is wrong by many of these sigmas.",
                 right=True,
             ),
             Option(
