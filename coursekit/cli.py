@@ -89,7 +89,8 @@ def _add_submit(commands: Any) -> None:
     submit.add_argument("--student", required=True, metavar="NAME", help="as your course knows it")
     submit.add_argument("--distance", type=float, metavar="M", help="where the camera will be, m")
     submit.add_argument("--frames", type=int, default=1, metavar="N", help="averaged there")
-    submit.add_argument("--dominates", choices=("bias", "noise"), help="which error, there")
+    choices = ("bias", "noise")
+    submit.add_argument("--dominates", type=str.lower, choices=choices, help="which error, there")
     words = submit.add_mutually_exclusive_group()
     words.add_argument("--paragraph", default="", metavar="TEXT", help="three sentences: why")
     words.add_argument("--paragraph-file", metavar="FILE", help="a text file that holds them")
@@ -153,7 +154,13 @@ def _submit(options: argparse.Namespace) -> None:
 
     paragraph = options.paragraph
     if options.paragraph_file:
-        paragraph = Path(options.paragraph_file).read_text(encoding="utf-8")
+        try:
+            paragraph = Path(options.paragraph_file).read_text(encoding="utf-8-sig")
+        except UnicodeDecodeError:
+            raise ValueError(
+                f"{options.paragraph_file}: is no plain text in UTF-8; save it as that (in Word or "
+                "Notepad: plain text, encoding UTF-8) and try again"
+            ) from None
     handed = submit(
         options.student,
         options.distance,

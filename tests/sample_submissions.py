@@ -244,6 +244,11 @@ def with_claims(submission: Submission, **changes: Any) -> Submission:
     return replace(submission, claims=replace(submission.claims, **changes))
 
 
+def predicting(plot: Plot, factor: float) -> Plot:
+    """The plot with a prediction that is so many times its own."""
+    return replace(plot, predicted_mm=tuple(factor * mm for mm in plot.predicted_mm or ()))
+
+
 def mistaken(seed: int = 0) -> dict[str, tuple[str, Submission]]:
     """One wrong submission for each named mistake: {mistake: (item's topic, submission)}."""
     # Depths in tenths of a millimetre, a bias and holes: mistakes that would hide otherwise show.
@@ -333,15 +338,8 @@ def mistaken(seed: int = 0) -> dict[str, tuple[str, Submission]]:
             "plot",
             replace(good, plot=replace(good.plot, predicted_mm=good.plot.measured_mm)),
         ),
-        "no_prediction": (
-            "plot",
-            replace(
-                good,
-                plot=Plot(
-                    good.plot.distances_m[:2], good.plot.measured_mm[:2], good.plot.predicted_mm[:2]
-                ),
-            ),
-        ),
+        "off_scale": ("plot", replace(good, plot=predicting(good.plot, 2.5))),
+        "no_prediction": ("plot", replace(good, plot=replace(good.plot, predicted_mm=None))),
         "other_dominates": (
             "verdict",
             replace(good, conclusion=replace(good.conclusion, dominates="noise")),

@@ -60,7 +60,7 @@ def report(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("samples") / "report"
     said = str(grade_folder(SAMPLES, out, workers=2, progress=False))
     assert said.startswith("9 bundles in ")
-    assert "5 graded, 4 refused, 2 flagged." in said
+    assert "5 graded, 4 refused, 4 flagged." in said
     return out
 
 
@@ -84,15 +84,18 @@ def test_every_sample_bundle_has_its_row_in_the_order_of_names(report):
 
 def test_copies_are_flagged_and_cost_nothing(report):
     flags = {row["file"].removesuffix(".zip"): row["flags"] for row in table(report)}
-    assert flags["ada_good"] == flags["dan_copied"] == "nearly_identical"
-    assert flags["ben_weak"] == flags["eve_formula"] == ""  # the simulated camera is everybody's
+    assert flags["ada_good"] == flags["dan_copied"] == "nearly_identical same_words"
+    assert flags["eve_formula"] == flags["ada_good"]  # of the same simulated camera, by right
+    assert flags["cleo_wrong"] == "same_words"
+    assert flags["ben_weak"] == ""
     assert {r["percent"] for r in table(report) if "dan" in r["file"]} == {"100.0"}
 
 
 def test_what_students_wrote_stays_text(report):
     (row,) = [row for row in table(report) if row["file"] == "eve_formula.zip"]
     assert row["student"].startswith("'=HYPERLINK")
-    for page in (report / "index.html", *(report / "students").iterdir()):
+    pages = [report / "index.html", report / "paragraphs.html"]
+    for page in (*pages, *(report / "students").iterdir()):
         text = page.read_text(encoding="utf-8")
         assert "<script" not in text
         assert "&lt;script&gt;" in text or "eve_formula" not in page.name
@@ -100,7 +103,7 @@ def test_what_students_wrote_stays_text(report):
 
 def test_the_report_holds_a_page_a_student_and_nothing_else(report):
     assert sorted(path.name for path in report.iterdir()) == sorted(
-        [".rows", "grades.csv", "index.html", "students"]
+        [".rows", "grades.csv", "index.html", "paragraphs.html", "students"]
     )
     pages = sorted(path.name for path in (report / "students").iterdir())
     assert [page.rpartition("_")[0] for page in pages] == list(GRADED)
@@ -123,7 +126,11 @@ def test_a_batch_grades_as_the_rubric_does(tmp_path):
     path = write_bundle(tmp_path / "a.zip", whole)
     line, page = grade_file(str(path), "a.zip", "students/a.html")
     found = grade(whole)
-    assert (line.points, line.of, line.items) == (found.points, found.of, found.items)
+    assert (line.points, line.of) == (found.points, found.of)
+    assert [(i.name, i.points, i.of, i.verdict, i.mistake) for i in line.items] == [
+        (i.name, i.points, i.of, i.verdict, i.mistake) for i in found.items
+    ]
+    assert (line.made, line.paragraph) == (whole.made, whole.conclusion.paragraph)
     assert line.page == "students/a.html"
     assert page.startswith("<!doctype html>")
 
@@ -152,7 +159,7 @@ def misbehave(path: str, name: str, page: str) -> tuple[Line, str]:
         while True:
             pass
     if "kill" in name:
-        os.kill(os.getpid(), signal.SIGKILL)
+        os.kill(os.getpid(), getattr(signal, "SIGKILL", signal.SIGTERM))
     if "crash" in name:
         os.abort()
     if "exit" in name:
@@ -348,6 +355,29 @@ def test_only_bundles_are_looked_at(tmp_path):
     assert names == ["A.zip", "UPPER.ZIP", "b.zip", "late/Ada_17/studio.zip"]
     again = grade_folder(folder, folder / "report", 1, progress=False, overwrite=True)
     assert again.kept == 4  # the report in the folder is no bundle of it
+    other = grade_folder(folder, folder / "second", 1, progress=False)
+    assert other.left_out == ("essay.pdf",)  # nor is one of an earlier run
+    (folder / "report" / "thesis.tex").write_bytes(b"")
+    third = grade_folder(folder, tmp_path / "third", 1, progress=False)
+    assert "report/thesis.tex" in third.left_out  # no report of ours any more
+
+
+def test_what_is_kept_of_a_bundle_may_go_and_the_report_says_so(tmp_path, monkeypatch):
+    folder, out = quick(tmp_path / "in", "ab"), tmp_path / "out"
+    real = batch._load
+    monkeypatch.setattr(batch, "_load", lambda out, b: None if b.name == "a.zip" else real(out, b))
+    summary = grade_folder(folder, out, 1, progress=False)
+    assert (summary.graded, summary.failed) == (1, 1)
+    assert [row["status"] for row in table(out)] == ["not graded: lost", "graded"]
+
+
+def test_a_student_with_two_bundles_has_two_rows_one_of_which_counts(tmp_path):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for name, made in (("a", "2026-03-03T10:00:00+00:00"), ("b", "2026-03-02T10:00:00+00:00")):
+        write_bundle(folder / f"{name}.zip", replace(tiny(student="Ann"), made=made))
+    grade_folder(folder, tmp_path / "out", 1, progress=False)
+    assert [row["counts"] for row in table(tmp_path / "out")] == ["yes", "no"]
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names")
@@ -418,8 +448,8 @@ def test_a_folder_with_anything_else_in_it_is_not_touched(what, tmp_path):
     ("change", "message"),
     [
         ({"folder": "nowhere"}, "there is no such folder"),
-        ({"folder": "empty"}, "there is no bundle"),
-        ({"folder": "papers"}, "only 1 other file"),
+        ({"folder": "empty"}, r"there is no bundle \(.zip\) in it or below it; want"),
+        ({"folder": "papers"}, "in it, only 1 other file; want"),
         ({"workers": 0}, "workers: got 0"),
         ({"timeout_s": 0.0}, "timeout_s: got 0.0"),
         ({"timeout_s": float("nan")}, "timeout_s: got nan"),

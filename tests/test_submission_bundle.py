@@ -74,6 +74,7 @@ def test_what_goes_in_comes_out(tmp_path: Path) -> None:
     [
         {"plot": None, "claims": Claims(), "conclusion": Conclusion(), "outcomes": {}},
         {"stacks": ()},
+        {"plot": Plot((0.3, 0.45), (0.3, 0.6), None)},
         {"camera": CameraFacts(**CAMERA | {"baseline_m": None, "serial": ""})},
         {"student": "=1+1"},  # what is a formula or a tag elsewhere is only text here
         {"student": "<script>alert(1)</script>"},

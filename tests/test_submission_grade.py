@@ -14,11 +14,14 @@ import sample_submissions as samples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from coursekit import cli
 from coursekit.submission import rubric
 from coursekit.submission.contents import Claims, Conclusion, Plot, Stack, Submission
-from coursekit.submission.flags import Fingerprint, compare, fingerprint, rules
+from coursekit.submission.flags import Fingerprint, compare, fingerprint
 from coursekit.submission.recompute import recompute
+from coursekit.submission.report import student_page
 from coursekit.submission.rubric import MISTAKES, Item, check, grade
+from coursekit.submission.rules import RULES, rules
 
 FIELDS = {
     "bias": "depth_bias_mm",
@@ -277,6 +280,98 @@ def test_points_are_a_hundred() -> None:
     points = rules()["points"]
     each = sum(points[topic] for topic in ("data", *FIELDS))
     assert 3 * each + sum(points.values()) - each == 100
+
+
+# --- the plot ---
+
+
+@pytest.mark.parametrize(
+    ("factor", "mistake"),
+    [(1, ""), (0.7, ""), (1.6, ""), (0.4, "off_scale"), (2.5, "off_scale"), (1e-3, "metres"),
+     (1e3, "off_scale")],
+)  # fmt: skip
+def test_a_prediction_is_right_within_a_factor(
+    known: Submission, factor: float, mistake: str
+) -> None:
+    assert known.plot is not None
+    found = item(replace(known, plot=samples.predicting(known.plot, factor)), "plot")
+    assert (found.verdict, found.mistake) == ("partial" if mistake else "right", mistake)
+    if mistake == "metres":
+        assert found.says.endswith("but the prediction is in metres: 1 m is 1000 mm.")
+
+
+def test_no_prediction_is_none_and_keeps_half(known: Submission) -> None:
+    assert known.plot is not None
+    silent = replace(known, plot=replace(known.plot, predicted_mm=None))
+    found = item(silent, "plot")
+    assert (found.points, found.verdict, found.mistake) == (3, "partial", "no_prediction")
+    assert "without your prediction" in found.says
+    assert check(silent) == (found.says,)
+    two = Plot(known.plot.distances_m[:2], known.plot.measured_mm[:2], None)
+    found = item(replace(known, plot=two), "plot")
+    assert (found.points, found.mistake) == (2, "no_prediction")
+    assert found.says.endswith("0.60 m missing and without your prediction.")
+    assert student_page(grade(silent), silent)
+
+
+def test_a_wrong_std_is_named_once(known: Submission) -> None:
+    assert known.plot is not None
+    stds = list(known.plot.measured_mm)
+    stds[1] *= 10
+    wrong = samples.with_row(known, 1, depth_std_mm=stds[1])
+    wrong = replace(wrong, plot=replace(known.plot, measured_mm=tuple(stds)))
+    assert [says.partition(":")[0] for says in check(wrong)] == ["Std of depth at 0.45 m"]
+    assert "in your table, which is judged there (0.45 m)" in item(wrong, "plot").says
+    only_there = replace(known, plot=wrong.plot)  # not in the table: the plot's own fault
+    assert item(only_there, "plot").verdict == "partial"
+
+
+# --- typing errors in rubric.toml ---
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("plot = 6 ", "plot = six ", r"rubric.toml: cannot be read: .*line 1\d"),
+        ("plot = 6 ", "plto = 6 ", "rubric.toml: points.plto: is no key .*points.plot is missing"),
+        ("plot = 6 ", "", "rubric.toml: points.plot: is missing|cannot be read"),
+        ("plot = 6 ", "plot = 6\nmore = 1 ", "rubric.toml: points.more: is no key of this file$"),
+        ("plot = 6 ", "plot = '6' ", "rubric.toml: points.plot: got '6', want a number from 0"),
+        ("plot = 6 ", "plot = -6 ", "rubric.toml: points.plot: got -6, want a number from 0"),
+        ("plot = 6 ", "plot = nan ", "rubric.toml: points.plot: got nan, want a number"),
+        ("plot = 6 ", "plot = true ", "rubric.toml: points.plot: got True, want a number"),
+        ("frames = 100 ", "frames = 99.5 ", "exercise.frames: got 99.5, want a whole number"),
+        ("close = 0.5", "close = 1.5", "credit.close: got 1.5, want a number from 0 to 1"),
+        ("close = 0.5", "", "rubric.toml: credit.close: is missing"),
+        ("[flags]", "[flgas]", "rubric.toml: flgas: is no key .*flags is missing"),
+        ("[0.30, 0.45, 0.60]", "0.30", "exercise.distances_m: got 0.3, want a list of numbers"),
+        ("[0.30, 0.45, 0.60]", "[0.3, 'far']", "exercise.distances_m: got 'far', want a number"),
+        ("[0.30, 0.45, 0.60]", "[0.3, 0.3]", "exercise.distances_m: .* want different numbers"),
+        ("# Points", "points = 3 # ", "rubric.toml: "),
+    ],
+)
+def test_a_typing_error_in_the_rubric_is_one_line(
+    old: str, new: str, message: str, good: Submission, tmp_path: Any, monkeypatch: Any, capsys: Any
+) -> None:
+    content = RULES.read_text(encoding="utf-8")
+    assert content.count(old) == 1
+    broken = tmp_path / "rubric.toml"
+    broken.write_text(content.replace(old, new + "#" * (old[-1] == " ")), encoding="utf-8")
+    monkeypatch.setattr("coursekit.submission.rules.RULES", broken)
+    rules.cache_clear()
+    try:
+        with pytest.raises(ValueError, match=message) as raised:
+            check(good)
+        assert "\n" not in str(raised.value)
+        out = tmp_path / "out"
+        out.mkdir()
+        (out / "grades.csv").write_text("good", encoding="utf-8")
+        command = ["grade", str(tmp_path), "--out", str(out), "--overwrite"]
+        assert cli.main(command) == 1
+        assert capsys.readouterr().err == f"coursekit: {raised.value}\n"
+        assert [path.read_text(encoding="utf-8") for path in out.iterdir()] == ["good"]
+    finally:
+        rules.cache_clear()
 
 
 # --- what is missing, or cannot be compared -------------------------------------------------------

@@ -65,6 +65,15 @@ def test_each_kind_is_refused_for_its_own_reason(kind: Hostile) -> None:
     assert outcome(kind.data) == kind.reason
 
 
+@pytest.mark.parametrize(
+    "kind", ["a bundle in a folder", "a Mac's zip of a bundle", "a folder", "streamed"]
+)
+def test_who_zips_a_bundle_again_hears_what_to_do(kind: str) -> None:
+    (data,) = [one.data for one in KINDS if one.name == kind]
+    with pytest.raises(Refused, match=r"zipped again.*; hand in the \.zip that .* never unpacked"):
+        read_bundle(data)
+
+
 def test_every_reason_has_its_kind() -> None:
     """All codes in the sources are met by a bundle here, or by a path below."""
     calls = [

@@ -16,9 +16,10 @@ from coursekit.cameras.simulated import SimulatedCamera
 from coursekit.lessons import progress
 from coursekit.results import Quantity
 from coursekit.submission.bundle import write_bundle
-from coursekit.submission.contents import Conclusion, Row, Submission
+from coursekit.submission.contents import Conclusion, Plot, Row, Submission
 from coursekit.submission.reader import read_bundle
 from coursekit.submission.rubric import check, grade
+from coursekit.submission.rules import rules
 from coursekit.submission.submit import (
     MEASURED,
     NOBODY,
@@ -137,11 +138,43 @@ def test_nothing_is_kept_of_what_cannot_be_handed_in(block, own_results):
     law = ck.stereo.fit_noise([0.45], [6e-4], 900, 431.0, 0.05, exponent=2)
     one = stack(frames, face.window, 0.45)
     with pytest.raises(ValueError, match="caliper_m: got 60"):
-        keep(camera, [one], {}, law, [], 0.0, 60.0)
+        keep(camera, [one], {}, law, None, 0.0, 60.0)
     found = {"depth_std_at_450_mm": Quantity(0.6, "mm", 0.01, "noise")}
-    with pytest.raises(ValueError, match="plot: got 1 distances"):
+    with pytest.raises(ValueError, match="predicted_mm: got 3, want 1: one number in mm for each"):
         keep(camera, [one], found, law, [0.7, 1.2, 1.9], 0.0, 0.06)
+    for quantity, message in (
+        (0.6, r"depth_std_at_450_mm: got a float, want Quantity\(value, 'mm', standard error\)"),
+        (Quantity(0.6, "inch"), "depth_std_at_450_mm: got the unit 'inch', want 'mm' or 'm'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            keep(camera, [one], {"depth_std_at_450_mm": quantity}, law, None, 0.0, 0.06)
+    for table, message in (
+        ([1], r"table: got \[1\], want \{0.30: "),
+        ({0.5: (1, 1, 1, 1, 0)}, "table: got the distance 0.5, want one of 0.45"),
+        ({0.45: (1, 1)}, r"table at 0.45 m: got \(1, 1\), want five: bias, its standard error"),
+        ({0.45: (1, 1, "x", 1, 0)}, "depth_std_mm: got 'x', want a number"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            keep(camera, [one], found, law, None, 0.0, 0.06, table)
     assert not own_results.exists()
+
+
+def test_units_are_respected_and_own_numbers_take_their_place(block, own_results):
+    camera, frames, face = block
+    law = ck.stereo.fit_noise([0.45], [6e-4], 900, 431.0, 0.05, exponent=2)
+    one = stack(frames, face.window, 0.45)
+    found = {
+        "depth_bias_at_450_mm": Quantity(-0.0018, "m", 0.0003, "bias"),
+        "depth_std_at_450_mm": Quantity(0.6, "mm", 0.01, "noise"),
+        "invalid_at_450_mm": Quantity(2.0, "%"),
+    }
+    keep(camera, [one], found, law, None, 0.0, 0.06)
+    assert load().claims.rows == (Row(0.45, 1e3 * -0.0018, 1e3 * 0.0003, 0.6, 0.01, 0.02),)
+    assert load().plot.predicted_mm is None
+    table = {0.45: (None, None, 0.7, np.float64(0.02), None)}
+    keep(camera, [one], found, law, [0.65], 0.0, 0.06, table)
+    assert load().claims.rows == (Row(0.45, 1e3 * -0.0018, 1e3 * 0.0003, 0.7, 0.02, 0.02),)
+    assert load().plot == Plot((0.45,), (0.7,), (0.65,))
 
 
 # --- what is said, and what is written ---
@@ -210,10 +243,41 @@ def test_a_disk_that_is_full_leaves_nothing_half_written(kept, own_results, monk
     assert [path.name for path in own_results.iterdir()] == [MEASURED]
 
 
+def test_small_differences_of_spelling_are_understood(kept, own_results):
+    path = submit("Ada", 0.45, " Bias", PARAGRAPH, frames=10.0).path
+    conclusion = read_bundle(path).conclusion
+    assert (conclusion.dominates, conclusion.frames) == ("bias", 10)
+    assert isinstance(conclusion.frames, int)
+
+
+def test_a_notebook_shows_an_error_in_one_line(kept, own_results):
+    with pytest.raises(ValueError, match="distance_m") as raised:
+        submit("Ada", 450)
+    assert raised.value._render_traceback_() == [str(raised.value)]
+    assert "\n" not in str(raised.value)
+
+
+def test_a_typing_error_in_the_rubric_is_an_error_here_too(kept, own_results, monkeypatch, capsys):
+    broken = own_results.parent / "rubric.toml"
+    broken.write_text("[points]\nbias = 'six'\n", encoding="utf-8")
+    monkeypatch.setattr("coursekit.submission.rules.RULES", broken)
+    rules.cache_clear()
+    try:
+        with pytest.raises(ValueError, match=r"^rubric\.toml: exercise: is missing$"):
+            submit("Ada")
+        assert cli.main(["submit", "--student", "Ada"]) == 1
+        assert capsys.readouterr().err == "coursekit: rubric.toml: exercise: is missing\n"
+    finally:
+        rules.cache_clear()
+    assert [path.name for path in own_results.iterdir()] == [MEASURED]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ({"distance_m": "far"}, "distance_m: got 'far'"),
+        ({"distance_m": 450}, "distance_m: got 450; metres are wanted: did you mean 0.45?"),
+        ({"frames": 10.5}, "frames: got 10.5, want a whole number"),
         ({"distance_m": math.nan}, "distance_m: got nan"),
         ({"frames": 0}, "frames: got 0"),
         ({"dominates": "both"}, "dominates: got 'both', want one of bias, noise"),
@@ -310,6 +374,32 @@ def test_the_command_packs_and_refuses_like_the_function(kept, own_results, caps
     assert "nowhere" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("encoding", "code"), [("utf-8", 0), ("utf-8-sig", 0), ("utf-16", 1), ("latin-1", 1)]
+)
+def test_a_paragraph_that_is_not_utf_8_is_said_plainly(encoding, code, kept, own_results, capsys):
+    words = own_results.parent / "words.txt"
+    words.write_text(f"Zoë: {PARAGRAPH}", encoding=encoding)
+    arguments = [
+        "submit",
+        "--student",
+        "Zoë",
+        "--dominates",
+        "Bias",
+        "--paragraph-file",
+        str(words),
+    ]
+    assert cli.main(arguments) == code
+    if code:
+        said = capsys.readouterr().err
+        assert "words.txt: is no plain text in UTF-8; save it as that" in said
+        assert said.count("\n") == 1
+    else:
+        bundle = read_bundle(own_results / "studio_1_Zoë.zip")
+        assert bundle.conclusion.paragraph == f"Zoë: {PARAGRAPH}"
+        assert bundle.conclusion.dominates == "bias"
+
+
 def test_the_command_without_a_measurement_exits_with_1(own_results, capsys):
     assert cli.main(["submit", "--student", "Ada"]) == 1
     assert "studio cells of notebook 02" in capsys.readouterr().err
@@ -325,6 +415,7 @@ def test_a_notebook_with_a_name_hands_in_what_it_says(tmp_path):
     path = build_notebooks.NOTEBOOKS / "02_depth_noise.ipynb"
     notebook = nbformat.read(path, as_version=4)
     cells = {cell.id: cell for cell in notebook.cells}
+    cells["predict"].source = "my_prediction_mm = 1000 * held.std_m((0.30, 0.45, 0.60))[0]\n"
     cells["hand-in-submit"].source = f"ck.submit('Ada', 0.45, 'bias', {PARAGRAPH!r}, frames=30)\n"
     build_notebooks.execute(
         notebook, path.stem, path.parent, build_notebooks.kernel_environment(tmp_path)

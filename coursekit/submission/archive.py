@@ -24,6 +24,8 @@ MAX_RATIO = 100  # of a member's size to what it takes up in the file
 
 HAND_IN = "hand in the file that `coursekit submit` wrote, as it is"
 COPY_AGAIN = "copy or download it again"
+AS_IT_WAS = "hand in the .zip that `coursekit submit` wrote, never unpacked and never zipped again"
+EXTRA = "carries a comment or extra fields, as when files are zipped again"
 
 _END = struct.Struct("<4s4H2LH")
 _ENTRY = struct.Struct("<4s6H3L5H2L")
@@ -168,12 +170,22 @@ def _check_name(name: str, allowed: dict[re.Pattern[str], int]) -> None:
     if ".." in re.split(r"[/\\]", name):
         raise Refused("path_traversal", f"{what}, a path that climbs out of its folder")
     if "\\" in name:
-        raise Refused("backslash", f"{what}, a name with a backslash")
+        raise Refused("backslash", f"{what}, a name with a backslash", AS_IT_WAS)
     if name.endswith("/"):
-        raise Refused("folder", f"{what}, a folder")
+        raise Refused("folder", f"{what}, a folder: it was unpacked and zipped again", AS_IT_WAS)
+    if _is_zipped_again(name, allowed):
+        wrong = f"{what}: the bundle was unpacked and its files or their folder zipped again"
+        raise Refused("zipped_again", wrong, AS_IT_WAS)
     if name.lower().endswith(_ARCHIVES):
-        raise Refused("nested_archive", f"{what}, an archive in the archive")
+        raise Refused("nested_archive", f"{what}, an archive in the archive", AS_IT_WAS)
     raise Refused("unknown_member", f"{what}, which a bundle does not have")
+
+
+def _is_zipped_again(name: str, allowed: dict[re.Pattern[str], int]) -> bool:
+    """Whether a member is one of a bundle in a folder, or what macOS adds when it makes a zip."""
+    *folders, last = name.split("/")
+    inside = bool(folders) and any(pattern.fullmatch(last) for pattern in allowed)
+    return inside or folders[:1] == ["__MACOSX"] or last == ".DS_Store"
 
 
 def _check_entry(member: Member) -> None:
@@ -182,7 +194,8 @@ def _check_entry(member: Member) -> None:
     if member.flags & 0x2041:
         raise Refused("encrypted", f"{name} is encrypted")
     if member.flags & 0x0008:
-        raise Refused("data_descriptor", f"The size of {name} is given behind it, not before")
+        wrong = f"The size of {name} is given behind it, not before, as when files are zipped again"
+        raise Refused("data_descriptor", wrong, AS_IT_WAS)
     if member.flags & ~_FLAGS_WITHOUT_MEANING:
         raise Refused("unknown_flags", f"{name} has the unknown flags {member.flags:#06x}")
     if kind == stat.S_IFLNK:
@@ -195,7 +208,7 @@ def _check_entry(member: Member) -> None:
     if 0xFFFFFFFF in (member.packed, member.size, member.offset) or member.disk == 0xFFFF:
         raise Refused("zip64", f"{name} is stored in the large kind of zip (zip64)")
     if member.extra or member.comment:
-        raise Refused("extra_field", f"{name} carries a comment or extra fields")
+        raise Refused("extra_field", f"{name} {EXTRA}", AS_IT_WAS)
     if member.disk:
         raise Refused("several_disks", f"{name} is in another part of a zip that was split")
 
@@ -247,7 +260,7 @@ def _check_local(data: bytes, position: int, member: Member) -> None:
     if same != member[:6]:
         raise Refused("lying_header", f"{member.name} has a header that the directory contradicts")
     if extra:
-        raise Refused("extra_field", f"{member.name} carries a comment or extra fields")
+        raise Refused("extra_field", f"{member.name} {EXTRA}", AS_IT_WAS)
 
 
 def _unpack(packed: bytes, member: Member) -> bytes:

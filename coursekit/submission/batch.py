@@ -34,7 +34,16 @@ from typing import Any
 from pebble import ProcessExpired, ProcessPool
 
 from coursekit import results
-from coursekit.submission.report import Line, class_page, grades_csv, not_graded, with_copies
+from coursekit.submission.report import (
+    PARAGRAPHS,
+    Line,
+    across,
+    class_page,
+    grades_csv,
+    not_graded,
+    paragraphs_page,
+)
+from coursekit.submission.rules import rules
 from coursekit.submission.submit import slug
 from coursekit.submission.worker import grade_file, out_of_memory
 
@@ -141,6 +150,7 @@ def grade_folder(
     Raises ValueError for a folder that will not do, before any work, Stopped on Ctrl-C, and
     ChildProcessError when no process can be started.
     """
+    rules()  # a typing error in rubric.toml is said before anything starts
     started = time.monotonic()
     folder, out = Path(folder), Path(out)
     workers = _cores() if workers is None else workers
@@ -152,33 +162,31 @@ def grade_folder(
     for part in (out / STUDENTS, out / ROWS):
         part.mkdir(parents=True, exist_ok=True)
     bundles = list(_bundles(folder, paths))
-    lines: dict[str, Line] = {}
-    kept = 0
+    kept = finished = 0
     with _bar(len(bundles), progress) as bar:
 
         def unfinished() -> Iterator[Bundle]:
             nonlocal kept
             for bundle in bundles:
-                line = _load(out, bundle)
-                if line is None:
-                    yield bundle
-                else:
+                if _is_done(out, bundle):
                     kept += 1
-                    lines[bundle.key] = line
                     bar.update()
+                else:
+                    yield bundle
 
         limits = Limits(workers, timeout_s, memory_bytes)
         try:
             with contextlib.closing(run(unfinished(), grade_file, limits)) as outcomes:
                 for bundle, outcome in outcomes:
-                    lines[bundle.key] = _store(out, bundle, outcome)
+                    _store(out, bundle, outcome)  # and not here: a class of any size fits
+                    finished += 1
                     bar.update()
         except KeyboardInterrupt:
             raise Stopped(
-                f"stopped after {len(lines)} of {_counted(len(bundles), 'bundle')}, which are "
+                f"stopped after {kept + finished} of {_counted(len(bundles), 'bundle')}, which are "
                 "kept. The same command goes on from there."
             ) from None
-    done = _finish(out, [lines[bundle.key] for bundle in bundles], {b.page for b in bundles})
+    done = _finish(out, bundles)
     counts = Counter(_kind(line) for line in done)
     return Summary(
         out,
@@ -202,7 +210,7 @@ def _cores() -> int:
 def find(folder: Path, out: Path) -> tuple[list[Path], tuple[str, ...]]:
     """The .zip files in a folder and below in the order of their names, and what else is there.
 
-    Links are not followed, hidden files and the report itself are not looked at.
+    Links are not followed, hidden files and reports of ours are not looked at.
     Raises ValueError for no folder, or one without a bundle.
     """
     if not folder.is_dir():
@@ -215,13 +223,14 @@ def find(folder: Path, out: Path) -> tuple[list[Path], tuple[str, ...]]:
         at = Path(parent)
         folders[:] = [name for name in folders if not name.startswith((".", "__MACOSX"))]
         folders[:] = [name for name in folders if (at / name).resolve() != out.resolve()]
+        folders[:] = [name for name in folders if not _is_report(at / name)]
         for name in names:
             if not name.startswith("."):
                 (found if name.lower().endswith(".zip") else others).append(at / name)
     if not found:
-        there = f"only {_counted(len(others), 'other file')}" if others else "nothing"
+        there = f", only {_counted(len(others), 'other file')}" if others else " or below it"
         raise ValueError(
-            f"{folder}: there is no bundle (.zip) in it, {there}; "
+            f"{folder}: there is no bundle (.zip) in it{there}; "
             "want the folder with what students handed in"
         )
     return (
@@ -480,33 +489,53 @@ def _is_ours(entry: Path) -> bool:
             child.name.endswith((ending, ".part")) and child.is_file() and not child.is_symlink()
             for child in entry.iterdir()
         )
-    unfinished = entry.name.endswith(".part") and entry.name.startswith((f".{CSV}.", f".{PAGE}."))
-    return entry.name in (CSV, PAGE) or unfinished
+    starts = tuple(f".{name}." for name in (CSV, PAGE, PARAGRAPHS))
+    unfinished = entry.name.endswith(".part") and entry.name.startswith(starts)
+    return entry.name in (CSV, PAGE, PARAGRAPHS) or unfinished
+
+
+def _is_report(folder: Path) -> bool:
+    """Whether a folder is a report of an earlier run, with nothing else in it."""
+    try:
+        begun = (folder / ROWS).is_dir() or ((folder / CSV).exists() and (folder / PAGE).exists())
+        return begun and all(_is_ours(entry) for entry in folder.iterdir())
+    except OSError:
+        return False
 
 
 def _load(out: Path, bundle: Bundle) -> Line | None:
-    """The line of a bundle that an earlier run has finished with, and whose page is there."""
+    """The line of a bundle that is kept."""
     try:
-        line = Line.from_dict(json.loads((out / ROWS / f"{bundle.key}.json").read_bytes()))
+        return Line.from_dict(json.loads((out / ROWS / f"{bundle.key}.json").read_bytes()))
     except (OSError, AttributeError, KeyError, TypeError, ValueError):
         return None
-    whole = not line.page or (out / line.page).exists()
-    return line if whole and line.reason not in FAILED else None
 
 
-def _store(out: Path, bundle: Bundle, outcome: Outcome) -> Line:
+def _is_done(out: Path, bundle: Bundle) -> bool:
+    """Whether an earlier run has finished with a bundle, and its page is there."""
+    line = _load(out, bundle)
+    if line is None or line.reason in FAILED:
+        return False
+    return not line.page or (out / line.page).exists()
+
+
+def _store(out: Path, bundle: Bundle, outcome: Outcome) -> None:
     """Keep a finished bundle: its page first, so that a line never lacks it."""
     line, page = outcome
     if page:
         results.write_bytes(out / bundle.page, page.encode())
     content = json.dumps(line.to_dict()).encode()
     results.write_bytes(out / ROWS / f"{bundle.key}.json", content)
-    return line
 
 
-def _finish(out: Path, lines: list[Line], pages: set[str]) -> list[Line]:
+def _finish(out: Path, bundles: list[Bundle]) -> list[Line]:
     """Write what takes the whole class; returns the lines with what they share."""
-    lines = with_copies(lines)
+    gone = "What was kept of it is gone. Run the same command again."
+    lines = across(
+        [_load(out, bundle) or not_graded(bundle.name, "lost", gone) for bundle in bundles]
+    )
+    pages = {bundle.page for bundle in bundles}
+    results.write_bytes(out / PARAGRAPHS, paragraphs_page(lines).encode())
     results.write_bytes(out / PAGE, class_page(lines).encode())
     results.write_bytes(out / CSV, grades_csv(lines).encode("utf-8-sig"))  # so spreadsheets see ë
     for path in (out / STUDENTS).iterdir():

@@ -164,19 +164,25 @@ class Claims:
 
 @dataclass(frozen=True)
 class Plot:
-    """What the student's figure showed: std of depth in mm, one of each for every distance."""
+    """What the student's figure showed: std of depth in mm, one of each for every distance.
+
+    predicted_mm: None where nothing was predicted.
+    """
 
     distances_m: tuple[float, ...]
     measured_mm: tuple[float, ...]
-    predicted_mm: tuple[float, ...]
+    predicted_mm: tuple[float, ...] | None
 
     def __post_init__(self) -> None:
         for name in ("distances_m", "measured_mm", "predicted_mm"):
-            _put(self, name, _numbers(name, getattr(self, name), -LARGEST, LARGEST))
-        if not len(self.distances_m) == len(self.measured_mm) == len(self.predicted_mm):
+            if name != "predicted_mm" or self.predicted_mm is not None:
+                _put(self, name, _numbers(name, getattr(self, name), -LARGEST, LARGEST))
+        n = len(self.distances_m)
+        predicted = n if self.predicted_mm is None else len(self.predicted_mm)
+        if not n == len(self.measured_mm) == predicted:
             raise ValueError(
-                f"plot: got {len(self.distances_m)} distances, {len(self.measured_mm)} measured "
-                f"and {len(self.predicted_mm)} predicted values, want as many of each"
+                f"plot: got {n} distances, {len(self.measured_mm)} measured "
+                f"and {predicted} predicted values, want as many of each"
             )
 
 
@@ -281,7 +287,13 @@ def number(name: str, value: Any, low: float, high: float) -> float:
 
 def distance(name: str, value: Any) -> float:
     """`value` as metres from the camera; ValueError unless it is from 0.01 to 100."""
-    return number(name, value, 0.01, 100)
+    try:
+        return number(name, value, 0.01, 100)
+    except ValueError as error:
+        if isinstance(value, (int, float)) and 100 < value <= 100_000:  # in millimetres, then
+            hint = f"metres are wanted: did you mean {value / 1000:g}?"
+            raise ValueError(f"{name}: got {shown(value)}; {hint}") from None
+        raise error
 
 
 def whole(name: str, value: Any, low: int, high: int) -> int:

@@ -1,4 +1,4 @@
-"""What an instructor should look at: data that cannot be, and data that two students share.
+"""What an instructor should look at: data that cannot be, and data or words that students share.
 
 A flag takes no points. It says what was seen, and what else could explain it.
 """
@@ -8,15 +8,17 @@ from __future__ import annotations
 import base64
 import hashlib
 import math
-import tomllib
+import re
+import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from functools import lru_cache
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from coursekit.submission.rules import rules
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -33,7 +35,8 @@ QUERIES = 12  # frames of a stack that are looked for in others
 FOUND = 8  # of these, for the stacks to be the same measurement
 CLIP = 4.0  # times what is typical: a few changed values must not hide a copy
 CLOCK_S = 1e-8  # no real clock keeps step so well
-RULES = Path(__file__).with_name("rubric.toml")
+RUN = 3  # words in a row, by which paragraphs are compared
+SAME_WORDS = 0.7  # part of the runs of the shorter of two paragraphs that the other one has too
 
 
 @dataclass(frozen=True)
@@ -43,12 +46,6 @@ class Flag:
     code: str
     says: str
     note: bool = False
-
-
-@lru_cache(maxsize=1)
-def rules() -> dict[str, Any]:
-    """What rubric.toml holds."""
-    return tomllib.loads(RULES.read_text(encoding="utf-8"))
 
 
 def data_flags(submission: Submission, found: Recomputed, prints: Fingerprint) -> tuple[Flag, ...]:
@@ -325,13 +322,13 @@ class Fingerprint:
 
 @dataclass(frozen=True)
 class Copy:
-    """Bundles that share raw data: their keys, in order, and a sentence about them.
+    """Bundles that share raw data or words: their keys, in order, and a sentence about them.
 
     note: true where that is no suspicion, as with two simulations of one camera.
     """
 
     keys: tuple[str, ...]
-    code: str  # "identical" or "nearly_identical"
+    code: str  # "identical", "nearly_identical" or "same_words"
     says: str
     note: bool = False
 
@@ -440,14 +437,14 @@ def compare(prints: Mapping[str, Fingerprint]) -> list[Copy]:
 
     Found whatever the order and number of the frames, with a few values changed, a constant added,
     or noise of +-1 count. Identical ones make one `Copy` together, nearly identical ones one a
-    pair; of several identical bundles only the first is compared further.
+    pair; of several identical bundles the first is compared further, for all of them.
     """
     groups: dict[tuple[str, ...], list[str]] = {}
     for key, fingerprint_ in prints.items():
         digests = tuple(sorted(stack.digest for stack in fingerprint_.stacks))
         groups.setdefault(digests or (key,), []).append(key)
     copies = [_identical(keys, prints) for keys in groups.values() if len(keys) > 1]
-    return copies + _nearly([keys[0] for keys in groups.values()], prints)
+    return copies + _nearly({keys[0]: tuple(keys) for keys in groups.values()}, prints)
 
 
 def _identical(keys: Sequence[str], prints: Mapping[str, Fingerprint]) -> Copy:
@@ -459,30 +456,30 @@ def _identical(keys: Sequence[str], prints: Mapping[str, Fingerprint]) -> Copy:
 def _innocent(keys: Sequence[str], prints: Mapping[str, Fingerprint], exact: bool) -> str:
     """Why they may well be the same; empty where nothing says so."""
     some = [prints[key] for key in keys]
-    if len({" ".join(p.student.casefold().split()) for p in some}) == 1:
+    if len({person(p.student) for p in some}) == 1:
         return "they are of one student"
     if exact and {p.source for p in some} == {"simulated"} and len({p.camera for p in some}) == 1:
         return f"{some[0].camera} gives everybody the same"
     return ""
 
 
-def _nearly(keys: Sequence[str], prints: Mapping[str, Fingerprint]) -> list[Copy]:
-    """Pairs of bundles with frames in common."""
-    stacks = [(key, stack) for key in keys for stack in prints[key].stacks if len(stack.frames)]
+def _nearly(groups: Mapping[str, tuple[str, ...]], prints: Mapping[str, Fingerprint]) -> list[Copy]:
+    """Pairs of bundles with frames in common; groups: those that are identical, by the first."""
+    stacks = [(key, stack) for key in groups for stack in prints[key].stacks if len(stack.frames)]
     if len(stacks) < 2:
         return []
     patterns = _unit(np.array([stack.pattern for _, stack in stacks]))
-    frames = [_unit(stack.frames) for _, stack in stacks]
     found: dict[tuple[str, str], dict[float, tuple[int, bool]]] = {}
-    rank = {key: i for i, key in enumerate(keys)}
+    rank = {key: i for i, key in enumerate(groups)}
     for i, (key, stack) in enumerate(stacks):
         alike = np.flatnonzero(patterns @ patterns[i] > SAME_PATTERN)
-        others = [j for j in alike if stacks[j][0] != key and len(frames[j]) >= FOUND]
+        others = [j for j in alike if stacks[j][0] != key and len(stacks[j][1].frames) >= FOUND]
         ask = _queries(stack.frames)
         if not others or len(ask) < FOUND:
             continue
-        likeness = _unit(ask) @ np.concatenate([frames[j] for j in others]).T
-        starts = np.cumsum([0, *(len(frames[j]) for j in others[:-1])])
+        frames = [_unit(stacks[j][1].frames) for j in others]
+        likeness = _unit(ask) @ np.concatenate(frames).T
+        starts = np.cumsum([0, *(len(some) for some in frames[:-1])])
         hits = (np.maximum.reduceat(likeness, starts, axis=1) >= SAME_FRAME).sum(axis=0)
         for j, number in zip(others, hits.tolist(), strict=True):
             if number >= FOUND:
@@ -492,11 +489,13 @@ def _nearly(keys: Sequence[str], prints: Mapping[str, Fingerprint]) -> list[Copy
                 part = found.setdefault(pair, {})
                 before = part.get(stack.distance_m, (0, False))
                 part[stack.distance_m] = max(before, (number, exact))
-    return [_near_pair(pair, part, prints) for pair, part in found.items()]
+    return [
+        _near_pair(groups[one] + groups[two], part, prints) for (one, two), part in found.items()
+    ]
 
 
 def _near_pair(
-    pair: tuple[str, str],
+    keys: tuple[str, ...],
     part: Mapping[float, tuple[int, bool]],
     prints: Mapping[str, Fingerprint],
 ) -> Copy:
@@ -505,5 +504,70 @@ def _near_pair(
     share = sum(number for number, _ in part.values()) / (QUERIES * len(part))
     kind = "the same" if exact else "nearly the same"
     says = f"The frames at {where} are {kind} ({min(share, 1):.0%} of those looked for were found)"
-    note = _innocent(pair, prints, exact)
-    return Copy(pair, "nearly_identical", f"{says}{': ' + note if note else ''}.", bool(note))
+    note = _innocent(keys, prints, exact)
+    return Copy(keys, "nearly_identical", f"{says}{': ' + note if note else ''}.", bool(note))
+
+
+# --- who shares words -----------------------------------------------------------------------
+
+
+def person(name: str) -> str:
+    """A student's name for telling whether two are one: case and spaces do not matter."""
+    return " ".join(unicodedata.normalize("NFKC", name).casefold().split())
+
+
+def same_words(said: Mapping[str, tuple[str, str]]) -> list[Copy]:
+    """Students whose paragraphs have the same or nearly the same words, a `Copy` for each group.
+
+    said: student and paragraph of each bundle, by its key. Case and punctuation do not matter;
+    paragraphs that are too short for the rubric are not compared.
+    """
+    least = rules()["exercise"]["words"]
+    who: dict[tuple[str, ...], list[str]] = {}
+    for key, (_, paragraph) in said.items():
+        words = re.findall(r"\w+", unicodedata.normalize("NFKC", paragraph).casefold())
+        if len(words) >= least:
+            who.setdefault(tuple(words), []).append(key)
+    copies = []
+    for texts in _alike(list(who), least - RUN + 1):
+        keys = tuple(key for text in texts for key in who[text])
+        students = {person(said[key][0]) for key in keys}
+        if len(students) > 1:
+            kind = "the same" if len(texts) == 1 else "nearly the same"
+            start = " ".join(said[keys[0]][1].split()[:10])
+            says = f"The paragraphs of {len(students)} students have {kind} words: “{start} …”."
+            copies.append(Copy(keys, "same_words", says))
+    return copies
+
+
+def _alike(texts: Sequence[tuple[str, ...]], least: int) -> list[list[tuple[str, ...]]]:
+    """The texts in groups of those that share their runs of words; least: runs, for a part."""
+    from scipy.sparse import coo_array, csr_array
+    from scipy.sparse.csgraph import connected_components
+
+    if not texts:
+        return []
+    number: dict[tuple[str, ...], int] = {}
+    rows: list[int] = []
+    columns: list[int] = []
+    for i, words in enumerate(texts):
+        runs = {words[j : j + RUN] for j in range(len(words) - RUN + 1)}
+        rows += [i] * len(runs)
+        columns += [number.setdefault(run, len(number)) for run in runs]
+    ones = np.ones(len(rows), np.float32)
+    has = csr_array((ones, (rows, columns)), shape=(len(texts), len(number)))
+    several = np.flatnonzero(has.sum(axis=0) > 1)
+    size = np.maximum(np.bincount(rows, minlength=len(texts)), least)
+    has = has[:, several]
+    pairs = []
+    for start in range(0, len(texts), 256):  # so that a class that says the same fits the memory
+        shared = coo_array(has[start : start + 256] @ has.T)
+        one, two = shared.row + start, shared.col
+        near = shared.data >= SAME_WORDS * np.minimum(size[one], size[two])
+        pairs.append(np.stack([one[near], two[near]]))
+    one, two = np.concatenate(pairs, axis=1)
+    graph = coo_array((np.ones(len(one)), (one, two)), shape=(len(texts), len(texts)))
+    groups: dict[int, list[tuple[str, ...]]] = {}
+    for text, label in zip(texts, connected_components(graph, directed=False)[1], strict=True):
+        groups.setdefault(int(label), []).append(text)
+    return list(groups.values())

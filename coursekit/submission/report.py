@@ -1,4 +1,4 @@
-"""What people read: a page for each student, one for the instructor, and a table for a spreadsheet.
+"""What people read: a page for each student, two for the instructor, and a table for a spreadsheet.
 
 Everything that came with a bundle is escaped; pages hold their style and figures, load nothing and
 run nothing. Flags are on the instructor's page only: they are questions, not findings.
@@ -10,15 +10,15 @@ import csv
 import io
 import math
 import statistics
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from datetime import datetime
 from html import escape
 from typing import Any
 from urllib.parse import quote
 
 from coursekit.submission.contents import Submission
-from coursekit.submission.flags import Copy, Fingerprint, Flag, compare
+from coursekit.submission.flags import Copy, Fingerprint, Flag, compare, person, same_words
 from coursekit.submission.rubric import LABELS, MISTAKES, Grade, Item
 from coursekit.submission.svg import histogram, noise_plot, off_scale
 
@@ -26,13 +26,17 @@ HEADER = (
     "file",
     "student",
     "status",
+    "counts",
     "points",
     "of",
     "percent",
     *LABELS,
+    "lost",
     "flags",
     "says",
 )
+PARAGRAPHS = "paragraphs.html"  # the link to it from the class page
+SHOWN = 12  # students of a group whose links are shown at once
 FORMULA = tuple("=+-@\t\r\n＝＋－＠")  # what makes a spreadsheet calculate a cell
 VERDICTS = ("right", "partial", "wrong", "missing")
 
@@ -52,6 +56,7 @@ table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nu
 th, td { text-align: left; padding: 5px 10px 5px 0; border-bottom: 1px solid #ddd;
   vertical-align: top; overflow-wrap: break-word; max-width: 36rem; }
 td:first-child, th:first-child { max-width: 13rem; }
+.names td:first-child { max-width: 36rem; }
 th { font-weight: 600; color: #444; }
 th.n, td.n { text-align: right; white-space: nowrap; }
 svg.figure { display: block; width: 100%; max-width: 620px; height: auto;
@@ -69,13 +74,23 @@ li .n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowr
 .partial { color: #6b4800; background: #fdf1d8; }
 .wrong { color: #8f3300; background: #fdeadd; }
 .missing { color: #444; background: #eee; }
+details { margin: 4px 0; }
+summary { cursor: pointer; color: #00538a; }
+.groups > div { margin-bottom: 4px; }
 blockquote { margin: 8px 0; padding: 4px 14px; border-left: 3px solid #bbb; white-space: pre-wrap; }
 @media (max-width: 560px) {
   body { font-size: 15px; }
   svg.figure { font-size: 15px; }
   table { font-size: 14px; }
   th, td { padding-right: 7px; }
+  .names td:first-child, .stack td { max-width: none; overflow-wrap: anywhere; }
   td:first-child, th:first-child { max-width: 8rem; }
+  .stack thead { display: none; }
+  .stack, .stack tbody { display: block; }
+  .stack tr { display: block; border-bottom: 1px solid #ddd; padding: 6px 0; }
+  .stack td { display: block; border: 0; padding: 1px 0; }
+  .stack td.n { text-align: left; }
+  .stack td:first-child { font-weight: 600; max-width: none; }
   li { grid-template-columns: 1fr auto; }
   li .says { grid-column: 1 / -1; }
 }
@@ -86,12 +101,15 @@ blockquote { margin: 8px 0; padding: 4px 14px; border-left: 3px solid #bbb; whit
 class Line:
     """One bundle in the class: graded, or not and why.
 
-    file: the bundle's name. page: the link to its page. reason, says: of a bundle that was not
-    graded. fingerprint: as `Fingerprint.to_dict` gives it. `to_dict`, `from_dict`: through JSON.
+    file: the bundle's name. made, paragraph: as handed in. page: the link to its page. reason,
+    says: of a bundle that was not graded. counts: False where the student has a newer one.
+    `to_dict`, `from_dict`: through JSON.
     """
 
     file: str
     student: str = ""
+    made: str = ""
+    paragraph: str = ""
     points: float | None = None
     of: float | None = None
     items: tuple[Item, ...] = ()
@@ -99,7 +117,8 @@ class Line:
     page: str = ""
     reason: str = ""
     says: str = ""
-    fingerprint: dict[str, Any] | None = None
+    counts: bool = True
+    fingerprint: Fingerprint | None = None
 
     @property
     def percent(self) -> float | None:
@@ -110,27 +129,34 @@ class Line:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain text, numbers, lists and dictionaries."""
-        return asdict(self)
+        prints = None if self.fingerprint is None else self.fingerprint.to_dict()
+        return {**asdict(replace(self, fingerprint=None)), "fingerprint": prints}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Line:
         """The inverse of `to_dict`."""
         items = tuple(Item(**item) for item in data["items"])
         flags = tuple(Flag(**flag) for flag in data["flags"])
-        return cls(**{**data, "items": items, "flags": flags})
+        prints = data["fingerprint"]
+        prints = None if prints is None else Fingerprint.from_dict(prints)
+        return cls(**{**data, "items": items, "flags": flags, "fingerprint": prints})
 
 
-def graded(file: str, grade: Grade, page: str = "") -> Line:
-    """The line of a graded bundle."""
+def graded(file: str, grade: Grade, submission: Submission, page: str = "") -> Line:
+    """The line of a graded bundle; of its items what the class page and the table say."""
     return Line(
         file=file,
         student=grade.student,
+        made=submission.made,
+        paragraph=submission.conclusion.paragraph,
         points=grade.points,
         of=grade.of,
-        items=grade.items,
+        items=tuple(
+            replace(item, says="", claimed=None, found=None, tolerance=None) for item in grade.items
+        ),
         flags=grade.flags,
         page=page,
-        fingerprint=grade.fingerprint.to_dict(),
+        fingerprint=grade.fingerprint,
     )
 
 
@@ -139,18 +165,47 @@ def not_graded(file: str, reason: str, says: str) -> Line:
     return Line(file, reason=reason, says=says)
 
 
-def with_copies(lines: Sequence[Line]) -> list[Line]:
-    """The lines, with a flag on each of those that share raw data with others."""
-    prints = {
-        line.file: Fingerprint.from_dict(line.fingerprint)
-        for line in lines
-        if line.fingerprint is not None
-    }
+def across(lines: Sequence[Line]) -> list[Line]:
+    """The lines with what only the class shows: shared data and words, and whose newest counts.
+
+    Without fingerprints, which are of no more use.
+    """
+    done = [line for line in lines if line.points is not None]
+    prints = {line.file: line.fingerprint for line in done if line.fingerprint is not None}
+    said = {line.file: (line.student, line.paragraph) for line in done}
     about: dict[str, list[Flag]] = {}
-    for copy in compare(prints):
+    for copy in [*compare(prints), *same_words(said)]:
+        flag = _copy_flag(copy)
         for key in copy.keys:
-            about.setdefault(key, []).append(_copy_flag(copy))
-    return [replace(line, flags=(*line.flags, *about.get(line.file, ()))) for line in lines]
+            about.setdefault(key, []).append(flag)
+    newest = _newest(done)
+    found = []
+    for line in lines:
+        flags = [*line.flags, *about.get(line.file, ())]
+        last = newest.get(person(line.student)) if line.points is not None else None
+        counts = last is None or last is line
+        if last is not None and not counts:
+            says = (
+                f"An earlier bundle of {last.student}, {_points(line.points or 0.0)} points; "
+                f"{last.file} counts, {_points(last.points or 0.0)} points."
+            )
+            flags.append(Flag("earlier_bundle", says, note=True))
+        found.append(replace(line, flags=tuple(flags), counts=counts, fingerprint=None))
+    return found
+
+
+def _newest(lines: Sequence[Line]) -> dict[str, Line]:
+    """The bundle of each student that was made last; the first one of several."""
+    newest: dict[str, Line] = {}
+    for line in lines:
+        before = newest.setdefault(person(line.student), line)
+        if _moment(line) > _moment(before):
+            newest[person(line.student)] = line
+    return newest
+
+
+def _moment(line: Line) -> float:
+    return datetime.fromisoformat(line.made).timestamp() if line.made else 0.0
 
 
 def _copy_flag(copy: Copy) -> Flag:
@@ -287,15 +342,18 @@ def _outcomes(submission: Submission) -> list[str]:
 def class_page(lines: Sequence[Line]) -> str:
     """Distribution, misconceptions, flags, refused bundles, and a link to every student's page.
 
-    lines: after `with_copies`.
+    lines: after `across`. A student counts once, with the newest bundle.
     """
     done = [line for line in lines if line.points is not None]
+    counted = [line for line in done if line.counts]
     refused = [line for line in lines if line.points is None]
-    percents = [line.percent for line in done if line.percent is not None]
+    percents = [line.percent for line in counted if line.percent is not None]
     flagged = sum(any(not flag.note for flag in line.flags) for line in done)
     summary = (
         f"{_counted(len(done), 'bundle')} graded, {len(refused)} not graded, {flagged} flagged."
     )
+    if len(counted) < len(done):
+        summary += f" They are of {_counted(len(counted), 'student')}, whose newest counts."
     if percents:
         summary += (
             f" Median {statistics.median(percents):.0f} % of the points, "
@@ -304,15 +362,17 @@ def class_page(lines: Sequence[Line]) -> str:
     body = [
         "<h1>Studio exercise 1: the class</h1>",
         f'<p class="points">{escape(summary)}</p>',
+        f'<p><a href="{PARAGRAPHS}">All paragraphs on one page</a>, to read and score.</p>',
         histogram(percents),
     ]
-    if done:
-        body += ["<h2>What was asked, and what went wrong</h2>", _misconceptions(done)]
+    if counted:
+        body += ["<h2>What was asked, and what went wrong</h2>", _misconceptions(counted)]
     body += _flag_section(done)
     if refused:
         rows = [(line.file, line.reason, line.says) for line in refused]
-        body += ["<h2>Not graded</h2>", _table(("file", "reason", "what to do"), rows)]
-    body += _students(done)
+        table = _table(("file", "reason", "what to do"), rows, kind="stack")
+        body += ["<h2>Not graded</h2>", table]
+    body += _students(counted)
     return _page("Studio exercise 1: the class", body)
 
 
@@ -324,15 +384,18 @@ def _misconceptions(lines: Sequence[Line]) -> str:
             continue
         right = sum(item.verdict == "right" for item in items) / len(items)
         # A mistake made at three distances is made by one student.
-        named = Counter(
-            mistake
-            for line in lines
-            for mistake in {_said(item) for item in line.items if item.topic == topic}
-            if mistake
-        )
-        words = "; ".join(f"{mistake} ({n})" for mistake, n in named.most_common(4))
-        rows.append((label, f"{right:.0%}", words or "-"))
-    return _table(("item", "right", "most often otherwise (students)"), rows, (1,))
+        who: dict[str, list[Line]] = {}
+        for line in lines:
+            for mistake in {_said(item): None for item in line.items if item.topic == topic}:
+                if mistake:
+                    who.setdefault(mistake, []).append(line)
+        groups = [
+            f"<div>{escape(mistake)} ({len(some)}): {_links(some)}</div>"
+            for mistake, some in sorted(who.items(), key=lambda pair: -len(pair[1]))
+        ]
+        cell = _Raw(f'<div class="groups">{"".join(groups)}</div>' if groups else "-")
+        rows.append((label, f"{right:.0%} right", cell))
+    return _table(("item", "answers", "otherwise (students)"), rows, (1,), kind="stack")
 
 
 def _said(item: Item) -> str:
@@ -358,7 +421,7 @@ def _flag_section(lines: Sequence[Line]) -> list[str]:
                     who.setdefault((flag.code.replace("_", " "), flag.says), []).append(line)
         if who:
             cells = [(_links(some), code, says) for (code, says), some in who.items()]
-            table = _table(("student", "what", "what was seen"), cells)
+            table = _table(("student", "what", "what was seen"), cells, kind="stack")
             sections += [f"<h2>{title}</h2>", f"<p>{words}</p>", table]
     return sections
 
@@ -366,35 +429,79 @@ def _flag_section(lines: Sequence[Line]) -> list[str]:
 def _students(lines: Sequence[Line]) -> list[str]:
     if not lines:
         return []
+    named = sorted(lines, key=lambda line: (person(line.student), line.file))
+    ranked = sorted(named, key=lambda line: line.percent or 0.0)
+    return [
+        "<h2>Everybody, lowest points first</h2>",
+        _everybody(ranked),
+        f"<details><summary>Everybody by name</summary>{_everybody(named)}</details>",
+    ]
+
+
+def _everybody(lines: Sequence[Line]) -> str:
     rows = [
         (
-            _Raw(_link(line)),
-            line.file,
+            _Raw(f'{_link(line)}<div class="faint">{escape(line.file)}</div>'),
             f"{_points(line.points or 0.0)} of {_points(line.of or 0.0)}",
             str(sum(not flag.note for flag in line.flags) or ""),
         )
-        for line in sorted(lines, key=lambda line: (line.student.casefold(), line.file))
+        for line in lines
     ]
-    table = _table(("student", "file", "points", "flags"), rows, (2, 3))
-    return ["<h2>Everybody</h2>", table]
+    return _table(("student and file", "points", "flags"), rows, (1, 2), kind="names")
+
+
+def paragraphs_page(lines: Sequence[Line]) -> str:
+    """The closing paragraphs of the class, by name, to read in one go; lines: after `across`."""
+    some = [line for line in lines if line.points is not None and line.counts]
+    some.sort(key=lambda line: (person(line.student), line.file))
+    silent = [line for line in some if not line.paragraph.strip()]
+    words = f"{_counted(len(some) - len(silent), 'paragraph')}, by name. <a href="
+    body = [
+        "<h1>Studio exercise 1: the paragraphs</h1>",
+        f'<p class="points">{words}"index.html">Back to the class</a></p>',
+    ]
+    if silent:
+        body.append(f"<div>No paragraph: {_links(silent)}</div>")
+    for line in some:
+        text = line.paragraph.strip()
+        if text:
+            facts = [_counted(len(text.split()), "word")]
+            facts += [
+                f"which error dominates: {item.verdict}"
+                for item in line.items
+                if item.topic == "verdict"
+            ]
+            if any(flag.code == "same_words" for flag in line.flags):
+                facts.append("shares its words with others, see the class page")
+            body += [
+                f"<h2>{_link(line)}</h2>",
+                f'<p class="faint">{escape("; ".join(facts))}</p>',
+                f"<blockquote>{escape(text)}</blockquote>",
+            ]
+    return _page("Studio exercise 1: the paragraphs", body)
 
 
 def _links(lines: Sequence[Line]) -> _Raw:
-    more = f", {len(lines) - 6} more" if len(lines) > 6 else ""
-    return _Raw(", ".join(_link(line) for line in lines[:6]) + more)
+    links = [_link(line) for line in lines]
+    shown, rest = ", ".join(links[:SHOWN]), links[SHOWN:]
+    if rest:
+        shown += f"<details><summary>and {len(rest)} more</summary>{', '.join(rest)}</details>"
+    return _Raw(shown)
 
 
 def _link(line: Line) -> str:
     name = escape(line.student or line.file)
-    return f'<a href="{escape(quote(line.page), quote=True)}">{name}</a>' if line.page else name
+    link = f'<a href="{escape(quote(line.page), quote=True)}">{name}</a>' if line.page else name
+    return link if line.counts else f"{link} (earlier)"
 
 
 # --- the table for a spreadsheet ------------------------------------------------------------------
 
 
 def grades_csv(lines: Sequence[Line]) -> str:
-    """One row a bundle: points in all and by topic, flags, and why it was not graded.
+    """One row a bundle: points in all and by topic, what cost some, flags, why it was not graded.
 
+    Of several bundles of one student one counts, as its column says; lines: after `across`.
     Text that a spreadsheet would calculate gets an apostrophe before it.
     """
     out = io.StringIO()
@@ -412,15 +519,22 @@ def grades_csv(lines: Sequence[Line]) -> str:
                 _cell(line.file),
                 _cell(line.student),
                 "graded" if done else _cell(f"not graded: {line.reason}"),
+                "yes" if done and line.counts else "no",
                 _points(line.points) if line.points is not None else "",
                 _points(line.of) if line.of is not None else "",
                 f"{line.percent:.1f}" if line.percent is not None else "",
                 *(_points(by_topic[topic]) if done else "" for topic in LABELS),
+                _cell("; ".join(_lost(item) for item in line.items if item.points < item.of)),
                 _cell(" ".join(codes)),
                 _cell(line.says),
             ]
         )
     return out.getvalue()
+
+
+def _lost(item: Item) -> str:
+    """Why an item lost points, and how many: "bias at 0.45 m: sign of the bias turned (-2)"."""
+    return f"{item.name}: {_said(item) or item.verdict} ({_points(item.points - item.of)})"
 
 
 def _cell(text: str) -> str:
@@ -438,17 +552,26 @@ class _Raw(str):
     __slots__ = ()
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[int] = ()) -> str:
+def _table(
+    head: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    numbers: Sequence[int] = (),
+    kind: str = "",
+) -> str:
+    """numbers: columns of them. kind: "stack": on a phone the cells of a row come below each other;
+    "names": names and files come first."""
+
     def cell(tag: str, i: int, text: str) -> str:
-        kind = ' class="n"' if i in numbers else ""
-        return f"<{tag}{kind}>{text if isinstance(text, _Raw) else escape(text)}</{tag}>"
+        side = ' class="n"' if i in numbers else ""
+        return f"<{tag}{side}>{text if isinstance(text, _Raw) else escape(text)}</{tag}>"
 
     top = "".join(cell("th", i, text) for i, text in enumerate(head))
     body = "".join(
         f"<tr>{''.join(cell('td', i, text) for i, text in enumerate(row))}</tr>" for row in rows
     )
     return (
-        f'<div class="wide"><table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>'
+        f'<div class="wide"><table class="{kind}">'
+        f"<thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>"
     )
 
 

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from coursekit.submission.flags import Fingerprint, Flag, data_flags, fingerprint, rules
+from coursekit.submission.flags import Fingerprint, Flag, data_flags, fingerprint
 from coursekit.submission.recompute import Measured, Recomputed, recompute
+from coursekit.submission.rules import rules
 
 if TYPE_CHECKING:
     from coursekit.stereo import NoiseFit
@@ -58,7 +59,8 @@ MISTAKES = {
     "of_variance": "exponent of the variance",
     "proportional": "prediction not proportional to Z squared",
     "copied_prediction": "prediction equal to the measurement",
-    "no_prediction": "points of the plot missing",
+    "off_scale": "prediction far from the measurement",
+    "no_prediction": "prediction, or points of the plot, missing",
     "other_dominates": "the other error dominates",
     "not_measured_there": "conclusion far from where it was measured",
     "incomplete": "something left out",
@@ -413,7 +415,7 @@ def _plot(submission: Submission, found: Recomputed, of: float) -> Item:
         says = "Plot: missing; measured std of depth against the predicted one, at each distance."
         return Item("plot", "plot", 0.0, of, "missing", says)
     wanted = len(rules()["exercise"]["distances_m"])
-    absent, wrong, right = [], [], 0
+    absent, wrong, of_table, right = [], [], [], 0
     for m in measured:
         i = _nearest(plot, m.distance_m)
         if i is None:
@@ -424,6 +426,9 @@ def _plot(submission: Submission, found: Recomputed, of: float) -> Item:
         tolerance = _tolerance("std", m.std.se)
         if abs(got - want) <= tolerance:
             right += 1
+        elif _is_of_table(submission, m.distance_m, got):  # wrong, but that is counted there
+            right += 1
+            of_table.append(f"{m.distance_m:.2f} m")
         else:
             wrong.append(
                 f"at {m.distance_m:.2f} m it shows a measured {_shown('std', got)}, your raw "
@@ -438,19 +443,42 @@ def _plot(submission: Submission, found: Recomputed, of: float) -> Item:
         return Item("plot", "plot", points, of, "partial" if points else "wrong", says)
     if absent or right < wanted:
         short = f"{', '.join(absent)} missing" if absent else f"{right} of {wanted} distances"
-        says = f"Plot: it shows what you measured, but with {short}."
-        return Item("plot", "plot", round(of * part, 2), of, "partial", says, "no_prediction")
-    return _prediction(plot, of)
+        says = f"Plot: it shows what you measured, but with {short}"
+        if plot.predicted_mm is None:
+            part *= rules()["credit"]["no_prediction"]
+            says += " and without your prediction"
+        return Item("plot", "plot", round(of * part, 2), of, "partial", f"{says}.", "no_prediction")
+    shows = "measured std as in your raw depths"
+    if of_table:
+        shows = f"measured std as in your table, which is judged there ({', '.join(of_table)})"
+    there = [_stack_at(measured, z) for z in plot.distances_m]
+    return _prediction(plot, shows, [m.std.value for m in there if m and m.std], of)
 
 
-def _prediction(plot: Plot, of: float) -> Item:
-    """The predicted curve: it was made before measuring, so only its shape can be wrong."""
-    z, predicted = np.array(plot.distances_m), np.array(plot.predicted_mm)
-    measured = np.array(plot.measured_mm)
-    credit, slack = rules()["credit"], rules()["tolerance"]["prediction"]
+def _is_of_table(submission: Submission, z: float, std_mm: float) -> bool:
+    row = _row(submission, z)
+    claim = None if row is None else row.depth_std_mm
+    return claim is not None and abs(std_mm - claim) <= _half_digit("std")
+
+
+def _prediction(plot: Plot, shows: str, found_mm: Sequence[float], of: float) -> Item:
+    """The predicted curve: it was made before measuring, so its shape must be right, and its scale
+    to a factor.
+
+    shows: what is right about the measured points. found_mm: what the raw depths say for each.
+    """
     full = Item("plot", "plot", of, of, "right", "")
+    if plot.predicted_mm is None:
+        says = (
+            f"Plot: {shows}, but without your prediction; predicted is what sigma_d, fx and "
+            "baseline say before you measure."
+        )
+        return _partial(full, "no_prediction", says)
+    z, predicted = np.array(plot.distances_m), np.array(plot.predicted_mm)
+    measured, found = np.array(plot.measured_mm), np.array(found_mm)
+    slack = rules()["tolerance"]["prediction"]
     if not (predicted > 0).all():
-        says = "Plot: measured right, but a predicted std must be greater than 0."
+        says = f"Plot: {shows}, but a predicted std must be greater than 0."
         return _partial(full, "proportional", says)
     if len(z) > 1 and np.array_equal(predicted, measured):
         says = (
@@ -460,20 +488,34 @@ def _prediction(plot: Plot, of: float) -> Item:
         return _partial(full, "copied_prediction", says)
     shape = predicted / z**2
     off = float(shape.max() / shape.min()) - 1
-    ratio = float(np.exp(np.log(predicted / measured).mean())) if (measured > 0).all() else 1.0
+    ratio = float(np.exp(np.log(predicted / found).mean())) if (found > 0).all() else 1.0
     if off > slack:
         law = "Z" if np.ptp(np.log(predicted / z)) < math.log(1 + slack) else "something else"
         says = (
-            f"Plot: measured right, but the prediction goes as {law}: divided by Z² it differs by "
+            f"Plot: {shows}, but the prediction goes as {law}: divided by Z² it differs by "
             f"{off:.0%} between distances, and sigma_Z = Z² sigma_d / (fx B) would not."
         )
-        kept = round(of * credit["proportional"], 2)
-        return Item("plot", "plot", kept, of, "partial", says, "proportional")
+        return _partial(full, "proportional", says)
+    return _scale(full, shows, ratio)
+
+
+def _scale(full: Item, shows: str, ratio: float) -> Item:
+    """A prediction of the right shape that is so many times what the raw depths say."""
+    most = rules()["tolerance"]["prediction_factor"]
+    if 1 / most <= ratio <= most:
+        says = (
+            f"Plot: {shows}, prediction proportional to Z² and {ratio:.2f} times what your raw "
+            "depths say: right."
+        )
+        return replace(full, says=says)
+    if 1 / most <= 1e3 * ratio <= most:
+        says = f"Plot: {shows}, but the prediction is in metres: 1 m is 1000 mm."
+        return _partial(full, "metres", says)
     says = (
-        f"Plot: measured std as in your raw depths, prediction proportional to Z² and "
-        f"{ratio:.2f} times what you measured: right."
+        f"Plot: {shows}, but the prediction is {ratio:.2g} times what your raw depths say; within "
+        f"a factor of {most:g} is accepted."
     )
-    return Item("plot", "plot", of, of, "right", says)
+    return _partial(full, "off_scale", says)
 
 
 def _nearest(plot: Plot, z: float) -> int | None:

@@ -7,10 +7,11 @@ grader look at it, and packs.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from coursekit.submission.contents import (
     Row,
     Stack,
     Submission,
+    shown,
 )
 
 if TYPE_CHECKING:
@@ -33,8 +35,16 @@ if TYPE_CHECKING:
     from coursekit.cameras import Camera, Frames
     from coursekit.stereo import NoiseFit
 
+    Table = Mapping[float, Sequence[float | None]]
+
 MEASURED = "studio_1.measured"  # in results/
 CHECKPOINTS = "depth_noise."  # what the names of the lesson's checkpoints and exercises begin with
+PARTS = ("depth_bias_mm", "depth_bias_se_mm", "depth_std_mm", "depth_std_se_mm", "invalid_fraction")
+UNITS = {  # of a quantity that is handed in, and what one of it is in the table's own
+    "depth_bias": {"mm": 1.0, "m": 1e3},
+    "depth_std": {"mm": 1.0, "m": 1e3},
+    "invalid": {"1": 1.0, "%": 0.01},
+}
 LONGEST_SLUG = 40  # characters of a name that go into the name of a file
 NOBODY = "nobody"  # stands in for a name while there is none
 
@@ -42,6 +52,30 @@ MEASURE_FIRST = (
     "The studio exercise is not measured yet: run the studio cells of notebook 02 (with a camera, "
     "a set of recordings or the simulated one), up to the one that keeps the measurement."
 )
+
+
+class CannotHandIn(ValueError):
+    """An input that cannot be handed in; a notebook shows the line alone, without a traceback."""
+
+    def _render_traceback_(self) -> list[str]:  # what IPython asks an exception for
+        return [str(self)]
+
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def _in_one_line(function: Callable[P, T]) -> Callable[P, T]:
+    """The function, with its ValueErrors turned into `CannotHandIn`."""
+
+    @wraps(function)
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> T:
+        try:
+            return function(*args, **kwargs)
+        except ValueError as error:
+            raise CannotHandIn(str(error)) from error
+
+    return wrapped
 
 
 @dataclass(frozen=True, repr=False)
@@ -75,14 +109,16 @@ def stack(frames: Frames, window: tuple[int, int, int, int], distance_m: float) 
     return Stack(distance_m, window, counts, np.array([frame.time_s for frame in frames], float))
 
 
+@_in_one_line
 def keep(
     camera: Camera,
     stacks: Iterable[Stack],
     quantities: Mapping[str, results.Quantity],
     fit: NoiseFit,
-    predicted_mm: Sequence[float],
+    predicted_mm: Sequence[float] | None,
     tape_sigma_m: float,
     caliper_m: float,
+    table: Table | None = None,
 ) -> Path:
     """Keep a measured studio exercise in `results/`, for `submit`; returns the file.
 
@@ -90,7 +126,7 @@ def keep(
     """
     from coursekit.submission.bundle import write_bundle
 
-    kept = measured(camera, stacks, quantities, fit, predicted_mm, tape_sigma_m, caliper_m)
+    kept = measured(camera, stacks, quantities, fit, predicted_mm, tape_sigma_m, caliper_m, table)
     return write_bundle(results.folder() / MEASURED, kept, overwrite=True)
 
 
@@ -99,25 +135,34 @@ def measured(
     stacks: Iterable[Stack],
     quantities: Mapping[str, results.Quantity],
     fit: NoiseFit,
-    predicted_mm: Sequence[float],
+    predicted_mm: Sequence[float] | None,
     tape_sigma_m: float,
     caliper_m: float,
+    table: Table | None = None,
 ) -> Submission:
     """A measured studio exercise, still without a name and a conclusion.
 
     stacks: one a distance. quantities: the student's table, by the names that notebook 02 gives
     (depth_bias_at_300_mm, depth_std_at_300_mm, invalid_at_300_mm, ...). fit: sigma_d from the
     block; its exponent is claimed only if it was fitted. predicted_mm: the std of depth that was
-    predicted for each stack. tape_sigma_m, caliper_m: as in `Submission`.
+    predicted for each stack, None if nobody did. tape_sigma_m, caliper_m: as in `Submission`.
+    table: the student's own numbers, {distance: (bias, its se, std, its se, all in mm, invalid
+    part)}; each that is not None takes the place of the one in `quantities`.
     Raises ValueError for what no bundle can hold.
     """
     stacks = tuple(stacks)
-    rows = tuple(_row(s.distance_m, quantities) for s in stacks)
+    rows = _with_own(tuple(_row(s.distance_m, quantities) for s in stacks), table or {})
+    if predicted_mm is not None and np.shape(predicted_mm) != (len(stacks),):
+        raise ValueError(
+            f"predicted_mm: got {np.size(predicted_mm)}, want {len(stacks)}: one number in mm for "
+            "each distance"
+        )
     free = fit.exponent if fit.exponent_interval is not None else None
     stds = [row.depth_std_mm for row in rows if row.depth_std_mm is not None]
+    predicted = None if predicted_mm is None else tuple(predicted_mm)
     figure = None
     if len(stds) == len(stacks):
-        figure = Plot(tuple(s.distance_m for s in stacks), tuple(stds), tuple(predicted_mm))
+        figure = Plot(tuple(s.distance_m for s in stacks), tuple(stds), predicted)
     return Submission(
         student=NOBODY,
         made=results.now(),
@@ -153,6 +198,7 @@ def facts(camera: Camera) -> CameraFacts:
     )
 
 
+@_in_one_line
 def submit(
     student: str = "",
     distance_m: float | None = None,
@@ -171,6 +217,10 @@ def submit(
     is there already stays, unless overwrite=True.
     Raises ValueError for an argument that cannot be, naming it.
     """
+    if isinstance(dominates, str):  # "Bias" is meant as well
+        dominates = cast("Cause", dominates.strip().lower())
+    if isinstance(frames, float) and float(frames).is_integer():
+        frames = int(frames)
     conclusion = Conclusion(distance_m, frames, dominates, (paragraph or "").strip())
     kept = load()
     if kept is None:
@@ -268,7 +318,41 @@ def _row(distance_m: float, quantities: Mapping[str, results.Quantity]) -> Row:
     """The line of the table at one distance; what was not measured is left out."""
 
     def found(name: str) -> tuple[float | None, float | None]:
-        quantity = quantities.get(f"{name}_at_{1000 * distance_m:.0f}_mm")
-        return (quantity.value, quantity.sigma) if quantity else (None, None)
+        full = f"{name}_at_{1000 * distance_m:.0f}_mm"
+        quantity = quantities.get(full)
+        if quantity is None:
+            return None, None
+        if not isinstance(quantity, results.Quantity):
+            got, unit = type(quantity).__name__, next(iter(UNITS[name]))
+            raise ValueError(f"{full}: got a {got}, want Quantity(value, {unit!r}, standard error)")
+        factor = UNITS[name].get(quantity.unit)
+        if factor is None:
+            raise ValueError(f"{full}: got the unit {quantity.unit!r}, want {_or(UNITS[name])}")
+        sigma = None if quantity.sigma is None else factor * quantity.sigma
+        return factor * quantity.value, sigma
 
     return Row(distance_m, *found("depth_bias"), *found("depth_std"), found("invalid")[0])
+
+
+def _or(words: Iterable[str]) -> str:
+    return " or ".join(repr(word) for word in words)
+
+
+def _with_own(rows: tuple[Row, ...], table: Table) -> tuple[Row, ...]:
+    """The rows with the student's own numbers in them, wherever these are not None."""
+    if not isinstance(table, Mapping):
+        raise ValueError(f"table: got {shown(table)}, want {{0.30: (five numbers), ...}}")
+    at = [row.distance_m for row in rows]
+    for z, numbers in table.items():
+        if z not in at:
+            measured_at = ", ".join(f"{distance:g}" for distance in at)
+            raise ValueError(f"table: got the distance {shown(z)}, want one of {measured_at}")
+        if not isinstance(numbers, (tuple, list, np.ndarray)) or len(numbers) != len(PARTS):
+            raise ValueError(
+                f"table at {z:g} m: got {shown(numbers)}, want five: bias, its standard error, "
+                "std, its standard error (mm), invalid part"
+            )
+        own = {part: n for part, n in zip(PARTS, numbers, strict=True) if n is not None}
+        i = at.index(z)
+        rows = (*rows[:i], replace(rows[i], **own), *rows[i + 1 :])
+    return rows

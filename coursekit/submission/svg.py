@@ -59,7 +59,7 @@ def noise_plot(submission: Submission, found: Recomputed) -> str:
     rows = submission.claims.rows
     claimed = [(r.distance_m, r.depth_std_mm) for r in rows if r.depth_std_mm is not None]
     plot = submission.plot or Plot((), (), ())
-    predicted = list(zip(plot.distances_m, plot.predicted_mm, strict=True))
+    predicted = list(zip(plot.distances_m, plot.predicted_mm or (), strict=False))  # or none
     tops = [std + 2 * se for _, std, se in measured if std < LARGEST_MM]
     if not tops:
         return ""
@@ -153,7 +153,7 @@ def _rounding_shows(found: Recomputed, distances_m: Sequence[float]) -> bool:
 
 
 def histogram(percents: Sequence[float]) -> str:
-    """How many bundles got which part of the points, in tens of percent."""
+    """How many students got which part of the points, in tens of percent."""
     bins = [0] * 10
     for percent in percents:
         bins[min(max(int(percent // 10), 0), 9)] += 1
@@ -172,7 +172,7 @@ def histogram(percents: Sequence[float]) -> str:
         _text((LEFT + WIDTH - RIGHT) / 2, BARS_HEIGHT - 8, "points (% of what can be had)")
     )
     words = [f"{n} from {10 * i} to {10 * i + 10} %" for i, n in enumerate(bins) if n]
-    alt = f"Bundles by points: {', '.join(words)}." if words else "No graded bundle."
+    alt = f"Students by points: {', '.join(words)}." if words else "No graded bundle."
     return _svg("distribution of points", alt, BARS_HEIGHT, parts)
 
 

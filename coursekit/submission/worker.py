@@ -24,7 +24,7 @@ def grade_file(path: str, name: str, page: str) -> tuple[Line, str]:
     try:
         submission = read_bundle(Path(path))
         found = grade(submission)
-        return graded(name, found, page), student_page(found, submission)
+        return graded(name, found, submission, page), student_page(found, submission)
     except Refused as refused:
         return not_graded(name, refused.reason, str(refused)), ""
     except MemoryError:
