@@ -22,7 +22,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return options.run(options) or 0
     except (CameraError, OSError, ValueError) as error:
-        print(f"coursekit: {error}", file=sys.stderr)
+        said = str(error).replace("overwrite=True", "--overwrite")  # which is Python's way
+        print(f"coursekit: {said}", file=sys.stderr)
         return 1
     except KeyboardInterrupt as stopped:
         print(f"coursekit: {stopped or 'stopped, nothing was written'}", file=sys.stderr)

@@ -32,7 +32,7 @@ def test_record_writes_a_recording_and_says_how_to_play_it(tmp_path, capsys):
 
     assert cli.main(arguments) == 1
     assert capsys.readouterr().err.endswith(
-        "a.db3 exists already: choose another name or overwrite=True\n"
+        "a.db3 exists already: choose another name or --overwrite\n"
     )
     assert cli.main([*arguments, "--overwrite"]) == 0
 
@@ -69,7 +69,7 @@ def test_board_writes_a_sheet_and_says_what_it_is(tmp_path, capsys):
     assert eval(said[-1].removeprefix("In Python: "), {"Board": Board}) == CHARUCO
 
     assert cli.main([*arguments, "--out", str(path)]) == 1
-    assert capsys.readouterr().err.endswith("choose another name or overwrite=True\n")
+    assert capsys.readouterr().err.endswith("choose another name or --overwrite\n")
     changed = [*arguments, "--marker-mm", "15", "--dictionary", "DICT_4X4_50", "--paper", "a3"]
     assert cli.main([*changed, "--out", str(path), "--overwrite"]) == 0
     assert "marker 15 mm, DICT_4X4_50." in capsys.readouterr().out
