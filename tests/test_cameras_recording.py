@@ -588,3 +588,4 @@ def record_with_infrared(rs, path, camera):
     for frame in camera._stream():
         writer.add(frame)
     writer.close()
+    recording._restore_order(path)  # as write_recording does
