@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import json
@@ -302,7 +303,7 @@ def test_ctrl_c_keeps_what_is_done_and_the_same_command_goes_on(tmp_path):
     folder, out = tmp_path / "in", tmp_path / "out"
     folder.mkdir()
     data = (SAMPLES / "ada_good.zip").read_bytes()
-    for i in range(80):
+    for i in range(400):  # some ten seconds of work
         (folder / f"{i:03d}.zip").write_bytes(data)
     command = [sys.executable, "-m", "coursekit.cli", "grade", str(folder), "--out", str(out)]
     running = subprocess.Popen(
@@ -323,7 +324,7 @@ def test_ctrl_c_keeps_what_is_done_and_the_same_command_goes_on(tmp_path):
     assert "Traceback" not in error
     assert not (out / "grades.csv").exists()
     done = len(list(out.glob(".rows/*.json")))
-    assert 5 <= done < 80
+    assert 5 <= done < 400
     for path in out.rglob("*"):
         assert not path.name.endswith(".part")
 
@@ -334,6 +335,24 @@ def test_ctrl_c_keeps_what_is_done_and_the_same_command_goes_on(tmp_path):
     finished = subprocess.run(command, capture_output=True, text=True, check=False)
     assert finished.returncode == 0, finished.stderr
     assert f"{done} of them had been graded before" in finished.stdout
+
+
+def test_a_ctrl_c_that_nobody_heard_still_stops(tmp_path, monkeypatch):
+    """Raised in a destructor or a callback, a KeyboardInterrupt goes no further."""
+
+    def run(bundles, work, limits):
+        for bundle in bundles:
+            with contextlib.suppress(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+            yield bundle, batch._failed(bundle, "error", "Not tried.")
+
+    monkeypatch.setattr(batch, "run", run)
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for name in "abc":
+        (folder / f"{name}.zip").write_bytes(b"")
+    with pytest.raises(batch.Stopped, match="stopped after 1 of 3 bundles"):
+        batch.grade_folder(folder, tmp_path / "out", progress=False)
 
 
 # --- folders ---

@@ -20,6 +20,7 @@ import os
 import signal
 import stat
 import sys
+import threading
 import time
 import unicodedata
 import warnings
@@ -176,11 +177,16 @@ def grade_folder(
 
         limits = Limits(workers, timeout_s, memory_bytes)
         try:
-            with contextlib.closing(run(unfinished(), grade_file, limits)) as outcomes:
+            with (
+                _noted_interrupts() as interrupted,
+                contextlib.closing(run(unfinished(), grade_file, limits)) as outcomes,
+            ):
                 for bundle, outcome in outcomes:
                     _store(out, bundle, outcome)  # and not here: a class of any size fits
                     finished += 1
                     bar.update()
+                    if interrupted:
+                        raise KeyboardInterrupt
         except KeyboardInterrupt:
             raise Stopped(
                 f"stopped after {kept + finished} of {_counted(len(bundles), 'bundle')}, which are "
@@ -198,6 +204,27 @@ def grade_folder(
         left_out,
         time.monotonic() - started,
     )
+
+
+@contextlib.contextmanager
+def _noted_interrupts() -> Iterator[list[int]]:
+    """Ctrl-C raises as always, and is in the list, too: raised in a destructor it would be lost."""
+    noted: list[int] = []
+    before = signal.getsignal(signal.SIGINT)
+
+    def note(number: int, frame: Any) -> None:
+        noted.append(number)
+        signal.default_int_handler(number, frame)
+
+    here = threading.current_thread() is threading.main_thread()
+    if not here or before is not signal.default_int_handler:  # somebody else's to decide
+        yield noted
+        return
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield noted
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _cores() -> int:
