@@ -10,11 +10,13 @@ import coursekit
 
 PACKAGE = Path(coursekit.__file__).parent
 ROOMS = (
+    "arrays",
+    "checks",
+    "words",
     "kernels",
     "geometry",
     "specifications",
     "results",
-    "findings",
     "stereo",
     "boards",
     "intrinsics",

@@ -14,7 +14,7 @@ import numpy as np
 
 from coursekit.arm import widowx
 from coursekit.boards import Detections
-from coursekit.findings import Finding, Findings
+from coursekit.words import Finding, Findings
 from coursekit.hand_eye import causes, misread, mistakes
 from coursekit.hand_eye.causes import Arms
 from coursekit.hand_eye.closed_form import FEWEST

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from coursekit.findings import Finding
+from coursekit.words import Finding
 from coursekit.hand_eye import causes, misread
 from coursekit.hand_eye.causes import Accepted, Search
 from coursekit.hand_eye.misread import Reading

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from coursekit.boards import Detections
-from coursekit.findings import Finding, Findings
+from coursekit.words import Finding, Findings
 from coursekit.geometry import check_transform
 from coursekit.intrinsics import causes
 from coursekit.intrinsics.differences import halves

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from coursekit.findings import Finding, Findings
+from coursekit.words import Finding, Findings
 
 BOW = Finding("bowed_board", "The board is <not> flat.", "0.51 ± 0.04 mm", "Use glass.", 1e-9)
 FEW = Finding("few_views", "Too few views.", "4 views", "Take more.")

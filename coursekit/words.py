@@ -1,4 +1,4 @@
-"""What a diagnosis found: each finding with its evidence and its remedy."""
+"""Words and tables for people: wrapped lines, plurals, p-values, and what a diagnosis found."""
 
 from __future__ import annotations
 
@@ -8,7 +8,59 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import overload
 
-WIDTH = 88  # characters: fits a notebook's output cell
+WIDTH = 88  # characters: fits a notebook's output cell; JupyterLab breaks longer lines in mid-word
+
+
+def wrapped(text: str, width: int = WIDTH, first: str = "", indent: str = "  ") -> str:
+    """Text in lines of at most `width`: never broken at a hyphen, nor between ± and its number."""
+    kept = text.replace("± ", "±\0")
+    filled = textwrap.fill(
+        kept, width, initial_indent=first, subsequent_indent=indent, break_on_hyphens=False
+    )
+    return filled.replace("\0", " ")
+
+
+def with_notes(text: str, notes: Sequence[str]) -> str:
+    """Text, and below it, indented, what has to be said about it."""
+    if not notes:
+        return text
+    note = wrapped("Note: " + "; ".join(notes) + ".", width=84, indent="    ")
+    return f"{text}.\n    {note}"
+
+
+def counted(n: int, thing: str) -> str:
+    """ "1 view", "3 views"."""
+    return f"{n} {thing}" + "s" * (n != 1)
+
+
+def p_text(p_value: float) -> str:
+    """ "p = 0.03", and no more zeros than mean anything."""
+    return f"p = {p_value:.2g}" if p_value >= 1e-6 else "p < 0.000001"
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Rows under a head, in columns that are as wide as they must be."""
+    lines = [tuple(head), *map(tuple, rows)]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
+        for line in lines
+    )
+
+
+def html_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """The same as an HTML table; text is escaped."""
+
+    def row(tag: str, cells: Sequence[str]) -> str:
+        texts = (f"<{tag} style='text-align:left'>{html.escape(c)}</{tag}>" for c in cells)
+        return f"<tr>{''.join(texts)}</tr>"
+
+    return f"<table>{row('th', head)}{''.join(row('td', cells) for cells in rows)}</table>"
+
+
+def html_list(lines: Iterable[str]) -> str:
+    """An HTML list; text is escaped."""
+    return f"<ul>{''.join(f'<li>{html.escape(line)}</li>' for line in lines)}</ul>"
 
 
 @dataclass(frozen=True)
@@ -33,7 +85,7 @@ class Finding:
 
     def __str__(self) -> str:
         lines = [self.says, f"Evidence: {self.evidence}", f"What to do: {self.remedy}"]
-        return "\n".join([self.title, *(_indent(line) for line in lines)])
+        return "\n".join([self.title, *(wrapped(line, WIDTH - 3, "  ") for line in lines)])
 
 
 class Findings(Sequence[Finding]):
@@ -73,7 +125,7 @@ class Findings(Sequence[Finding]):
     def _headline(self) -> str:
         if not self._findings:
             return "Nothing found."
-        return f"{len(self)} finding{'s' if len(self) > 1 else ''}."
+        return f"{counted(len(self), 'finding')}."
 
     def _looked_for(self) -> list[str]:
         lines = []
@@ -86,7 +138,7 @@ class Findings(Sequence[Finding]):
             f"{number}. {str(finding).replace(chr(10), chr(10) + '   ')}"
             for number, finding in enumerate(self, 1)
         ]
-        return "\n".join([self._headline(), *found, *map(_fill, self._looked_for())])
+        return "\n".join([self._headline(), *found, *map(wrapped, self._looked_for())])
 
     def _repr_html_(self) -> str:
         items = "".join(
@@ -99,10 +151,3 @@ class Findings(Sequence[Finding]):
         listed = f"<ol>{items}</ol>" if items else ""
         return f"<p><b>{self._headline()}</b></p>{listed}{notes}"
 
-
-def _indent(text: str) -> str:
-    return textwrap.fill(text, WIDTH - 3, initial_indent="  ", subsequent_indent="  ")
-
-
-def _fill(text: str) -> str:
-    return textwrap.fill(text, WIDTH, subsequent_indent="  ")
