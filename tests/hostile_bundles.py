@@ -21,16 +21,18 @@ from typing import Any
 
 import numpy as np
 
-from coursekit.submission import bundle
-from coursekit.submission.contents import (
+from coursekit.submission.format import (
     CameraFacts,
     Claims,
     Conclusion,
     Outcome,
     Plot,
-    Row,
     Stack,
     Submission,
+    TableRow,
+    array_bytes,
+    bundle_bytes,
+    zip_bytes,
 )
 
 CAMERA = {
@@ -72,7 +74,7 @@ def submission(**changes: Any) -> Submission:
         "caliper_m": 0.06,
         "stacks": stacks,
         "claims": Claims(
-            rows=(Row(0.3, 0.5, 0.02, 1.25, 0.01, 0.0), Row(0.6, depth_std_mm=4.5)),
+            rows=(TableRow(0.3, 0.5, 0.02, 1.25, 0.01, 0.0), TableRow(0.6, depth_std_mm=4.5)),
             sigma_d_px=0.08,
             sigma_d_interval_px=(0.07, 0.09),
             exponent=2.1,
@@ -107,12 +109,12 @@ def hashed(members: Parts) -> Parts:
 
 def with_member(name: str, content: bytes) -> bytes:
     """The honest bundle, but this member has another content, or is there besides; rehashed."""
-    return bundle.zip_bytes(hashed(MEMBERS | {name: content}))
+    return zip_bytes(hashed(MEMBERS | {name: content}))
 
 
 def unhashed(name: str, content: bytes) -> bytes:
     """The honest bundle with another content of this member, and its manifest left as it was."""
-    return bundle.zip_bytes(MEMBERS | {name: content})
+    return zip_bytes(MEMBERS | {name: content})
 
 
 def with_json(name: str, change: Callable[[Any], Any]) -> bytes:
@@ -121,7 +123,7 @@ def with_json(name: str, change: Callable[[Any], Any]) -> bytes:
     replaced = change(content)
     changed = json.dumps(content if replaced is None else replaced).encode()
     if name == "manifest.json":
-        return bundle.zip_bytes(MEMBERS | {name: changed})
+        return zip_bytes(MEMBERS | {name: changed})
     return with_member(name, changed)
 
 
@@ -275,16 +277,14 @@ def _bomb() -> bytes:
     return packed_by(
         lambda archive: [
             archive.writestr(name, content, zipfile.ZIP_DEFLATED)
-            for name, content in hashed(
-                MEMBERS | {"depth_0.npy": bundle.array_bytes(zeros[:240], "<u2")}
-            ).items()
+            for name, content in hashed(MEMBERS | {"depth_0.npy": array_bytes(zeros[:240])}).items()
         ]
     )
 
 
 def _same_name() -> bytes:
     """A zip with the same name twice (zipfile would warn)."""
-    return bundle.zip_bytes({"facts.json": b"{}", "factz.json": b"{}"}).replace(b"factz", b"facts")
+    return zip_bytes({"facts.json": b"{}", "factz.json": b"{}"}).replace(b"factz", b"facts")
 
 
 def _set(*path: Any, to: Any) -> Callable[[Any], None]:
@@ -317,13 +317,13 @@ def full_size(last: int) -> bytes:
     counts = _a_million(2)
     window = {"window": (400, 200, 64, 64), "times_s": np.arange(244) / 30}
     stacks = [Stack(distance_m=z, counts=counts, **window) for z in (0.3, 0.6)]
-    members = parts(bundle.bundle_bytes(submission(stacks=stacks)))
+    members = parts(bundle_bytes(submission(stacks=stacks)))
     content = members["depth_1.npy"]
     members["depth_1.npy"] = content[:-1] + bytes([content[-1] ^ last])
-    return bundle.zip_bytes(members)
+    return zip_bytes(members)
 
 
-HONEST = bundle.bundle_bytes(submission())
+HONEST = bundle_bytes(submission())
 MEMBERS = parts(HONEST)
 DIRECTORY = HONEST.index(b"PK\x01\x02")
 
@@ -365,9 +365,9 @@ def _files() -> dict[str, tuple[str, bytes]]:
 
 def _zips() -> dict[str, tuple[str, bytes]]:
     second = headers(HONEST, "facts.json")[0]
-    many = bundle.zip_bytes({f"depth_{i}.npy": b"" for i in range(33)})
+    many = zip_bytes({f"depth_{i}.npy": b"" for i in range(33)})
     return {
-        "no members": ("no_members", bundle.zip_bytes({})),
+        "no members": ("no_members", zip_bytes({})),
         "33 members": ("too_many_members", many),
         "junk between members": ("data_between", inserted(second, b"junk", moved=True)),
         "junk before the directory": ("data_between", inserted(DIRECTORY, b"junk", moved=True)),
@@ -453,8 +453,8 @@ def _names() -> dict[str, tuple[str, bytes]]:
         "a long name": ("unknown_member", "a" * 60_000),
         "a formula for a name": ("unknown_member", '=HYPERLINK("http://x")'),
     }
-    kinds = {k: (reason, bundle.zip_bytes(MEMBERS | {n: b""})) for k, (reason, n) in names.items()}
-    nul = bundle.zip_bytes(MEMBERS | {"facts.json?": b""}).replace(b"json?", b"json\0")
+    kinds = {k: (reason, zip_bytes(MEMBERS | {n: b""})) for k, (reason, n) in names.items()}
+    nul = zip_bytes(MEMBERS | {"facts.json?": b""}).replace(b"json?", b"json\0")
     return kinds | {"a NUL in a name": ("unknown_member", nul)}
 
 
@@ -470,9 +470,9 @@ def _hashes() -> dict[str, tuple[str, bytes]]:
         "members swapped": ("wrong_hash", unhashed("depth_0.npy", MEMBERS["depth_1.npy"])),
         "a wrong size in the manifest": ("wrong_hash", with_json("manifest.json", listed)),
         "as large as can be, last value changed": ("wrong_hash", full_size(last=1)),
-        "a member missing": ("missing_member", bundle.zip_bytes(gone)),
-        "a member missing everywhere": ("missing_member", bundle.zip_bytes(hashed(gone))),
-        "no manifest": ("missing_member", bundle.zip_bytes({"facts.json": b"{}"})),
+        "a member missing": ("missing_member", zip_bytes(gone)),
+        "a member missing everywhere": ("missing_member", zip_bytes(hashed(gone))),
+        "no manifest": ("missing_member", zip_bytes({"facts.json": b"{}"})),
         "a member not listed": ("unlisted_member", unhashed("depth_2.npy", b"")),
         "an array of no distance": ("unlisted_member", with_member("depth_2.npy", npy())),
     }
@@ -639,9 +639,9 @@ def _arrays() -> dict[str, tuple[str, bytes]]:
     kinds |= {
         kind: (reason, with_member("times_0.npy", data)) for kind, (reason, data) in times.items()
     }
-    huge = bundle.array_bytes(_a_million(4), "<u2")
+    huge = array_bytes(_a_million(4))
     three = {f"depth_{i}.npy": huge for i in range(3)} | {f"times_{i}.npy": b"" for i in range(3)}
     facts = json.loads(MEMBERS["facts.json"])
     facts["stacks"] = [{"distance_m": 0.3 + i, "window": [0, 0, 64, 64]} for i in range(3)]
     all_of = hashed(MEMBERS | three | {"facts.json": json.dumps(facts).encode()})
-    return kinds | {"three million values": ("too_many_values", bundle.zip_bytes(all_of))}
+    return kinds | {"three million values": ("too_many_values", zip_bytes(all_of))}

@@ -15,15 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
-from coursekit.submission.contents import (
+from coursekit.submission.format import (
     CameraFacts,
     Claims,
     Conclusion,
     Outcome,
     Plot,
-    Row,
     Stack,
     Submission,
+    TableRow,
 )
 from coursekit.submission.recompute import Recomputed, recompute
 
@@ -136,7 +136,7 @@ def claims_of(submission: Submission, found: Recomputed | None = None) -> Claims
         steady = np.isfinite(z).all(axis=0)
         assert m.std is not None
         rows.append(
-            Row(
+            TableRow(
                 m.distance_m,
                 round(float(z[:, steady].mean()) - 1e3 * m.distance_m, 2),
                 m.bias_se_mm,
@@ -152,7 +152,7 @@ def claims_of(submission: Submission, found: Recomputed | None = None) -> Claims
 def exact_claims(found: Recomputed) -> Claims:
     """The recomputed values themselves, with an exponent: the middle of every tolerance."""
     rows = tuple(
-        Row(
+        TableRow(
             m.distance_m,
             m.bias and m.bias.value,
             m.bias_se_mm,

@@ -27,10 +27,9 @@ from coursekit import cli
 from coursekit.specifications import DATA
 from coursekit.submission import batch
 from coursekit.submission.batch import Bundle, Limits, grade_folder
-from coursekit.submission.bundle import bundle_bytes, write_bundle
-from coursekit.submission.report import Line, not_graded
+from coursekit.submission.format import bundle_bytes, write_bundle
+from coursekit.submission.report import ReportLine, grade_file, not_graded
 from coursekit.submission.rubric import grade
-from coursekit.submission.worker import grade_file
 
 SAMPLES = DATA / "sample_bundles"
 GRADED = ("ada_good", "ben_weak", "cleo_wrong", "dan_copied", "eve_formula")
@@ -152,7 +151,7 @@ def test_every_hostile_bundle_is_a_row_with_its_reason(tmp_path):
 # --- what a bundle can do to a process ---
 
 
-def misbehave(path: str, name: str, page: str) -> tuple[Line, str]:
+def misbehave(path: str, name: str, page: str) -> tuple[ReportLine, str]:
     """What a bundle does that the reader let through: its name says it."""
     if "hang" in name:
         time.sleep(3600)
@@ -177,7 +176,7 @@ def misbehave(path: str, name: str, page: str) -> tuple[Line, str]:
     return not_graded(name, "well", f"{os.getpid()} {threads}"), "page"
 
 
-def outcomes(names: Iterable[str], limits: Limits, work=misbehave) -> dict[str, Line]:
+def outcomes(names: Iterable[str], limits: Limits, work=misbehave) -> dict[str, ReportLine]:
     """What `run` makes of bundles of these names."""
     bundles = [Bundle(Path(name), name, name) for name in names]
     return {bundle.name: line for bundle, (line, _) in batch.run(bundles, work, limits)}

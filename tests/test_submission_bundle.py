@@ -26,18 +26,22 @@ from hostile_bundles import (
     with_member,
 )
 
-from coursekit.submission import bundle, contents
-from coursekit.submission.contents import (
+from coursekit.submission.format import (
     CameraFacts,
     Claims,
     Conclusion,
     Outcome,
     Plot,
-    Row,
+    Refused,
     Stack,
     Submission,
+    TableRow,
+    array_bytes,
+    bundle_bytes,
+    read_bundle,
+    write_bundle,
+    zip_bytes,
 )
-from coursekit.submission.reader import Refused, read_bundle
 
 FORMAT = Path(contents.__file__).parent / "FORMAT.md"
 
@@ -59,7 +63,7 @@ def same(one: Submission, other: Submission) -> bool:
 
 def test_what_goes_in_comes_out(tmp_path: Path) -> None:
     given = submission()
-    path = bundle.write_bundle(tmp_path / "new" / "studio_1_zoe.zip", given)
+    path = write_bundle(tmp_path / "new" / "studio_1_zoe.zip", given)
     assert path == tmp_path / "new" / "studio_1_zoe.zip"
     assert [p.name for p in path.parent.iterdir()] == [path.name]  # nothing left over
     for found in (read_bundle(path), read_bundle(path.read_bytes())):
@@ -80,12 +84,12 @@ def test_what_goes_in_comes_out(tmp_path: Path) -> None:
         {"student": "<script>alert(1)</script>"},
         {"student": "O'Brien; DROP TABLE -- 王小明 مریم"},
         {"conclusion": Conclusion(paragraph="\t" + "ǅ\n" * 2_000)},
-        {"claims": Claims((Row(0.1 + 0.2, -0.0, 5e-324, 1 / 3, 1e-9, -7.0),))},
+        {"claims": Claims((TableRow(0.1 + 0.2, -0.0, 5e-324, 1 / 3, 1e-9, -7.0),))},
     ],
 )
 def test_unusual_but_honest(changes: dict[str, Any]) -> None:
     given = submission(**changes)
-    assert same(read_bundle(bundle.bundle_bytes(given)), given)
+    assert same(read_bundle(bundle_bytes(given)), given)
 
 
 def test_a_hundred_frames_at_three_distances_take_milliseconds_and_half_a_megabyte() -> None:
@@ -95,7 +99,7 @@ def test_a_hundred_frames_at_three_distances_take_milliseconds_and_half_a_megaby
         for z in (0.3, 0.45, 0.6)
     ]
     given = submission(stacks=stacks)
-    data = bundle.bundle_bytes(given)
+    data = bundle_bytes(given)
     assert len(data) < 600_000
     assert same(read_bundle(data), given)
 
@@ -109,12 +113,12 @@ def test_depth_that_never_changes_is_no_zip_bomb(value: int) -> None:
     """All invalid, or frozen: weak, but honest. It is stored, for deflate shrinks it 800 times."""
     counts = np.full((100, 40, 40), value, np.uint16)
     given = submission(stacks=[Stack(0.3, (0, 0, 40, 40), counts, np.arange(100) / 30)])
-    assert same(read_bundle(bundle.bundle_bytes(given)), given)
+    assert same(read_bundle(bundle_bytes(given)), given)
 
 
 def test_same_bytes_every_time() -> None:
-    assert bundle.bundle_bytes(submission()) == HONEST
-    assert bundle.bundle_bytes(read_bundle(HONEST)) == HONEST
+    assert bundle_bytes(submission()) == HONEST
+    assert bundle_bytes(read_bundle(HONEST)) == HONEST
 
 
 def test_arrays_that_lie_differently_in_memory_give_the_same_bytes() -> None:
@@ -123,18 +127,18 @@ def test_arrays_that_lie_differently_in_memory_give_the_same_bytes() -> None:
     spread = np.repeat(stack.times_s, 2)[::2]
     again = Stack(stack.distance_m, stack.window, turned, spread)
     stacks = (again, submission().stacks[1])
-    assert bundle.bundle_bytes(submission(stacks=stacks)) == HONEST
+    assert bundle_bytes(submission(stacks=stacks)) == HONEST
 
 
 # --- writing ---
 
 
 def test_never_overwritten_without_being_told(tmp_path: Path) -> None:
-    path = bundle.write_bundle(tmp_path / "a.zip", submission())
+    path = write_bundle(tmp_path / "a.zip", submission())
     with pytest.raises(FileExistsError, match="overwrite=True"):
-        bundle.write_bundle(path, submission(student="Max"))
+        write_bundle(path, submission(student="Max"))
     assert path.read_bytes() == HONEST
-    bundle.write_bundle(path, submission(student="Max"), overwrite=True)
+    write_bundle(path, submission(student="Max"), overwrite=True)
     assert read_bundle(path).student == "Max"
 
 
@@ -148,7 +152,7 @@ def test_as_much_as_a_submission_may_hold_fits() -> None:
     word = "\U0001f9ff\U00010400" * 50  # 100 characters of 4 bytes each
     names = [f"{i:03d}_{'a' * 96}" for i in range(contents.MAX_ENTRIES)]
     numbers = (-1 / 3e9,) * contents.MAX_ENTRIES
-    row = dict.fromkeys(Row.__dataclass_fields__, 1000000000.0 - 1 / 3)
+    row = dict.fromkeys(TableRow.__dataclass_fields__, 1000000000.0 - 1 / 3)
     given = submission(
         student=word,
         stacks=stacks,
@@ -156,12 +160,12 @@ def test_as_much_as_a_submission_may_hold_fits() -> None:
         versions={
             word[:-2] + chr(0x10400 + i // 40) + chr(0x10400 + i % 40): word for i in range(100)
         },
-        claims=Claims([Row(**row | {"distance_m": 0.3 + i}) for i in range(12)]),
+        claims=Claims([TableRow(**row | {"distance_m": 0.3 + i}) for i in range(12)]),
         plot=Plot(numbers, numbers, numbers),
         conclusion=Conclusion(0.3, 10**6, "noise", word[:1] * 4_999 + "1"),
         outcomes={name: Outcome(False, 10**6) for name in names},
     )
-    data = bundle.bundle_bytes(given)
+    data = bundle_bytes(given)
     assert 4e6 < len(data) < 5 * 2**20
     assert same(read_bundle(data), given)
 
@@ -169,14 +173,14 @@ def test_as_much_as_a_submission_may_hold_fits() -> None:
 def test_interrupted_writing_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = bundle.write_bundle(tmp_path / "a.zip", submission())
+    path = write_bundle(tmp_path / "a.zip", submission())
 
     def full(*_: Any) -> None:
         raise OSError("No space left on device")
 
     monkeypatch.setattr(Path, "replace", full)
     with pytest.raises(OSError, match="No space"):
-        bundle.write_bundle(path, submission(student="Max"), overwrite=True)
+        write_bundle(path, submission(student="Max"), overwrite=True)
     assert path.read_bytes() == HONEST
     assert [p.name for p in tmp_path.iterdir()] == ["a.zip"]
 
@@ -250,7 +254,7 @@ def test_headers_of_all_versions_of_numpy(header: bytes) -> None:
 def test_arrays_are_numpys_own_format(shape: tuple[int, ...], dtype: str) -> None:
     rng = np.random.default_rng(7)
     given = rng.integers(0, 65535, shape).astype(dtype)
-    data = bundle.array_bytes(given, dtype)
+    data = array_bytes(given, dtype)
     found = np.load(io.BytesIO(data), allow_pickle=False)
     np.testing.assert_array_equal(found, given)
     assert found.dtype == given.dtype
@@ -264,7 +268,7 @@ def test_what_numpy_saves_is_read() -> None:
             buffer = io.BytesIO()
             np.save(buffer, values)
             saved[f"{kind}_{i}.npy"] = buffer.getvalue()
-    assert same(read_bundle(bundle.zip_bytes(hashed(MEMBERS | saved))), submission())
+    assert same(read_bundle(zip_bytes(hashed(MEMBERS | saved))), submission())
 
 
 # --- the format, as it is described ---
@@ -307,7 +311,7 @@ def test_a_bundle_written_by_hand() -> None:
     found = read_bundle(buffer.getvalue())
     assert found.student == "Zoë"
     assert found.camera.fx == 425
-    assert found.claims == Claims((Row(0.3, depth_std_mm=0.5, invalid_fraction=0),))
+    assert found.claims == Claims((TableRow(0.3, depth_std_mm=0.5, invalid_fraction=0),))
     assert found.conclusion == Conclusion(0.45, 30, "noise", "Z²\n")
     assert found.outcomes == {"depth_noise.width": Outcome(True, 1)}
     assert found.stacks[0].counts.tolist() == [[[300, 301]], [[0, 65535]]]
@@ -316,7 +320,7 @@ def test_a_bundle_written_by_hand() -> None:
 
 def test_the_page_on_the_format_shows_all_keys_and_caps() -> None:
     page = FORMAT.read_text(encoding="utf-8")
-    kinds = (CameraFacts, Row, Claims, Plot, Conclusion, Outcome)
+    kinds = (CameraFacts, TableRow, Claims, Plot, Conclusion, Outcome)
     for kind in kinds:
         for name in kind.__dataclass_fields__:
             assert f'"{name}"' in page, name
@@ -335,7 +339,7 @@ def test_the_page_on_the_format_shows_all_keys_and_caps() -> None:
 
 
 def test_numbers_become_plain_and_lists_become_tuples() -> None:
-    row = Row(np.float32(0.5), depth_std_mm=np.float64(1.5), invalid_fraction=np.int64(0))
+    row = TableRow(np.float32(0.5), depth_std_mm=np.float64(1.5), invalid_fraction=np.int64(0))
     assert asdict(row)["depth_std_mm"] == 1.5
     assert {type(v) for v in asdict(row).values()} == {float, type(None)}
     claims = Claims([row], sigma_d_interval_px=np.array([0.1, 0.2]))
@@ -356,12 +360,12 @@ def test_nobody_can_change_a_stack() -> None:
 @pytest.mark.parametrize(
     ("make", "name"),
     [
-        (lambda: Row(None), "distance_m"),
-        (lambda: Row(0.3, float("nan")), "depth_bias_mm"),
-        (lambda: Row(0.3, 1 + 2j), "depth_bias_mm"),
-        (lambda: Row(0.3, 10**5000), "depth_bias_mm"),
-        (lambda: Row(0.3, np.array([1.0, 2.0])), "depth_bias_mm"),
-        (lambda: Claims((Row(0.3), Row(0.3))), "rows"),
+        (lambda: TableRow(None), "distance_m"),
+        (lambda: TableRow(0.3, float("nan")), "depth_bias_mm"),
+        (lambda: TableRow(0.3, 1 + 2j), "depth_bias_mm"),
+        (lambda: TableRow(0.3, 10**5000), "depth_bias_mm"),
+        (lambda: TableRow(0.3, np.array([1.0, 2.0])), "depth_bias_mm"),
+        (lambda: Claims((TableRow(0.3), TableRow(0.3))), "rows"),
         (lambda: Claims([{"distance_m": 0.3}]), "rows"),
         (lambda: Claims(exponent_interval=(2, float("inf"))), "exponent_interval"),
         (lambda: Plot((0.3,), (1.0,), ()), "plot"),

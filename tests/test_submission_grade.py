@@ -16,12 +16,11 @@ from hypothesis import strategies as st
 
 from coursekit import cli
 from coursekit.submission import rubric
-from coursekit.submission.contents import Claims, Conclusion, Plot, Stack, Submission
-from coursekit.submission.flags import Fingerprint, compare, fingerprint
-from coursekit.submission.recompute import recompute
+from coursekit.submission.flags import Fingerprint, copies, fingerprint
+from coursekit.submission.format import Claims, Conclusion, Plot, Stack, Submission
+from coursekit.submission.recompute import RULES, grading_rules, recompute
 from coursekit.submission.report import student_page
-from coursekit.submission.rubric import MISTAKES, Item, check, grade
-from coursekit.submission.rules import RULES, rules
+from coursekit.submission.rubric import MISTAKES, Item, grade, shortcomings
 
 FIELDS = {
     "bias": "depth_bias_mm",
@@ -62,12 +61,12 @@ def test_honest_work_gets_full_points_and_no_flag(seed: int) -> None:
 
 
 def test_check_says_nothing_about_honest_work(good: Submission) -> None:
-    assert check(good) == ()
+    assert shortcomings(good) == ()
 
 
 def test_check_is_the_graders_own_sentences() -> None:
     poor = samples.weak(1)
-    says = check(poor)
+    says = shortcomings(poor)
     assert "0.60 m has 84 frames, 100 are needed." in says
     assert "0.30 m is missing: 100 frames of raw depth are needed there." in says
     assert says == tuple(i.says for i in grade(poor).items if i.verdict != "right")
@@ -271,13 +270,13 @@ def test_the_sentence_of_a_turned_sign(good: Submission) -> None:
 
 
 def test_every_mistake_has_a_credit_and_a_sample() -> None:
-    assert set(rules()["credit"]) == set(MISTAKES)
+    assert set(grading_rules()["credit"]) == set(MISTAKES)
     assert set(MISTAKEN) == set(MISTAKES)
-    assert all(0 < part < 1 for part in rules()["credit"].values())
+    assert all(0 < part < 1 for part in grading_rules()["credit"].values())
 
 
 def test_points_are_a_hundred() -> None:
-    points = rules()["points"]
+    points = grading_rules()["points"]
     each = sum(points[topic] for topic in ("data", *FIELDS))
     assert 3 * each + sum(points.values()) - each == 100
 
@@ -306,7 +305,7 @@ def test_no_prediction_is_none_and_keeps_half(known: Submission) -> None:
     found = item(silent, "plot")
     assert (found.points, found.verdict, found.mistake) == (3, "partial", "no_prediction")
     assert "without your prediction" in found.says
-    assert check(silent) == (found.says,)
+    assert shortcomings(silent) == (found.says,)
     two = Plot(known.plot.distances_m[:2], known.plot.measured_mm[:2], None)
     found = item(replace(known, plot=two), "plot")
     assert (found.points, found.mistake) == (2, "no_prediction")
@@ -320,7 +319,7 @@ def test_a_wrong_std_is_named_once(known: Submission) -> None:
     stds[1] *= 10
     wrong = samples.with_row(known, 1, depth_std_mm=stds[1])
     wrong = replace(wrong, plot=replace(known.plot, measured_mm=tuple(stds)))
-    assert [says.partition(":")[0] for says in check(wrong)] == ["Std of depth at 0.45 m"]
+    assert [says.partition(":")[0] for says in shortcomings(wrong)] == ["Std of depth at 0.45 m"]
     assert "in your table, which is judged there (0.45 m)" in item(wrong, "plot").says
     only_there = replace(known, plot=wrong.plot)  # not in the table: the plot's own fault
     assert item(only_there, "plot").verdict == "partial"
@@ -357,11 +356,11 @@ def test_a_typing_error_in_the_rubric_is_one_line(
     assert content.count(old) == 1
     broken = tmp_path / "rubric.toml"
     broken.write_text(content.replace(old, new + "#" * (old[-1] == " ")), encoding="utf-8")
-    monkeypatch.setattr("coursekit.submission.rules.RULES", broken)
-    rules.cache_clear()
+    monkeypatch.setattr("coursekit.submission.recompute.RULES", broken)
+    grading_rules.cache_clear()
     try:
         with pytest.raises(ValueError, match=message) as raised:
-            check(good)
+            shortcomings(good)
         assert "\n" not in str(raised.value)
         out = tmp_path / "out"
         out.mkdir()
@@ -371,7 +370,7 @@ def test_a_typing_error_in_the_rubric_is_one_line(
         assert capsys.readouterr().err == f"coursekit: {raised.value}\n"
         assert [path.read_text(encoding="utf-8") for path in out.iterdir()] == ["good"]
     finally:
-        rules.cache_clear()
+        grading_rules.cache_clear()
 
 
 # --- what is missing, or cannot be compared -------------------------------------------------------
@@ -530,7 +529,7 @@ def test_a_copy_is_found(how: str, unit: float, others: dict[str, Fingerprint]) 
     original = samples.honest(1, of_camera={"depth_scale_m": unit})
     copy = samples.copied(original, how)
     prints = others | {"original": fingerprint(original), "copy": fingerprint(copy)}
-    found = compare(prints)
+    found = copies(prints)
     assert [set(one.keys) for one in found] == [{"original", "copy"}]
     assert found[0].code == ("identical" if how == "identical" else "nearly_identical")
     assert not found[0].note
@@ -540,11 +539,11 @@ def test_a_copy_is_found_in_the_other_order(others: dict[str, Fingerprint]) -> N
     original = samples.honest(1)
     copy = fingerprint(samples.copied(original, "subset"))
     prints = {"copy": copy} | others | {"original": fingerprint(original)}
-    assert [set(one.keys) for one in compare(prints)] == [{"original", "copy"}]
+    assert [set(one.keys) for one in copies(prints)] == [{"original", "copy"}]
 
 
 def test_strangers_are_not_copies(others: dict[str, Fingerprint]) -> None:
-    assert compare(others) == []
+    assert copies(others) == []
 
 
 def test_two_measurements_with_one_camera_at_one_place_are_not_copies() -> None:
@@ -566,7 +565,7 @@ def test_two_measurements_with_one_camera_at_one_place_are_not_copies() -> None:
             for z in samples.DISTANCES
         )
         prints[who] = fingerprint(replace(samples.honest(0), stacks=stacks, student=who))
-    assert compare(prints) == []
+    assert copies(prints) == []
 
 
 def test_two_simulations_of_one_camera_are_a_note() -> None:
@@ -574,7 +573,7 @@ def test_two_simulations_of_one_camera_are_a_note() -> None:
     prints = {
         who: fingerprint(samples.honest(3, of_camera=facts, student=who)) for who in ("one", "two")
     }
-    found = compare(prints)
+    found = copies(prints)
     assert [one.note for one in found] == [True]
     assert "gives everybody the same" in found[0].says
 
@@ -583,20 +582,20 @@ def test_a_simulation_declared_as_live_shares_its_depths_with_the_others() -> No
     facts = {"source": "simulated", "name": "Simulated D435", "serial": "seed-7"}
     one = samples.honest(3, of_camera=facts)
     two = replace(one, student="Two", camera=samples.camera(3))
-    found = compare({"one": fingerprint(one), "two": fingerprint(two)})
+    found = copies({"one": fingerprint(one), "two": fingerprint(two)})
     assert [copy.note for copy in found] == [False]
 
 
 def test_a_student_who_hands_in_twice_is_a_note(good: Submission) -> None:
     again = fingerprint(replace(good, student=good.student.upper()))
-    assert [c.note for c in compare({"one": fingerprint(good), "two": again})] == [True]
+    assert [c.note for c in copies({"one": fingerprint(good), "two": again})] == [True]
 
 
 def test_a_fingerprint_goes_through_json(good: Submission, others: dict[str, Fingerprint]) -> None:
     there = json.dumps(fingerprint(good).to_dict())
     assert len(there) < 25_000
     back = Fingerprint.from_dict(json.loads(there))
-    assert [set(c.keys) for c in compare(others | {"a": fingerprint(good), "b": back})] == [
+    assert [set(c.keys) for c in copies(others | {"a": fingerprint(good), "b": back})] == [
         {"a", "b"}
     ]
 
@@ -619,7 +618,7 @@ def test_a_thousand_bundles_are_compared_in_seconds(others: dict[str, Fingerprin
     for i in range(800):
         prints[f"repeated {i}"] = replace(prints[f"own {i % 25}"], student=f"repeated {i}")
     started = time.process_time()
-    found = compare(prints)
+    found = copies(prints)
     assert time.process_time() - started < 15  # some 2 s on a quiet machine
     assert len(found) == 25
     assert all(one.code == "identical" for one in found)
@@ -627,7 +626,7 @@ def test_a_thousand_bundles_are_compared_in_seconds(others: dict[str, Fingerprin
 
 def test_an_empty_bundle_is_like_no_other(good: Submission) -> None:
     nothing = fingerprint(empty(good))
-    assert compare({"one": nothing, "two": nothing}) == []
+    assert copies({"one": nothing, "two": nothing}) == []
 
 
 def test_a_plot_without_points_is_missing(good: Submission) -> None:

@@ -18,8 +18,8 @@ import pytest
 import sample_submissions as samples
 
 from coursekit.submission import report
-from coursekit.submission.contents import Stack, Submission
 from coursekit.submission.flags import Flag, same_words
+from coursekit.submission.format import Stack, Submission
 from coursekit.submission.rubric import LABELS, MISTAKES, Grade, grade
 
 VOID = {"meta", "br", "img", "hr", "input", "link"}
@@ -89,19 +89,19 @@ def own_words(submission: Submission, seed: int) -> Submission:
     return replace(submission, conclusion=replace(submission.conclusion, paragraph=said))
 
 
-def said_by(student: str, paragraph: str, **more: Any) -> report.Line:
+def said_by(student: str, paragraph: str, **more: Any) -> report.ReportLine:
     """A graded line with nothing but a paragraph."""
     fields = {"points": 1.0, "of": 2.0, "page": f"students/{student}.html"} | more
-    return report.Line(f"{student}.zip", student, paragraph=paragraph, **fields)
+    return report.ReportLine(f"{student}.zip", student, paragraph=paragraph, **fields)
 
 
-def notes(lines: Iterable[report.Line], code: str) -> dict[str, str]:
+def notes(lines: Iterable[report.ReportLine], code: str) -> dict[str, str]:
     """What the flags of a kind say, by the bundle's name."""
     return {line.file: flag.says for line in lines for flag in line.flags if flag.code == code}
 
 
 @pytest.fixture(scope="module")
-def lines() -> list[report.Line]:
+def lines() -> list[report.ReportLine]:
     """A small class."""
     handed = [
         samples.honest(0),
@@ -220,7 +220,7 @@ def test_a_students_text_stays_text(text: str) -> None:
 # --- the class page -------------------------------------------------------------------------------
 
 
-def test_the_class_page_has_everything(lines: list[report.Line]) -> None:
+def test_the_class_page_has_everything(lines: list[report.ReportLine]) -> None:
     page = check_page(report.class_page(lines))
     assert "6 bundles graded, 1 not graded, 3 flagged." in page.text
     assert "zip_bomb" in page.text
@@ -233,13 +233,13 @@ def test_the_class_page_has_everything(lines: list[report.Line]) -> None:
             assert flag.says in page.text
 
 
-def test_a_flag_that_several_share_is_said_once(lines: list[report.Line]) -> None:
+def test_a_flag_that_several_share_is_said_once(lines: list[report.ReportLine]) -> None:
     copies = [flag for line in lines for flag in line.flags if flag.code == "nearly_identical"]
     assert len(copies) == 2
     assert report.class_page(lines).count(escape(copies[0].says)) == 1
 
 
-def test_notes_are_no_suspicion(lines: list[report.Line]) -> None:
+def test_notes_are_no_suspicion(lines: list[report.ReportLine]) -> None:
     noted = replace(lines[0], flags=(Flag("identical", "The same by right.", note=True),))
     text = report.class_page([noted])
     assert "0 flagged" in text
@@ -293,7 +293,7 @@ def test_every_mistake_is_on_the_page_not_the_most_frequent_alone() -> None:
                 assert escape(MISTAKES[item.mistake]) in text
 
 
-def test_everybody_is_by_points_and_by_name(lines: list[report.Line]) -> None:
+def test_everybody_is_by_points_and_by_name(lines: list[report.ReportLine]) -> None:
     text = report.class_page(lines)
     ranked, named = text.partition("Everybody, lowest points first")[2].split("Everybody by name")
     done = [line for line in lines if line.points is not None]
@@ -413,7 +413,7 @@ def test_twins_of_a_bundle_with_a_near_copy_are_all_flagged() -> None:
     assert "(a.zip, b.zip, c.zip)" in notes(found, "nearly_identical")["b.zip"]
 
 
-def test_all_paragraphs_are_on_a_page_with_name_and_link(lines: list[report.Line]) -> None:
+def test_all_paragraphs_are_on_a_page_with_name_and_link(lines: list[report.ReportLine]) -> None:
     earlier = replace(said_by("Old", "words of old"), counts=False)
     silent = said_by("Silent", "  ")
     text = report.paragraphs_page([*lines, earlier, silent])
@@ -438,7 +438,9 @@ def read(text: str) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(text)))
 
 
-def test_the_table_has_a_row_a_bundle_and_points_that_add_up(lines: list[report.Line]) -> None:
+def test_the_table_has_a_row_a_bundle_and_points_that_add_up(
+    lines: list[report.ReportLine],
+) -> None:
     rows = read(report.grades_csv(lines))
     assert len(rows) == len(lines)
     assert tuple(rows[0]) == report.HEADER
@@ -462,7 +464,7 @@ def test_the_table_has_a_row_a_bundle_and_points_that_add_up(lines: list[report.
     ["=1+1", "+1", "-1", "@A1", "\t=1", "\r=1", "\n=1", " =1", "＝1", "=cmd|' /C calc'!A0"],
 )
 def test_a_cell_is_never_a_formula(text: str) -> None:
-    line = report.Line(text, student=text, points=1.0, of=2.0)
+    line = report.ReportLine(text, student=text, points=1.0, of=2.0)
     for row in read(report.grades_csv([line, report.not_graded(text, text, text)])):
         for cell in row.values():
             assert not cell.lstrip().startswith(report.FORMULA)
@@ -471,13 +473,13 @@ def test_a_cell_is_never_a_formula(text: str) -> None:
 
 def test_an_ordinary_name_stays_as_it_is() -> None:
     name = 'Zoë "Z" O\'Neil-Żak, Jr.'
-    row = read(report.grades_csv([report.Line("a.zip", student=name, points=1.0, of=2.0)]))[0]
+    row = read(report.grades_csv([report.ReportLine("a.zip", student=name, points=1.0, of=2.0)]))[0]
     assert row["student"] == name
     assert row["percent"] == "50.0"
 
 
-def test_a_line_goes_through_json(lines: list[report.Line]) -> None:
-    back = [report.Line.from_dict(json.loads(json.dumps(line.to_dict()))) for line in lines]
+def test_a_line_goes_through_json(lines: list[report.ReportLine]) -> None:
+    back = [report.ReportLine.from_dict(json.loads(json.dumps(line.to_dict()))) for line in lines]
     assert report.class_page(back) == report.class_page(lines)
     assert report.grades_csv(back) == report.grades_csv(lines)
 

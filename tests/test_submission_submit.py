@@ -15,11 +15,16 @@ from coursekit import cli, results
 from coursekit.cameras.simulated import SimulatedCamera
 from coursekit.lessons import progress
 from coursekit.results import Quantity
-from coursekit.submission.bundle import write_bundle
-from coursekit.submission.contents import Conclusion, Plot, Row, Submission
-from coursekit.submission.reader import read_bundle
-from coursekit.submission.rubric import check, grade
-from coursekit.submission.rules import rules
+from coursekit.submission.format import (
+    Conclusion,
+    Plot,
+    Submission,
+    TableRow,
+    read_bundle,
+    write_bundle,
+)
+from coursekit.submission.recompute import grading_rules
+from coursekit.submission.rubric import grade, shortcomings
 from coursekit.submission.submit import (
     MEASURED,
     NOBODY,
@@ -55,7 +60,7 @@ def right_conclusion(kept: Submission) -> dict[str, object]:
     """The conclusion that the kept measurement bears out."""
     for dominates in ("bias", "noise"):
         conclusion = Conclusion(0.45, 30, dominates, PARAGRAPH)
-        if not check(replace(kept, conclusion=conclusion)):
+        if not shortcomings(replace(kept, conclusion=conclusion)):
             break
     return {"distance_m": 0.45, "frames": 30, "dominates": dominates, "paragraph": PARAGRAPH}
 
@@ -129,7 +134,7 @@ def test_a_fitted_exponent_is_claimed_and_what_is_not_in_the_table_is_left_out(b
     claims = load().claims
     assert claims.exponent == law.exponent
     assert claims.exponent_interval == pytest.approx(law.exponent_interval)
-    assert claims.rows == (Row(0.45, depth_std_mm=0.6, depth_std_se_mm=0.01), Row(0.60))
+    assert claims.rows == (TableRow(0.45, depth_std_mm=0.6, depth_std_se_mm=0.01), TableRow(0.60))
     assert load().plot is None
 
 
@@ -169,11 +174,11 @@ def test_units_are_respected_and_own_numbers_take_their_place(block, own_results
         "invalid_at_450_mm": Quantity(2.0, "%"),
     }
     keep(camera, [one], found, law, None, 0.0, 0.06)
-    assert load().claims.rows == (Row(0.45, 1e3 * -0.0018, 1e3 * 0.0003, 0.6, 0.01, 0.02),)
+    assert load().claims.rows == (TableRow(0.45, 1e3 * -0.0018, 1e3 * 0.0003, 0.6, 0.01, 0.02),)
     assert load().plot.predicted_mm is None
     table = {0.45: (None, None, 0.7, np.float64(0.02), None)}
     keep(camera, [one], found, law, [0.65], 0.0, 0.06, table)
-    assert load().claims.rows == (Row(0.45, 1e3 * -0.0018, 1e3 * 0.0003, 0.7, 0.02, 0.02),)
+    assert load().claims.rows == (TableRow(0.45, 1e3 * -0.0018, 1e3 * 0.0003, 0.7, 0.02, 0.02),)
     assert load().plot == Plot((0.45,), (0.7,), (0.65,))
 
 
@@ -219,7 +224,7 @@ def test_what_is_weak_is_said_in_the_graders_words_and_packed_all_the_same(kept,
     handed = submit("Ben")
     assert handed.path is not None
     assert any(says.startswith("0.60 m has 84 frames, 100 are needed") for says in handed.says)
-    assert handed.says == check(read_bundle(handed.path))
+    assert handed.says == shortcomings(read_bundle(handed.path))
 
 
 def test_a_bundle_is_never_overwritten_without_being_told(kept, own_results):
@@ -260,15 +265,15 @@ def test_a_notebook_shows_an_error_in_one_line(kept, own_results):
 def test_a_typing_error_in_the_rubric_is_an_error_here_too(kept, own_results, monkeypatch, capsys):
     broken = own_results.parent / "rubric.toml"
     broken.write_text("[points]\nbias = 'six'\n", encoding="utf-8")
-    monkeypatch.setattr("coursekit.submission.rules.RULES", broken)
-    rules.cache_clear()
+    monkeypatch.setattr("coursekit.submission.recompute.RULES", broken)
+    grading_rules.cache_clear()
     try:
         with pytest.raises(ValueError, match=r"^rubric\.toml: exercise: is missing$"):
             submit("Ada")
         assert cli.main(["submit", "--student", "Ada"]) == 1
         assert capsys.readouterr().err == "coursekit: rubric.toml: exercise: is missing\n"
     finally:
-        rules.cache_clear()
+        grading_rules.cache_clear()
     assert [path.name for path in own_results.iterdir()] == [MEASURED]
 
 

@@ -30,8 +30,7 @@ from coursekit.simulation.diagnosis_power import power
 from coursekit.simulation.hand_eye_sessions import SIMULATED, rendered_session
 from coursekit.simulation.sessions import Effects, view_poses
 from coursekit.specifications import DATA
-from coursekit.submission.bundle import bundle_bytes, write_bundle
-from coursekit.submission.contents import Conclusion, Stack, Submission
+from coursekit.submission.format import Conclusion, Stack, Submission, bundle_bytes, write_bundle
 from coursekit.submission.submit import measured
 from tools import build_notebooks
 
