@@ -54,6 +54,10 @@ def _template() -> jinja2.Template:
     return pages.get_template("report.html.jinja")
 
 
+def _page(**values: Any) -> str:
+    return _template().render(**values).lstrip()
+
+
 @dataclass(frozen=True)
 class ReportLine:
     """One bundle in the class: graded, or not and why.
@@ -195,7 +199,7 @@ def student_page(grade: Grade, submission: Submission) -> str:
     """A student's page: points, plot, table and a sentence on everything; no flags."""
     camera = submission.camera
     baseline = "unknown" if camera.baseline_m is None else f"{1e3 * camera.baseline_m:.2f} mm"
-    return _template().render(
+    return _page(
         what="student",
         submission=submission,
         grade=grade,
@@ -412,7 +416,7 @@ def class_page(lines: Sequence[ReportLine]) -> str:
     percents = [line.percent or 0.0 for line in counts]
     named = sorted(counts, key=lambda line: (person(line.student), line.file))
     ask_first = "No points were taken for these. Ask first: there may be an innocent reason."
-    return _template().render(
+    return _page(
         what="class",
         done=done,
         counts=counts,
@@ -461,7 +465,7 @@ def paragraphs_page(lines: Sequence[ReportLine]) -> str:
     some.sort(key=lambda line: (person(line.student), line.file))
     said = [(line, _about(line)) for line in some if line.paragraph.strip()]
     silent = [line for line in some if not line.paragraph.strip()]
-    return _template().render(what="paragraphs", said=said, silent=silent)
+    return _page(what="paragraphs", said=said, silent=silent)
 
 
 def _about(line: ReportLine) -> str:
