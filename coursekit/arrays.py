@@ -5,11 +5,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["AnyArray", "ArrayLike", "Bools", "Floats", "Image", "Integers", "Interval", "NDArray"]
-
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Bools = NDArray[np.bool_]
-Image = NDArray[np.uint8]  # grey (H, W) or BGR (H, W, 3)
+Mask = Bools
+Grey = NDArray[np.uint8]  # a grey image (H, W)
 AnyArray = NDArray[Any]
 Interval = tuple[float, float]  # low and high end, mostly of 95 %
+Window = tuple[int, int, int, int]  # left, top, width, height, px
+__all__ = [
+    "AnyArray",
+    "ArrayLike",
+    "Bools",
+    "Floats",
+    "Grey",
+    "Integers",
+    "Interval",
+    "Mask",
+    "NDArray",
+    "Window",
+]

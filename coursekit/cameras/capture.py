@@ -17,9 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from coursekit import results
 from coursekit.boards import Board, BoardNotFound, Detection, Detections, Skipped, detect
-from coursekit.boards.detect import FEWEST_CORNERS
+from coursekit.boards.detector import FEWEST_CORNERS, SESSION
 from coursekit.boards.find import find
-from coursekit.boards.folder import SESSION
 from coursekit.cameras.camera import Camera, CameraError, check_count
 from coursekit.cameras.guidance import guidance, middle_of
 from coursekit.cameras.live_view import Screen, screen_for

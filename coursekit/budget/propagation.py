@@ -12,20 +12,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from coursekit.budget.terms import skew
+from coursekit.arrays import ArrayLike, Floats
 from coursekit.budget.view import View, positive
-from coursekit.geometry import check_transform, distortion_jacobian
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    from coursekit.hand_eye.poses import Mount
-
-    Floats = NDArray[np.float64]
+from coursekit.geometry import check_transform, cross_matrix, distortion_jacobian
+from coursekit.hand_eye.poses import Mount
 
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 CHUNK = 65_536  # samples at a time: what one step needs stays in the cache
@@ -154,8 +147,8 @@ def jacobian(chain: Chain, names: tuple[str, ...] = ("fx", "fy", "cx", "cy")) ->
     """d p_base / d(u, v, Z, K, twist of X, twist of the arm), (3, 15 + p)."""
     view, R = chain.view, chain.view.R_base_camera
     frame = chain.R_base_frame
-    turned = -skew(view.lever_base) @ frame
-    arm = np.concatenate([-skew(chain.arm_lever), np.eye(3)], axis=1)
+    turned = -cross_matrix(view.lever_base) @ frame
+    arm = np.concatenate([-cross_matrix(chain.arm_lever), np.eye(3)], axis=1)
     parts = (
         R @ pixel_jacobian(view),
         (R @ view.ray)[:, None],

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
+from coursekit.arm import Arm, FkErrors
+from coursekit.arrays import ArrayLike
+from coursekit.boards import Board, Detection
+from coursekit.geometry import Intrinsics
 from coursekit.hand_eye.closed_form import CLOSED_FORMS, FEWEST
-from coursekit.hand_eye.data import HandEyeData
 from coursekit.hand_eye.poses import Mount, check_mount
-from coursekit.hand_eye.refine import refine, refine_poses
-from coursekit.hand_eye.result import HandEyeResult
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from coursekit.arm import Arm, FkErrors
-    from coursekit.boards import Board, Detection
-    from coursekit.geometry import Intrinsics
+from coursekit.hand_eye.refinement import refine, refine_poses
+from coursekit.hand_eye.result import HandEyeData, HandEyeResult
 
 __all__ = ["FEWEST", "METHODS", "HandEyeResult", "solve"]
 

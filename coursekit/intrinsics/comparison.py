@@ -11,10 +11,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from coursekit.arrays import Floats
+from coursekit.boards import Board, Detection
 from coursekit.geometry import Intrinsics, deproject, project
 from coursekit.intrinsics.derivatives import (
     moved,
@@ -25,24 +26,15 @@ from coursekit.intrinsics.derivatives import (
 from coursekit.intrinsics.fit import (
     IntrinsicsResult,
     calibrate,
+    check_range,
+    image_grid,
     one_thread,
     p_text,
     parameter_vector,
-)
-from coursekit.intrinsics.uncertainty import (
-    check_range,
-    image_grid,
     projection_columns,
     uncertainty_map,
     worst_direction,
 )
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from coursekit.boards import Board, Detection
-
-    Floats = NDArray[np.float64]
 
 SHAPE = (30, 40)
 STEPS = 20

@@ -4,6 +4,11 @@ At corner level (`hand_eye_session`, milliseconds) corners are projected and get
 with images (`rendered_session`) a renderer takes the pictures and the detector finds the board. The
 arm's own errors come from `SimulatedArm`. What the session reports is what a student would have;
 what is true is in `HandEyeTruth`, and both can be made again from the seed.
+
+Tests of a hand-eye calibration in the world: touch the board, look with two cameras.
+
+The simulated arm is really at the place; what it *reports* is its own forward kinematics, so its
+hidden errors show, as they would on a table.
 """
 
 from __future__ import annotations
@@ -11,23 +16,23 @@ from __future__ import annotations
 import json
 import os
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coursekit.arm import ArmErrors, SimulatedArm, widowx
+from coursekit.arrays import Floats, NDArray
 from coursekit.boards import Board, BoardNotFound, Detection, Detections, detect
-from coursekit.boards.folder import SESSION
-from coursekit.geometry import invert_transform, project, transform_points
+from coursekit.boards.detector import SESSION
+from coursekit.geometry import invert_transform, make_transform, project, transform_points
 from coursekit.hand_eye.poses import Mount, camera_board, check_mount, turned
 from coursekit.hand_eye.session import HandEyeSession
-from coursekit.simulation.board_images import render_board
-from coursekit.simulation.hand_eye_poses import (
+from coursekit.simulation.arm_poses import (
     BORDER_PX,
     Setup,
     board_in_gripper,
@@ -39,12 +44,8 @@ from coursekit.simulation.hand_eye_poses import (
     small_rotations,
     translation_grid,
 )
+from coursekit.simulation.board_images import render_board
 from coursekit.specifications import device
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Floats = NDArray[np.float64]
 
 Design = Literal["careful", "grid", "single_axis", "small_rotations"]
 Degrees = Literal["", "joints", "rotation_vectors"]
@@ -426,3 +427,74 @@ def _shifted(session: HandEyeSession, by: int) -> HandEyeSession:
     images = session.pick(arm + by)
     rows = session.pick(arm)
     return replace(images, T_base_gripper=rows.T_base_gripper, q=rows.q, dq=rows.dq)
+
+
+# the gripper points down (its x to the table), its fingers close along the base's y
+POINTS_DOWN = np.column_stack([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+SEEN_TO_M = 2e-4  # std along each axis of where one camera puts a target in its own frame
+
+
+def touch_corners(truth: HandEyeTruth, corners: Sequence[int] = (0, 7, 39)) -> Floats:
+    """Where the arm says its fingertip is when it is on corners of the board on the table.
+
+    truth: of an eye-in-hand session. corners (k,): ids. Returns (k, 3), m, in the base by the
+    arm's own forward kinematics; the fingertip is really on the corner.
+    Raises ValueError for another mount, and for a corner out of the arm's reach.
+    """
+    if truth.mount != "eye_in_hand":
+        raise ValueError(f"truth: got {truth.mount}, the board has to lie on the table")
+    places = transform_points(truth.setup.Y, truth.setup.board.points[list(corners)])
+    poses = np.stack([make_transform(POINTS_DOWN, place) for place in places])
+    return np.asarray(_reported_poses(truth.arm, poses, "corners")[:, :3, 3])
+
+
+@dataclass(frozen=True, eq=False)
+class SharedTarget:
+    """One point on the table, as two cameras see it at the same time.
+
+    T_base_gripper (4, 4): where the arm says the gripper is while its camera looks.
+    in_wrist_camera, in_shoulder_camera (3,): the point in either camera's frame, m.
+    """
+
+    T_base_gripper: Floats
+    in_wrist_camera: Floats
+    in_shoulder_camera: Floats
+
+
+def shared_target(
+    on_wrist: HandEyeTruth, over_shoulder: HandEyeTruth, view: int = 0, seed: int = 0
+) -> SharedTarget:
+    """The middle of the board on the table, seen from view `view` of the wrist and from above.
+
+    Both cameras are good to 0.2 mm along each axis in their own frames.
+    Raises ValueError for sessions of other mounts.
+    """
+    if (on_wrist.mount, over_shoulder.mount) != ("eye_in_hand", "eye_to_hand"):
+        raise ValueError(
+            f"on_wrist, over_shoulder: got {on_wrist.mount} and {over_shoulder.mount}, want an "
+            "eye_in_hand and an eye_to_hand session"
+        )
+    rng = np.random.default_rng(seed)
+    middle = on_wrist.setup.board.points.mean(axis=0)
+    place = transform_points(on_wrist.Y[view], middle)
+    true = on_wrist.T_base_gripper[view]
+    near, far = (
+        transform_points(invert_transform(T), place) + SEEN_TO_M * rng.normal(size=3)
+        for T in (true @ on_wrist.setup.X, over_shoulder.setup.X)
+    )
+    return SharedTarget(_reported_poses(on_wrist.arm, true[None], "on_wrist")[0], near, far)
+
+
+def _reported_poses(arm: SimulatedArm, poses: Floats, name: str) -> Floats:
+    """Where forward kinematics puts grippers that really are at poses (n, 4, 4).
+
+    First order: the arm's error, a few mm, is taken from the nearest place that it can command.
+    """
+    nominal = arm.nominal
+    q, reached = nominal.inverse(poses)
+    if not reached.all():
+        raise ValueError(f"{name}: number {int(np.argmin(reached))} is out of the arm's reach")
+    read = arm.move(q)
+    computed = nominal.forward(read)
+    error = arm.true_pose() @ invert_transform(computed)  # about the base's origin
+    return np.asarray(invert_transform(error) @ poses)

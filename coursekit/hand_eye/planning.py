@@ -3,25 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from coursekit.geometry import project
-from coursekit.hand_eye.observability import POSITION_M, ROTATION_RAD, units
+from coursekit.arm import Arm
+from coursekit.arrays import ArrayLike, Floats, NDArray
+from coursekit.boards import Board
+from coursekit.geometry import Intrinsics, project
 from coursekit.hand_eye.poses import camera_board, check_poses
-from coursekit.hand_eye.refine import by_X_and_Y
-from coursekit.hand_eye.views import PixelViews
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    from coursekit.arm import Arm
-    from coursekit.boards import Board
-    from coursekit.geometry import Intrinsics
-    from coursekit.hand_eye.result import HandEyeResult
-
-    Floats = NDArray[np.float64]
+from coursekit.hand_eye.refinement import PixelViews, by_X_and_Y
+from coursekit.hand_eye.result import POSITION_M, ROTATION_RAD, HandEyeResult, units
 
 CORNER_PX = 0.1  # corner noise where no images have told
 BORDER_PX = 10.0

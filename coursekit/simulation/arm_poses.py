@@ -8,12 +8,13 @@ turns about one axis only, turns of a few degrees.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coursekit.arm import Arm
+from coursekit.arrays import ArrayLike, Floats, Mask, NDArray
 from coursekit.boards import Board
 from coursekit.geometry import (
     Intrinsics,
@@ -24,12 +25,6 @@ from coursekit.geometry import (
     project,
     undistort,
 )
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    Floats = NDArray[np.float64]
-    Mask = NDArray[np.bool_]
 
 Mount = Literal["eye_in_hand", "eye_to_hand"]
 

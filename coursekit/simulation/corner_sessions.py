@@ -8,18 +8,13 @@ each view, and for a rolling shutter the row at which each corner is really seen
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from coursekit.arrays import Floats, NDArray
 from coursekit.boards import Board, Detection, Detections
 from coursekit.geometry import Intrinsics, deproject, fold_radius, project, transform_points
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Floats = NDArray[np.float64]
 
 BORDER_PX = 6.0  # a corner nearer to the image's border has no room for its refinement window
 PARTIAL_SHARE = 0.4  # a ChArUco view shows at least this share of the corners
