@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from coursekit import kernels
 from coursekit.arrays import ArrayLike, Floats, NDArray
+from coursekit.checks import array, number, transform, transforms
 
 MODELS = ("none", "brown_conrady", "inverse_brown_conrady", "modified_brown_conrady")
 NEWTON_STEPS = 50
@@ -47,13 +48,13 @@ class Intrinsics:
                 raise ValueError(f"{name}: got {value!r}, want a positive whole number of pixels")
             object.__setattr__(self, name, int(value))
         for name in ("fx", "fy", "cx", "cy"):
-            object.__setattr__(self, name, _number(name, getattr(self, name)))
+            object.__setattr__(self, name, number(name, getattr(self, name)))
         for name in ("fx", "fy"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name}: got {getattr(self, name)}, want a positive length in px")
         if self.model not in MODELS:
             raise ValueError(f"model: got {self.model!r}, want one of {', '.join(MODELS)}")
-        coeffs = _array("coeffs", self.coeffs, (5,), leading=False)
+        coeffs = array("coeffs", self.coeffs, (5,))
         if not np.isfinite(coeffs).all():
             raise ValueError(f"coeffs: got {coeffs.tolist()}, want finite numbers")
         object.__setattr__(self, "coeffs", tuple(coeffs.tolist()))
@@ -140,7 +141,7 @@ def project(points: ArrayLike, K: ArrayLike, dist: ArrayLike | None = None) -> F
     or not finite. Raises ValueError for a wrong shape, K or dist.
     Source: Brown (1971) as OpenCV's `projectPoints` states it.
     """
-    xyz = _array("points", points, (3,))
+    xyz = array("points", points, (3,), leading=True)
     K = _intrinsic_matrix(K)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         z = np.where(xyz[..., 2:] > 0, xyz[..., 2:], np.nan)
@@ -161,8 +162,8 @@ def deproject(
     the distortion has no inverse (`undistort` says which those are).
     Raises ValueError for a wrong shape, K or dist.
     """
-    uv = _array("pixels", pixels, (2,))
-    z = _array("depth_m", depth_m)
+    uv = array("pixels", pixels, (2,), leading=True)
+    z = array("depth_m", depth_m, leading=True)
     K = _intrinsic_matrix(K)
     try:
         shape = np.broadcast_shapes(uv.shape[:-1], z.shape)
@@ -187,7 +188,7 @@ def distort(xy: ArrayLike, dist: ArrayLike) -> Floats:
     xy (..., 2): X/Z and Y/Z. dist: (k1, k2, p1, p2, k3). Returns (..., 2).
     Source: OpenCV, "Camera Calibration and 3D Reconstruction", with k4..k6 = 0.
     """
-    xy = _array("xy", xy, (2,))
+    xy = array("xy", xy, (2,), leading=True)
     k1, k2, p1, p2, k3 = _coefficients(dist)
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
@@ -208,7 +209,7 @@ def undistort(xy: ArrayLike, dist: ArrayLike) -> tuple[Floats, NDArray[np.bool_]
     where there is no answer. A strong barrel distortion folds: past a radius the polynomial turns
     back, a pixel there belongs to no ray, and the mask says so instead of inventing one.
     """
-    target = _array("xy", xy, (2,))
+    target = array("xy", xy, (2,), leading=True)
     dist = _coefficients(dist)
     ideal = np.where(np.isfinite(target), target, np.nan).copy()
     determinant = np.full(target.shape[:-1], np.nan)
@@ -285,14 +286,14 @@ def deproject_image(
     """
     if not isinstance(intrinsics, Intrinsics):
         raise ValueError(f"intrinsics: got {type(intrinsics).__name__}, want Intrinsics")
-    image = depth if isinstance(depth, np.ndarray) else _array("depth", depth)
+    image = depth if isinstance(depth, np.ndarray) else array("depth", depth, leading=True)
     shape = (intrinsics.height, intrinsics.width)
     if image.shape != shape:
         raise ValueError(f"depth: got shape {image.shape}, want {shape} as the intrinsics say")
     if image.dtype.kind == "f":
         scale = 1.0
     elif image.dtype == np.uint16:
-        scale = _number("depth_scale_m", depth_scale_m)
+        scale = number("depth_scale_m", depth_scale_m)
         if scale <= 0:
             raise ValueError(f"depth_scale_m: got {scale}, want a positive number of metres")
     else:
@@ -333,11 +334,11 @@ def align_depth_to_color(
     that the depth camera measured; deprojecting that with the colour K is off by the rotation
     between the two cameras. Source of the footprint rule: librealsense, `src/proc/align.cpp`.
     """
-    depth = _array("depth_m", depth_m)
+    depth = array("depth_m", depth_m, leading=True)
     shape = (depth_intrinsics.height, depth_intrinsics.width)
     if depth.shape != shape:
         raise ValueError(f"depth_m: got shape {depth.shape}, want {shape} as the intrinsics say")
-    T = check_transform("T_color_depth", T_color_depth)
+    T = transform("T_color_depth", T_color_depth)
     source = _align_sources(depth, depth_intrinsics, color_intrinsics, T)
     grid = pixel_grid(*depth_intrinsics.size)
     points = deproject(grid, depth, depth_intrinsics.K, depth_intrinsics.dist)
@@ -366,30 +367,14 @@ def make_transform(rotation: Rotation | ArrayLike, translation: ArrayLike) -> Fl
     """The 4x4 transform of a rotation, (3, 3) or SciPy's, and a translation (3,) in m."""
     matrix = rotation.as_matrix() if hasattr(rotation, "as_matrix") else rotation
     T = np.eye(4)
-    T[:3, :3] = _array("rotation", matrix, (3, 3), leading=False)
-    T[:3, 3] = _array("translation", translation, (3,), leading=False)
-    return check_transform("rotation and translation", T)
-
-
-def check_transform(name: str, value: ArrayLike) -> Floats:
-    """`value` as (..., 4, 4) float64, or a ValueError under `name` if it is not rigid."""
-    T = _array(name, value, (4, 4))
-    if not np.isfinite(T).all():
-        raise ValueError(f"{name}: has NaN or infinite entries")
-    if not np.allclose(T[..., 3, :], [0, 0, 0, 1], atol=1e-9):
-        raise ValueError(f"{name}: the last row must be (0, 0, 0, 1)")
-    R = T[..., :3, :3]
-    off = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(initial=0.0)
-    if off > 1e-5:  # librealsense reports extrinsics in float32
-        raise ValueError(f"{name}: the rotation is not orthonormal (R R^T is off by {off:.1e})")
-    if (np.linalg.det(R) < 0).any():
-        raise ValueError(f"{name}: the rotation has determinant -1, a reflection")
-    return T
+    T[:3, :3] = array("rotation", matrix, (3, 3))
+    T[:3, 3] = array("translation", translation, (3,))
+    return transform("rotation and translation", T)
 
 
 def invert_transform(T: ArrayLike) -> Floats:
     """The inverse of rigid transforms (..., 4, 4): R^T and -R^T t."""
-    T = check_transform("T", T)
+    T = transforms("T", T)
     inverse = np.zeros_like(T)
     inverse[..., :3, :3] = np.swapaxes(T[..., :3, :3], -1, -2)
     inverse[..., :3, 3:] = -inverse[..., :3, :3] @ T[..., :3, 3:]
@@ -399,10 +384,8 @@ def invert_transform(T: ArrayLike) -> Floats:
 
 def transform_points(T: ArrayLike, points: ArrayLike) -> Floats:
     """Points (..., 3) taken through the transform T (4, 4): R p + t."""
-    T = check_transform("T", T)
-    if T.ndim != 2:
-        raise ValueError(f"T: got shape {T.shape}, want one (4, 4) transform")
-    return _array("points", points, (3,)) @ T[:3, :3].T + T[:3, 3]
+    T = transform("T", T)
+    return array("points", points, (3,), leading=True) @ T[:3, :3].T + T[:3, 3]
 
 
 def cross_matrix(vectors: Floats) -> Floats:
@@ -416,31 +399,8 @@ def cross_matrix(vectors: Floats) -> Floats:
 # --- checks at the boundary ---
 
 
-def _array(name: str, value: Any, tail: tuple[int, ...] = (), leading: bool = True) -> Floats:
-    """`value` as float64 of shape (..., *tail), or of exactly `tail` when `leading` is False."""
-    try:
-        given = np.asarray(value)
-        if given.dtype.kind not in "fiub":
-            raise ValueError(f"{type(value).__name__} of dtype {given.dtype}")
-        array = given.astype(np.float64, copy=False)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name}: want an array of real numbers, got {error}") from None
-    extra = array.ndim - len(tail)
-    if extra < 0 or array.shape[extra:] != tail or (extra and not leading):
-        wanted = ", ".join(["..."] * leading + [str(n) for n in tail])
-        raise ValueError(f"{name}: got shape {array.shape}, want ({wanted})")
-    return array
-
-
-def _number(name: str, value: Any) -> float:
-    array = _array(name, value, leading=False)
-    if not np.isfinite(array):
-        raise ValueError(f"{name}: got {value!r}, want a finite number")
-    return float(array)
-
-
 def _intrinsic_matrix(K: ArrayLike) -> Floats:
-    K = _array("K", K, (3, 3), leading=False)
+    K = array("K", K, (3, 3))
     if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
         raise ValueError(f"K: got {K.tolist()}, want finite numbers with fx > 0 and fy > 0")
     if K[0, 1] or K[1, 0] or tuple(K[2]) != (0.0, 0.0, 1.0):
@@ -449,7 +409,7 @@ def _intrinsic_matrix(K: ArrayLike) -> Floats:
 
 
 def _coefficients(dist: ArrayLike) -> Floats:
-    values = _array("dist", dist)
+    values = array("dist", dist, leading=True)
     if values.shape not in ((4,), (5,)) or not np.isfinite(values).all():
         raise ValueError(f"dist: got {values.tolist()}, want finite (k1, k2, p1, p2[, k3])")
     return np.append(values, 0.0) if values.shape == (4,) else values

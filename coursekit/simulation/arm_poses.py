@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 from coursekit.arm import Arm
 from coursekit.arrays import ArrayLike, Floats, Mask, NDArray
 from coursekit.boards import Board
+from coursekit.checks import transform, transforms
 from coursekit.geometry import (
     Intrinsics,
-    check_transform,
     deproject,
     invert_transform,
     make_transform,
@@ -115,20 +115,17 @@ class Setup:
         if self.mount not in get_args(Mount):
             raise ValueError(f"mount: got {self.mount!r}, want 'eye_in_hand' or 'eye_to_hand'")
         for name in ("X", "Y"):
-            T = check_transform(name, getattr(self, name))
-            if T.ndim != 2:
-                raise ValueError(f"{name}: got shape {T.shape}, want one (4, 4) transform")
-            object.__setattr__(self, name, T)
+            object.__setattr__(self, name, transform(name, getattr(self, name)))
         if not 0 < self.share <= 1:
             raise ValueError(f"share: got {self.share!r}, want more than 0 and at most 1")
 
     def T_camera_board(self, T_base_gripper: ArrayLike) -> Floats:
         """The board in the camera (..., 4, 4) for gripper poses (..., 4, 4)."""
-        return self._seen(check_transform("T_base_gripper", T_base_gripper))
+        return self._seen(transforms("T_base_gripper", T_base_gripper))
 
     def T_base_gripper(self, T_camera_board: ArrayLike) -> Floats:
         """The gripper poses (..., 4, 4) at which the camera has the board at (..., 4, 4)."""
-        arm = self.X @ check_transform("T_camera_board", T_camera_board) @ invert_transform(self.Y)
+        arm = self.X @ transforms("T_camera_board", T_camera_board) @ invert_transform(self.Y)
         return invert_transform(arm) if self.mount == "eye_in_hand" else arm
 
     def sees(self, T_base_gripper: ArrayLike) -> Mask:
@@ -328,7 +325,7 @@ def half_turns(T_base_gripper: ArrayLike) -> Floats:
 
     Rotation vectors from the mean orientation, along their principal directions: half the range.
     """
-    R = Rotation.from_matrix(check_transform("T_base_gripper", T_base_gripper)[:, :3, :3])
+    R = Rotation.from_matrix(transforms("T_base_gripper", T_base_gripper)[:, :3, :3])
     vectors = (R.mean().inv() * R).as_rotvec()
     _, axes = np.linalg.eigh(vectors.T @ vectors)
     return np.sort(np.ptp(vectors @ axes, axis=0) / 2)[::-1]

@@ -24,9 +24,9 @@ from scipy.spatial.transform import Rotation
 
 from coursekit.arrays import ArrayLike, NDArray
 from coursekit.boards import Board
+from coursekit.checks import transform
 from coursekit.geometry import (
     Intrinsics,
-    check_transform,
     deproject,
     invert_transform,
     make_transform,
@@ -259,7 +259,7 @@ def render_board(
 
 def board_scene(board: Board, T_scene_board: ArrayLike) -> Scene:
     """A plate of the printed sheet's size, without the print, on a table: "board", "table"."""
-    T = check_transform("T_scene_board", T_scene_board) @ T_board_sheet(board)
+    T = transform("T_scene_board", T_scene_board) @ T_board_sheet(board)
     wide, high = board.size_m
     margin = 2 * MARGIN * board.square_m
     into_plate, into_table = np.eye(4), np.eye(4)
@@ -273,9 +273,7 @@ def board_scene(board: Board, T_scene_board: ArrayLike) -> Scene:
 
 def check_pose(board: Board, T_camera_board: ArrayLike) -> NDArray[np.float64]:
     """T_camera_board as (4, 4) float64; ValueError unless the board's print faces the camera."""
-    T = check_transform("T_camera_board", T_camera_board)
-    if T.shape != (4, 4):
-        raise ValueError(f"T_camera_board: got shape {T.shape}, want one (4, 4) transform")
+    T = transform("T_camera_board", T_camera_board)
     T_camera_sheet = T @ T_board_sheet(board)
     middle = transform_points(T_camera_sheet, np.array([*board.size_m, 0.0]) / 2)
     if not (middle[2] > 0 and invert_transform(T_camera_sheet)[2, 3] < 0):

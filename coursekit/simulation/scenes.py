@@ -11,9 +11,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coursekit.arrays import ArrayLike, NDArray
+from coursekit.checks import transform
 from coursekit.geometry import (
     Intrinsics,
-    check_transform,
     deproject,
     invert_transform,
     make_transform,
@@ -64,9 +64,7 @@ class Box:
             raise ValueError(f"texture: got {self.texture!r}, want one of {', '.join(TEXTURES)}")
         if not 0 <= _number("specular", self.specular, "share") <= 1:
             raise ValueError(f"specular: got {self.specular}, want a share from 0 to 1")
-        T = check_transform("T_scene_box", self.T_scene_box).copy()
-        if T.shape != (4, 4):
-            raise ValueError(f"T_scene_box: got shape {T.shape}, want one (4, 4) transform")
+        T = transform("T_scene_box", self.T_scene_box).copy()
         size.flags.writeable = T.flags.writeable = False
         object.__setattr__(self, "size_m", size)
         object.__setattr__(self, "T_scene_box", T)
@@ -268,9 +266,7 @@ def box_table(scene: Scene, T_scene_camera: ArrayLike | None) -> NDArray[np.floa
 
     Raises ValueError for a camera inside a box.
     """
-    T = check_transform("T_scene_camera", np.eye(4) if T_scene_camera is None else T_scene_camera)
-    if T.shape != (4, 4):
-        raise ValueError(f"T_scene_camera: got shape {T.shape}, want one (4, 4) transform")
+    T = transform("T_scene_camera", np.eye(4) if T_scene_camera is None else T_scene_camera)
     T_camera_scene = invert_transform(T)
     boxes = np.empty((len(scene), 15))
     for row, box in zip(boxes, scene, strict=True):
