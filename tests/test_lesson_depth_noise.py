@@ -11,7 +11,7 @@ import pytest
 from test_lessons import own_results  # noqa: F401
 
 from coursekit import stereo
-from coursekit.lessons.checkpoints import Choice
+from coursekit.lessons.questions import Choice
 from coursekit.lessons.depth_noise import (
     CHECKPOINTS,
     DEPTH_NOISE,
