@@ -64,7 +64,7 @@ class HeldBoard(Camera):
         self.locked = self.streams = 0
         self.shown = []  # what each frame showed: the number of a pose, or None on the way
 
-    def _stream(self):
+    def stream(self):
         self.streams += 1
         for number, T in enumerate(self.poses):
             rng = np.random.default_rng(0)
