@@ -13,9 +13,9 @@ import pytest
 
 from coursekit import lessons
 from coursekit.lessons import progress
-from coursekit.lessons.questions import EXAMPLES, Choice, Number, _panel
 from coursekit.lessons.exercises import Exercise, _as_numbers, _run
 from coursekit.lessons.progress import Verdict
+from coursekit.lessons.questions import EXAMPLES, Choice, Number, _panel
 
 EXERCISES = lessons.EXERCISES
 CHECKPOINTS = lessons.CHECKPOINTS
