@@ -246,8 +246,7 @@ def compare(
     [10.  0.]
     """
     ours, names = result.intrinsics, result.names
-    same_size = factory.size == ours.size
-    want(same_size, "factory", factory, f"one for images of {ours.size} px, as the fit")
+    want(factory.size == ours.size, "factory", factory.size, f"the fit's size, {ours.size} px")
     grid = image_grid(ours, shape).reshape(-1, 2)
     weights = 1.0 / result.uncertainty_map(range_m, shape).ravel()
     pixels = difference_px(ours, factory, grid, range_m, weights).reshape(*shape, 2)

@@ -340,7 +340,8 @@ def calibrate(
         "points", board.points if points is None else points, board.points.shape, finite=True
     )
     width, height = size = detections[0].size
-    want(guess is None or guess.size == size, "guess", guess, f"one for images of {size} px")
+    if guess is not None:
+        want(guess.size == size, "guess", guess.size, f"the images' size, {size} px")
     names = (*(("f",) if same_focal else ("fx", "fy")), "cx", "cy", *MODELS[model])
     # OpenCV's own start can lie at the far end of the valley in which focal length and distance
     # trade against each other, where its steps go nowhere; then once more from a plain camera.
