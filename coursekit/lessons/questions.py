@@ -80,7 +80,7 @@ class Checkpoint:
         raise NotImplementedError
 
     def _repr_mimebundle_(self, **kwargs: Any) -> dict[str, Any]:
-        widget: dict[str, Any] = _panel(self)._repr_mimebundle_(**kwargs)
+        widget: dict[str, Any] = panel(self)._repr_mimebundle_(**kwargs)
         return widget | {"text/plain": repr(self), "text/html": self._without_kernel()}
 
     def _without_kernel(self) -> str:
@@ -213,7 +213,7 @@ def _readings(given: Any, unit: str) -> list[float]:
     return [number for number in numbers if math.isfinite(number) and factor]
 
 
-def _panel(checkpoint: Checkpoint) -> Any:
+def panel(checkpoint: Checkpoint) -> Any:
     """The widget: input, a button that commits, and the verdict below."""
     import ipywidgets
 
@@ -260,8 +260,8 @@ def load(lesson: str) -> tuple[tuple[Checkpoint, ...], tuple[Objective, ...]]:
             )
             return Choice(name, question, tuple(options))
         slips = tuple(Classic(value, _single_spaced(why)) for value, why in asked["slips"])
-        texts = (_single_spaced(asked[key]) for key in ("why", "hint"))
-        return Number(name, question, asked["value"], asked["unit"], *texts, slips)
+        why, hint = _single_spaced(asked["why"]), _single_spaced(asked["hint"])
+        return Number(name, question, asked["value"], asked["unit"], why, hint, slips)
 
     return (
         tuple(
