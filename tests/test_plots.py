@@ -16,7 +16,7 @@ from coursekit.geometry import Intrinsics
 from coursekit.hand_eye import error_study
 from coursekit.intrinsics import calibrate, compare, stored_power
 from coursekit.plots import depth_noise, error_budget, hand_eye, intrinsics, pinhole
-from coursekit.plots.interactive import label
+from coursekit.plots.style import label
 from coursekit.simulation import (
     Effects,
     corner_session,

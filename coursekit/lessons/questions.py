@@ -253,11 +253,8 @@ def load(lesson: str) -> tuple[tuple[Checkpoint, ...], tuple[Objective, ...]]:
     def checkpoint(name: str, asked: dict[str, Any]) -> Checkpoint:
         question = _single_spaced(asked["question"])
         if "right" in asked:
-            options = (
-                Option(*map(_single_spaced, asked[letter]), right=letter == asked["right"])
-                for letter in LETTERS
-                if letter in asked
-            )
+            texts = {k: map(_single_spaced, asked[k]) for k in LETTERS if k in asked}
+            options = (Option(next(t), next(t), k == asked["right"]) for k, t in texts.items())
             return Choice(name, question, tuple(options))
         slips = tuple(Classic(value, _single_spaced(why)) for value, why in asked["slips"])
         why, hint = _single_spaced(asked["why"]), _single_spaced(asked["hint"])

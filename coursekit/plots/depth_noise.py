@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from coursekit.plots.style import COLORS, LessonFigure, figure
+from coursekit.arrays import ArrayLike, Floats
+from coursekit.plots.style import COLORS, LessonFigure, figure, plain_ticks, single
 
 RANGE_M = np.linspace(0.25, 3.0, 200)
+STYLES = ("-", "--", "-.", ":")
 MARKERS = ("o", "s", "^", "D", "v")
 
 
@@ -21,8 +22,7 @@ def technologies(fx: float, baseline_m: float, sigma_d_px: float) -> LessonFigur
     1.425e-5 Z^2 in cm, for the first Kinect. Time of flight: the maker's limit for the Azure
     Kinect, a standard deviation of at most 17 mm at any range; typical values are far below.
     """
-    fig = figure(8.0, 4.2)
-    ax = fig.subplots()
+    fig, ax = single(8.0, 4.2)
     stereo = 1000 * RANGE_M**2 * sigma_d_px / (fx * baseline_m)
     light = 10 * 1.425e-5 * (100 * RANGE_M) ** 2
     ax.plot(RANGE_M, stereo, color=COLORS["model"], label="active stereo (this camera, the law)")
@@ -39,7 +39,7 @@ def technologies(fx: float, baseline_m: float, sigma_d_px: float) -> LessonFigur
     return fig
 
 
-def _at(values: NDArray[Any], distance_m: float) -> float:
+def _at(values: Floats, distance_m: float) -> float:
     return float(np.interp(distance_m, RANGE_M, values))
 
 
@@ -53,8 +53,7 @@ def reciprocal(fx_baseline: float, distance_m: float, sigma_d_px: float) -> Less
     wide = 10 * sigma_d_px
     low, high = fx_baseline / (at + wide), fx_baseline / max(at - wide, 1.0)
     sigma_mm = 1000 * distance_m**2 * sigma_d_px / fx_baseline
-    fig = figure(8.0, 4.2)
-    ax = fig.subplots()
+    fig, ax = single(8.0, 4.2)
     ax.plot(d, fx_baseline / d, color=COLORS["model"])
     ax.axvspan(at - wide, at + wide, color=COLORS["depth"], alpha=0.5)
     ax.axhspan(low, high, color=COLORS["measured"], alpha=0.35)
@@ -73,25 +72,23 @@ def reciprocal(fx_baseline: float, distance_m: float, sigma_d_px: float) -> Less
 
 def prices(devices: Mapping[str, tuple[float, float]], sigma_d_px: float) -> LessonFigure:
     """The law for several cameras, each (fx in px, baseline in m), on logarithmic axes."""
-    fig = figure(8.0, 4.4)
-    ax = fig.subplots()
+    fig, ax = single(8.0, 4.4)
     texts = []
-    for style, (name, (fx, baseline_m)) in zip(
-        ("-", "--", "-.", ":"), devices.items(), strict=False
-    ):
+    for style, (name, (fx, baseline_m)) in zip(STYLES, devices.items(), strict=False):
         sigma = 1000 * RANGE_M**2 * sigma_d_px / (fx * baseline_m)
         ax.plot(RANGE_M, sigma, style, label=name)
         texts.append(f"{name} {_at(sigma, 0.45):.2f} mm")
     ax.axvspan(0.4, 0.6, color=COLORS["faint"], alpha=0.4, label="over a tabletop")
     ax.set(xscale="log", yscale="log", xlabel="distance Z (m)", ylabel="std of depth (mm)")
-    _plain_log_ticks(ax, (0.3, 0.5, 1, 2, 3), (0.1, 0.3, 1, 3, 10, 30))
+    plain_ticks(ax.xaxis, (0.3, 0.5, 1, 2, 3))
+    plain_ticks(ax.yaxis, (0.1, 0.3, 1, 3, 10, 30))
     ax.legend()
     fig.alt = f"Depth noise by the law for {sigma_d_px:.2f} px, at 0.45 m: {', '.join(texts)}."
     return fig
 
 
 def infrared_pair(
-    left: NDArray[Any], right: NDArray[Any], pixel: tuple[int, int], disparity_px: float, half: int
+    left: Floats, right: Floats, pixel: tuple[int, int], disparity_px: float, half: int
 ) -> LessonFigure:
     """A crop of both infrared images with the window around `pixel` and where it is found."""
     u, v = pixel
@@ -114,7 +111,7 @@ def infrared_pair(
     return fig
 
 
-def cost_curve(costs: NDArray[Any], disparity_px: float) -> LessonFigure:
+def cost_curve(costs: Floats, disparity_px: float) -> LessonFigure:
     """Matching cost against disparity: the whole search, and the neighbourhood of the minimum."""
     fig = figure(9.0, 3.6)
     whole, close = fig.subplots(1, 2)
@@ -136,7 +133,7 @@ def cost_curve(costs: NDArray[Any], disparity_px: float) -> LessonFigure:
     return fig
 
 
-def _flanks(ax: Any, costs: NDArray[Any], best: int, disparity_px: float) -> None:
+def _flanks(ax: Any, costs: Floats, best: int, disparity_px: float) -> None:
     """The two lines of equal steepness through the three lowest points, which meet at the peak."""
     before, here, after = costs[best - 1 : best + 2]
     slope = max(before, after) - here
@@ -147,11 +144,10 @@ def _flanks(ax: Any, costs: NDArray[Any], best: int, disparity_px: float) -> Non
 
 
 def depth_image(
-    depth_m: NDArray[Any], labels: Mapping[str, tuple[float, float]] | None = None
+    depth_m: Floats, labels: Mapping[str, tuple[float, float]] | None = None
 ) -> LessonFigure:
     """A depth image, no depth in white, with labels at pixels if there are any."""
-    fig = figure(8.5, 4.6)
-    ax = fig.subplots()
+    fig, ax = single(8.5, 4.6)
     shown = ax.imshow(np.where(depth_m > 0, depth_m, np.nan), vmin=0.2, vmax=1.2)
     fig.colorbar(shown, ax=ax, label="depth Z (m)", shrink=0.8)
     for name, (u, v) in (labels or {}).items():
@@ -168,7 +164,7 @@ def noise_law(
     distances_m: ArrayLike,
     std_mm: ArrayLike,
     error_mm: ArrayLike,
-    curve: tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]],
+    curve: tuple[Floats, Floats, Floats, Floats],
     extra: Mapping[str, tuple[ArrayLike, ArrayLike]] | None = None,
     law: str = "fitted law",
 ) -> LessonFigure:
@@ -177,8 +173,7 @@ def noise_law(
     extra: other series (Z, std), by name. The legend stands beside the axes, clear of all points.
     """
     z, mid, low, high = curve
-    fig = figure(9.5, 4.6)
-    ax = fig.subplots()
+    fig, ax = single(9.5, 4.6)
     ax.plot(z, mid, color=COLORS["model"], label=law)
     ax.fill_between(z, low, high, color=COLORS["model"], alpha=0.25, label="its 95 % band")
     ax.errorbar(distances_m, std_mm, 1.96 * np.asarray(error_mm), fmt="o", capsize=3,
@@ -187,7 +182,8 @@ def noise_law(
     for (marker, color), (name, (x, y)) in zip(styles, (extra or {}).items(), strict=False):
         ax.plot(x, y, marker=marker, ls=":", color=COLORS[color], mfc="white", label=name)
     ax.set(xscale="log", yscale="log", xlabel="distance Z (m)", ylabel="standard deviation (mm)")
-    _plain_log_ticks(ax, (0.3, 0.45, 0.6, 1, 1.5, 2, 3), (0.01, 0.03, 0.1, 0.3, 1, 3, 10, 30))
+    plain_ticks(ax.xaxis, (0.3, 0.45, 0.6, 1, 1.5, 2, 3))
+    plain_ticks(ax.yaxis, (0.01, 0.03, 0.1, 0.3, 1, 3, 10, 30))
     ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0))
     others = "".join(f"; {name}: {_listed(x, y)}" for name, (x, y) in (extra or {}).items())
     fig.alt = (
@@ -206,25 +202,17 @@ def averaging(
     counts: ArrayLike, std_mm: ArrayLike, error_mm: ArrayLike, ideal_mm: ArrayLike
 ) -> LessonFigure:
     """Std of the mean of N frames with its error, over the 1 / sqrt(N) of independent frames."""
-    fig = figure(8.0, 4.2)
-    ax = fig.subplots()
+    fig, ax = single(8.0, 4.2)
     ax.plot(counts, ideal_mm, color=COLORS["model"], ls="--", label="independent frames: 1/√N")
     ax.errorbar(counts, std_mm, 1.96 * np.asarray(error_mm), fmt="o-", capsize=3,
                 color=COLORS["measured"], label="measured, with 95 % interval")  # fmt: skip
     ax.set(xscale="log", yscale="log", xlabel="N (frames averaged)", ylabel="std of mean (mm)")
     n, s, i = (np.asarray(a) for a in (counts, std_mm, ideal_mm))
-    _plain_log_ticks(ax, tuple(n), (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2))
+    plain_ticks(ax.xaxis, tuple(n))
+    plain_ticks(ax.yaxis, (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2))
     ax.legend()
     fig.alt = (
         f"Std of the mean of N frames: from {s[0]:.3f} mm at N = {n[0]} to {s[-1]:.3f} mm at "
         f"N = {n[-1]}, where independent frames would give {i[-1]:.3f} mm."
     )
     return fig
-
-
-def _plain_log_ticks(ax: Any, x: Sequence[float], y: Sequence[float]) -> None:
-    """Ticks at these numbers, written as numbers, inside the data's range."""
-    for axis, ticks, limits in ((ax.xaxis, x, ax.get_xlim()), (ax.yaxis, y, ax.get_ylim())):
-        inside = [t for t in ticks if limits[0] <= t <= limits[1]]
-        axis.set_ticks(inside, [f"{t:g}" for t in inside])
-        axis.set_ticks([], minor=True)

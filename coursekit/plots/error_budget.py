@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.patches import Ellipse, Rectangle
 from matplotlib.ticker import MultipleLocator
-from numpy.typing import ArrayLike, NDArray
 
-from coursekit.plots.style import COLORS, LessonFigure, figure
-
-if TYPE_CHECKING:
-    from coursekit.attribution.simulate import SimulatedMisses
-    from coursekit.budget import BestDistance, Draws, ErrorBudget, Gripper, Target
+from coursekit.arrays import ArrayLike, Floats
+from coursekit.attribution import SimulatedMisses
+from coursekit.budget import BestDistance, Draws, ErrorBudget, Gripper, Target
+from coursekit.plots.style import COLORS, LessonFigure, figure, single
 
 KINDS = {"bias": "measured", "noise": "depth"}
 CHI2_95 = 5.991  # of two degrees of freedom
@@ -29,8 +27,7 @@ def bars(budget: ErrorBudget) -> LessonFigure:
     where the rows know their directions.
     """
     rows, averaged = budget.rows, budget.averaged_m
-    fig = figure(8.6, 0.5 * len(rows) + 1.3)
-    ax = fig.subplots()
+    fig, ax = single(8.6, 0.5 * len(rows) + 1.3)
     said = []
     for y, row in enumerate(rows):
         name, kind = row.term.name, row.term.kind
@@ -123,9 +120,7 @@ def between_fingers(
     return fig
 
 
-def _from_above(
-    ax: Any, width: float, opening: float, covariance: NDArray[Any], bias: NDArray[Any]
-) -> NDArray[Any]:
+def _from_above(ax: Any, width: float, opening: float, covariance: Floats, bias: Floats) -> Floats:
     """Fingers, cube and the 95 % ellipse of (closing, lateral), mm; its half axes (2,)."""
     room, reach = (opening - width) / 2, opening / 2 + 10
     for side in (-1, 1):
@@ -146,7 +141,7 @@ def _from_above(
     return half
 
 
-def _surface(covariance: NDArray[Any], middle: NDArray[Any]) -> NDArray[Any]:
+def _surface(covariance: Floats, middle: Floats) -> Floats:
     """The 95 % ellipsoid as x, y, z to plot, (3, 17, 25): closing, lateral, up (mm)."""
     polar, around = np.meshgrid(np.linspace(0, np.pi, 17), np.linspace(0, 2 * np.pi, 25),
                                 indexing="ij")  # fmt: skip
@@ -167,8 +162,7 @@ def _box(ax: Any, middle: tuple[float, ...], size: tuple[float, ...], color: str
 
 def distances(best: BestDistance) -> LessonFigure:
     """A figure of the budget against the mounting distance, with what limits the distance."""
-    fig = figure(8.0, 3.6)
-    ax = fig.subplots()
+    fig, ax = single(8.0, 3.6)
     ax.plot(best.distances_m, 1000 * np.asarray(best.figures_m), color=COLORS["model"])
     ax.plot(best.distance_m, 1000 * best.figure_m, "o", color=COLORS["measured"])
     ax.set(xlabel="distance Z (m)", ylabel="error along closing (mm)", ylim=(0, None))

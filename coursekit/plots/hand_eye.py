@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from coursekit.plots.style import COLORS, LessonFigure, figure
-
-if TYPE_CHECKING:
-    from coursekit.hand_eye import StudyPoint
-    from coursekit.simulation.hand_eye_poses import Setup
-
-Floats = NDArray[np.float64]
+from coursekit.arrays import ArrayLike, Floats
+from coursekit.hand_eye import StudyPoint
+from coursekit.plots.style import COLORS, LessonFigure, cross, figure, plain_ticks, single
+from coursekit.simulation.hand_eye_poses import Setup
 
 AXIS_M = 0.09  # how long a frame's axes are drawn
 STYLES = ("-", "--", "-.", ":")
@@ -98,8 +94,7 @@ def diversity(sessions: Mapping[str, Floats]) -> LessonFigure:
         texts.append(f"{name}: turned by up to {np.linalg.norm(vectors, axis=1).max():.0f} deg")
     places.set(aspect="equal", xlabel="x of the base (m)", ylabel="y of the base (m)")
     places.set_title("the gripper from above")
-    turns.axhline(0, color=COLORS["faint"], lw=1)
-    turns.axvline(0, color=COLORS["faint"], lw=1)
+    cross(turns)
     reach = max(10.0, 1.1 * np.abs([*turns.get_xlim(), *turns.get_ylim()]).max())
     turns.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal",
               xlabel="turned about the gripper's y (deg)",
@@ -143,16 +138,13 @@ def more_poses(
         ax.plot(counts, error, "o-", color=COLORS["measured"], label="error")
         ax.plot(counts, half, "--", color=COLORS["model"], label="stated 95 %")
         ax.set(xscale="log", yscale="log", xlabel="poses (number)")
-        ax.set_xticks(list(counts), [str(c) for c in counts])
-        ax.set_xticks([], minor=True)
+        plain_ticks(ax.xaxis, counts, widen=True)
         ax.set_title(name)
         texts.append(
             f"{name}: error {error[0]:.2f} to {error[-1]:.2f} mm, stated {half[0]:.2f} to "
             f"{half[-1]:.2f} mm"
         )
-    ticks = (0.1, 0.3, 1, 3, 10)
-    axes[0].set_yticks(ticks, [f"{t:g}" for t in ticks])
-    axes[0].set_yticks([], minor=True)
+    plain_ticks(axes[0].yaxis, (0.1, 0.3, 1, 3, 10), widen=True)
     axes[0].set_ylabel("translation of X (mm)")
     axes[0].legend()
     fig.alt = f"Error of X against the number of poses, {counts[0]} to {counts[-1]}. " + "; ".join(
@@ -164,8 +156,7 @@ def more_poses(
 def gaps(fitted_mm: ArrayLike, held_mm: ArrayLike) -> LessonFigure:
     """How far the board is from where X says, pose by pose: fitted ones and ones held out, mm."""
     fitted, held = np.asarray(fitted_mm), np.asarray(held_mm)
-    fig = figure(8.0, 3.4)
-    ax = fig.subplots()
+    fig, ax = single(8.0, 3.4)
     ax.bar(np.arange(len(fitted)) + 1, fitted, color=COLORS["model"], label="fitted")
     ax.bar(len(fitted) + 1 + np.arange(len(held)), held, color=COLORS["measured"],
            label="held out")  # fmt: skip
@@ -185,8 +176,7 @@ def _rms(values: Floats) -> float:
 def touched(gap_mm: ArrayLike) -> LessonFigure:
     """Where corners are by camera, from several looks, and by fingertip: the gaps (n, 3), mm."""
     gap = np.asarray(gap_mm)
-    fig = figure(7.0, 3.2)
-    ax = fig.subplots()
+    fig, ax = single(7.0, 3.2)
     places = np.arange(len(gap))
     for k, (axis, color) in enumerate(zip("xyz", ("measured", "truth", "model"), strict=True)):
         ax.bar(places + 0.25 * (k - 1), gap[:, k], 0.22, color=COLORS[color], label=axis)

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from itertools import combinations, product
+from typing import Any
 
 import numpy as np
 from matplotlib.colors import LogNorm
 
 from coursekit import geometry
+from coursekit.arrays import AnyArray, Floats, NDArray
+from coursekit.cameras import Frame
 from coursekit.geometry import Intrinsics
-from coursekit.plots.style import COLORS, LessonFigure, figure
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from coursekit.cameras import Frame
-    from coursekit.simulation.scenes import Box
+from coursekit.plots.style import (
+    COLORS,
+    LessonFigure,
+    cross,
+    figure,
+    image_axes,
+    panels,
+    single,
+)
+from coursekit.simulation import Box
 
 DISPLACEMENT_PX = 0.1, 120.0  # the colour scale of `displacement`
 SLICE_M = 0.015  # half the height of the slice in `point_cloud`
@@ -34,8 +40,7 @@ def similar_triangles(focal_length_mm: float = 1.93, depth_m: float = 0.45) -> L
     fig = figure(9.0, 3.8)
     above, sensor = fig.subplots(1, 2, width_ratios=[2.4, 1])
     _triangles(above, 0.080 * focal_length_mm, depth_m)
-    sensor.axhline(0, color=COLORS["faint"], lw=1)
-    sensor.axvline(0, color=COLORS["faint"], lw=1)
+    cross(sensor)
     sensor.plot([x_mm], [0], "o", color=COLORS["measured"], ms=10)
     sensor.set(xlim=(-1.3, 1.3), ylim=(-1.3, 1.3), xlabel="$x_s$ on the sensor (mm)")
     sensor.set(aspect="equal", yticks=[], title=f"$x_s = f\\,X/Z$ = {x_mm:.3f} mm")
@@ -70,12 +75,10 @@ def _triangles(ax: Any, plane_m: float, depth_m: float) -> None:
 def pixel_grid(principal: tuple[float, float] = (3.3, 2.2)) -> LessonFigure:
     """A sensor of 8 x 5 pixels: (0, 0) is the centre of the top-left one, edges are at +-0.5."""
     columns, rows = 8, 5
-    fig = figure(6.5, 4.4)
-    ax = fig.subplots()
-    for u in range(columns + 1):
-        ax.plot([u - 0.5] * 2, [-0.5, rows - 0.5], color=COLORS["faint"], lw=1)
-    for v in range(rows + 1):
-        ax.plot([-0.5, columns - 0.5], [v - 0.5] * 2, color=COLORS["faint"], lw=1)
+    fig, ax = single(6.5, 4.4)
+    u, v = np.arange(columns + 1) - 0.5, np.arange(rows + 1) - 0.5
+    ax.plot([u] * 2, v[[0, -1]], color=COLORS["faint"], lw=1)
+    ax.plot(u[[0, -1]], [v] * 2, color=COLORS["faint"], lw=1)
     centres = geometry.pixel_grid(columns, rows).reshape(-1, 2)
     ax.plot(*centres.T, ".", color=COLORS["ink"], ms=4, label="pixel centres")
     ax.plot(0, 0, "s", color=COLORS["model"], ms=9, label="(0, 0)")
@@ -94,8 +97,7 @@ def pixel_grid(principal: tuple[float, float] = (3.3, 2.2)) -> LessonFigure:
 def entries_of_K(scene: tuple[Box, ...], camera: Intrinsics, **moved: float) -> LessonFigure:
     """The edges of a scene's boxes, drawn with the camera's K and with some entries changed."""
     changed = Intrinsics.from_dict(camera.to_dict() | moved)
-    fig = figure(8.0, 4.8)
-    ax = fig.subplots()
+    fig, ax = single(8.0, 4.8)
     for intrinsics, color, style, name in (
         (camera, COLORS["model"], "-", "K of the camera"),
         (changed, COLORS["measured"], "--", "your K"),
@@ -105,7 +107,7 @@ def entries_of_K(scene: tuple[Box, ...], camera: Intrinsics, **moved: float) -> 
         ax.plot([], [], style, color=color, label=name)
         ax.plot(intrinsics.cx, intrinsics.cy, "+", color=color, ms=14, mew=2)
     ax.plot([], [], "+", color=COLORS["ink"], ms=12, label="principal point")
-    _image_axes(ax, camera)
+    image_axes(ax, *camera.size)
     ax.legend(loc="upper right")
     values = ", ".join(f"{k} = {getattr(changed, k):.0f}" for k in ("fx", "fy", "cx", "cy"))
     ax.set_title(values + " px")
@@ -113,25 +115,21 @@ def entries_of_K(scene: tuple[Box, ...], camera: Intrinsics, **moved: float) -> 
     return fig
 
 
-def _edges(scene: tuple[Box, ...]) -> list[NDArray[np.float64]]:
+def _edges(scene: tuple[Box, ...]) -> list[Floats]:
     """The twelve edges of each free-standing box, (2, 3) each, m."""
-    signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]) / 2
-    lines = []
-    for box in scene:
-        if max(box.size_m) > 0.2:  # the wall and the table are larger than the image
-            continue
-        corners = geometry.transform_points(box.T_scene_box, signs * box.size_m)
-        for a in range(8):
-            for b in range(a + 1, 8):
-                if np.count_nonzero(signs[a] != signs[b]) == 1:
-                    lines.append(corners[[a, b]])
-    return lines
+    signs = np.array(list(product((-0.5, 0.5), repeat=3)))
+    pairs = [(a, b) for a, b in combinations(range(8), 2) if (signs[a] != signs[b]).sum() == 1]
+    return [
+        geometry.transform_points(box.T_scene_box, signs[[a, b]] * box.size_m)
+        for box in scene
+        if max(box.size_m) < 0.2  # the wall and the table are larger than the image
+        for a, b in pairs
+    ]
 
 
 def field_of_view(depth: Intrinsics, color: Intrinsics | None, distance_m: float) -> LessonFigure:
     """What the depth and the colour camera see, from above, and how wide that is at a distance."""
-    fig = figure(8.0, 4.0)
-    ax = fig.subplots()
+    fig, ax = single(8.0, 4.0)
     texts = []
     cameras = [("depth", depth)] + ([("color", color)] if color else [])
     for (name, camera), label in zip(cameras, ("depth", "colour"), strict=False):
@@ -151,12 +149,11 @@ def field_of_view(depth: Intrinsics, color: Intrinsics | None, distance_m: float
     return fig
 
 
-def same_pixel(near_m: float, near_size_m: float, far_m: float, K: NDArray[Any]) -> LessonFigure:
+def same_pixel(near_m: float, near_size_m: float, far_m: float, K: Floats) -> LessonFigure:
     """A small near and a large far object that cover the same pixels."""
     far_size = near_size_m * far_m / near_m
     pixels = K[0, 0] * near_size_m / near_m
-    fig = figure(8.0, 3.2)
-    ax = fig.subplots()
+    fig, ax = single(8.0, 3.2)
     for z, size, name in ((near_m, near_size_m, "cube"), (far_m, far_size, "block")):
         ax.plot([z, z], [-size / 2, size / 2], color=COLORS[name], lw=6,
                 label=f"{1000 * size:.0f} mm at {z:.4g} m")  # fmt: skip
@@ -176,12 +173,9 @@ def same_pixel(near_m: float, near_size_m: float, far_m: float, K: NDArray[Any])
 
 def displacement(lenses: Mapping[str, Intrinsics]) -> LessonFigure:
     """How far distortion moves each pixel, in px, one map a lens, all to one scale."""
-    columns = 2
-    rows = -(-len(lenses) // columns)
-    fig = figure(8.5, 3.1 * rows)
-    axes = np.atleast_1d(fig.subplots(rows, columns)).ravel()
+    fig, axes = panels(len(lenses), 2, 8.5, 3.1)
     texts = []
-    for ax, (name, lens) in zip(axes, lenses.items(), strict=False):
+    for ax, (name, lens) in zip(axes, lenses.items(), strict=True):
         shift, size = displacement_px(lens)
         shown = ax.imshow(
             np.maximum(size, DISPLACEMENT_PX[0]),
@@ -195,17 +189,15 @@ def displacement(lenses: Mapping[str, Intrinsics]) -> LessonFigure:
                   scale_units="xy", scale=1, color="white", width=0.005)  # fmt: skip
         edge, corner = edge_and_corner(size)
         ax.set_title(f"{name}\nedge {edge:.1f} px, corner {corner:.1f} px", fontsize=10)
-        _image_axes(ax, lens)
+        image_axes(ax, *lens.size)
         texts.append(f"{name}, {edge:.1f} px at an edge, {corner:.1f} px in a corner")
-    for ax in axes[len(lenses) :]:
-        ax.set_visible(False)
     bar = fig.colorbar(shown, ax=list(axes), label="displacement (px)", shrink=0.6)
     bar.set_ticks([0.1, 1, 10, 100], labels=["0.1", "1", "10", "100"])
     fig.alt = "Maps of the displacement by distortion: " + "; ".join(texts) + "."
     return fig
 
 
-def displacement_px(lens: Intrinsics) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def displacement_px(lens: Intrinsics) -> tuple[Floats, Floats]:
     """How far, and from the pinhole's place, the lens moves each pixel: (H, W, 2), (H, W) px."""
     grid = geometry.pixel_grid(*lens.size)
     ideal = geometry.deproject(grid, np.ones(grid.shape[:2]), lens.K)
@@ -213,13 +205,11 @@ def displacement_px(lens: Intrinsics) -> tuple[NDArray[np.float64], NDArray[np.f
     return shift, np.linalg.norm(shift, axis=-1)
 
 
-def edge_and_corner(size: NDArray[np.float64]) -> tuple[float, float]:
+def edge_and_corner(size: Floats) -> tuple[float, float]:
     """The largest displacement at the middle of the four edges, and in the four corners, px."""
     height, width = size.shape
-    edge = max(
-        size[height // 2, 0], size[height // 2, -1], size[0, width // 2], size[-1, width // 2]
-    )
-    return float(edge), float(max(size[0, 0], size[0, -1], size[-1, 0], size[-1, -1]))
+    edge = max(size[height // 2, [0, -1]].max(), size[[0, -1], width // 2].max())
+    return float(edge), float(size[np.ix_([0, -1], [0, -1])].max())
 
 
 def frame(shot: Frame) -> LessonFigure:
@@ -243,7 +233,7 @@ def frame(shot: Frame) -> LessonFigure:
     return fig
 
 
-def _far(depth_m: NDArray[Any]) -> float:
+def _far(depth_m: AnyArray) -> float:
     """Where the scene ends, m: false matches may lie far behind it."""
     return 1.1 * float(np.nanquantile(depth_m, 0.97))
 
@@ -294,8 +284,3 @@ def _solid(ax: Any, cloud: NDArray[np.float32]) -> None:
     ax.locator_params(axis="y", nbins=2)
     ax.view_init(elev=18, azim=-70)
     ax.set_box_aspect(np.maximum(np.ptp(cloud[:, [0, 2, 1]], axis=0), 0.05), zoom=0.85)
-
-
-def _image_axes(ax: Any, camera: Intrinsics) -> None:
-    ax.set(xlim=(-0.5, camera.width - 0.5), ylim=(camera.height - 0.5, -0.5), aspect="equal")
-    ax.set(xlabel="u (px)", ylabel="v (px)")
