@@ -31,12 +31,11 @@ def technologies(fx: float, baseline_m: float, sigma_d_px: float) -> LessonFigur
             label="time of flight (Azure Kinect, upper limit)")  # fmt: skip
     ax.set(xlabel="distance Z (m)", ylabel="std of depth (mm)", ylim=(0, None))
     ax.legend()
-    fig.alt = (
+    return fig.saying(
         f"Random depth error against distance: active stereo {_at(stereo, 1):.1f} mm at 1 m and "
         f"{_at(stereo, 2):.1f} mm at 2 m, structured light {_at(light, 1):.1f} and "
         f"{_at(light, 2):.1f} mm; time of flight stays under a constant limit of 17 mm."
     )
-    return fig
 
 
 def _at(values: Floats, distance_m: float) -> float:
@@ -62,12 +61,11 @@ def reciprocal(fx_baseline: float, distance_m: float, sigma_d_px: float) -> Less
     ax.set_title(
         f"d = {at:.1f} px, Z = {distance_m:.2f} m: {sigma_d_px:.2f} px become {sigma_mm:.2f} mm"
     )
-    fig.alt = (
+    return fig.saying(
         f"The hyperbola Z = f B / d with f B = {fx_baseline:.2f} px m. At Z = {distance_m:.2f} m a "
         f"disparity noise of {sigma_d_px:.2f} px becomes a depth noise of {sigma_mm:.2f} mm; the "
         "bands are drawn ten times too wide."
     )
-    return fig
 
 
 def prices(devices: Mapping[str, tuple[float, float]], sigma_d_px: float) -> LessonFigure:
@@ -83,8 +81,9 @@ def prices(devices: Mapping[str, tuple[float, float]], sigma_d_px: float) -> Les
     plain_ticks(ax.xaxis, (0.3, 0.5, 1, 2, 3))
     plain_ticks(ax.yaxis, (0.1, 0.3, 1, 3, 10, 30))
     ax.legend()
-    fig.alt = f"Depth noise by the law for {sigma_d_px:.2f} px, at 0.45 m: {', '.join(texts)}."
-    return fig
+    return fig.saying(
+        f"Depth noise by the law for {sigma_d_px:.2f} px, at 0.45 m: {', '.join(texts)}."
+    )
 
 
 def infrared_pair(
@@ -104,11 +103,10 @@ def infrared_pair(
             ax.plot(x + box[:, 0], v + box[:, 1], color=color, lw=1.5)
         ax.set(xlim=(u - 110, u + 60), ylim=(v + 60, v - 60), xlabel="u (px)", title=name)
     axes[0].set_ylabel("v (px)")
-    fig.alt = (
+    return fig.saying(
         f"The infrared pair around pixel ({u}, {v}): the window of the left image is found "
         f"{disparity_px:.1f} px further left in the right image."
     )
-    return fig
 
 
 def cost_curve(costs: Floats, disparity_px: float) -> LessonFigure:
@@ -126,11 +124,10 @@ def cost_curve(costs: Floats, disparity_px: float) -> LessonFigure:
         ax.set(xlabel="disparity d (px)", ylabel="cost (grey levels)")
     whole.set_title("all candidates")
     close.set_title(f"around the minimum: d = {disparity_px:.2f} px")
-    fig.alt = (
+    return fig.saying(
         f"Matching cost against disparity: lowest at candidate {best}, and between the candidates "
         f"the two straight flanks meet at d = {disparity_px:.2f} px."
     )
-    return fig
 
 
 def _flanks(ax: Any, costs: Floats, best: int, disparity_px: float) -> None:
@@ -156,8 +153,7 @@ def depth_image(
                     arrowprops={"arrowstyle": "->", "color": COLORS["ink"]})  # fmt: skip
     ax.set(xlabel="u (px)", ylabel="v (px)")
     said = f" Marked: {', '.join(labels)}." if labels else ""
-    fig.alt = f"Depth image, {np.mean(depth_m == 0):.0%} of it without depth.{said}"
-    return fig
+    return fig.saying(f"Depth image, {np.mean(depth_m == 0):.0%} of it without depth.{said}")
 
 
 def noise_law(
@@ -186,11 +182,10 @@ def noise_law(
     plain_ticks(ax.yaxis, (0.01, 0.03, 0.1, 0.3, 1, 3, 10, 30))
     ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0))
     others = "".join(f"; {name}: {_listed(x, y)}" for name, (x, y) in (extra or {}).items())
-    fig.alt = (
+    return fig.saying(
         f"Standard deviation of depth against distance over the {law}: "
         f"{_listed(distances_m, std_mm)}{others}."
     )
-    return fig
 
 
 def _listed(distances_m: ArrayLike, std_mm: ArrayLike) -> str:
@@ -211,8 +206,7 @@ def averaging(
     plain_ticks(ax.xaxis, tuple(n))
     plain_ticks(ax.yaxis, (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2))
     ax.legend()
-    fig.alt = (
+    return fig.saying(
         f"Std of the mean of N frames: from {s[0]:.3f} mm at N = {n[0]} to {s[-1]:.3f} mm at "
         f"N = {n[-1]}, where independent frames would give {i[-1]:.3f} mm."
     )
-    return fig

@@ -30,12 +30,11 @@ def mounts(setups: Mapping[str, Setup], joints: Mapping[str, ArrayLike]) -> Less
         _side_view(ax, setup, np.asarray(joints[name], float))
         ax.set_title(name)
         ax.label_outer()
-    fig.alt = (
+    return fig.saying(
         "Side views at true scale: with the camera on the wrist it looks along the gripper at a "
         "board on the table; with the camera over the shoulder it looks down at a board in the "
         "gripper."
     )
-    return fig
 
 
 def _side_view(ax: Any, setup: Setup, q: Floats) -> None:
@@ -101,8 +100,9 @@ def diversity(sessions: Mapping[str, Floats]) -> LessonFigure:
               ylabel="turned about the gripper's z (deg)")  # fmt: skip
     turns.set_title("how it was turned, from the mean")
     turns.legend(loc="best")
-    fig.alt = "Gripper places from above, and rotations from their mean. " + "; ".join(texts)
-    return fig
+    return fig.saying(
+        "Gripper places from above, and rotations from their mean. " + "; ".join(texts)
+    )
 
 
 def study(points: Sequence[StudyPoint]) -> LessonFigure:
@@ -122,8 +122,9 @@ def study(points: Sequence[StudyPoint]) -> LessonFigure:
         ax.set(xlabel="the wrist turns by up to ± (deg)", ylabel=f"median error, {label}",
                ylim=(0, None))  # fmt: skip
         ax.legend()
-    fig.alt = "Median error of X against the range of rotation: " + "; ".join(map(repr, points))
-    return fig
+    return fig.saying(
+        "Median error of X against the range of rotation: " + "; ".join(map(repr, points))
+    )
 
 
 def more_poses(
@@ -147,10 +148,9 @@ def more_poses(
     plain_ticks(axes[0].yaxis, (0.1, 0.3, 1, 3, 10), widen=True)
     axes[0].set_ylabel("translation of X (mm)")
     axes[0].legend()
-    fig.alt = f"Error of X against the number of poses, {counts[0]} to {counts[-1]}. " + "; ".join(
-        texts
+    return fig.saying(
+        f"Error of X against the number of poses, {counts[0]} to {counts[-1]}. " + "; ".join(texts)
     )
-    return fig
 
 
 def gaps(fitted_mm: ArrayLike, held_mm: ArrayLike) -> LessonFigure:
@@ -162,11 +162,10 @@ def gaps(fitted_mm: ArrayLike, held_mm: ArrayLike) -> LessonFigure:
            label="held out")  # fmt: skip
     ax.set(xlabel="pose (number)", ylabel="gap at the board (mm)")
     ax.legend()
-    fig.alt = (
+    return fig.saying(
         f"Gap between the board as seen and as predicted: rms {_rms(fitted):.2f} mm over "
         f"{len(fitted)} fitted poses, {_rms(held):.2f} mm over {len(held)} held out."
     )
-    return fig
 
 
 def _rms(values: Floats) -> float:
@@ -184,7 +183,9 @@ def touched(gap_mm: ArrayLike) -> LessonFigure:
     ax.set_xticks(places, [f"{n + 1}" for n in places])
     ax.set(xlabel="corner, look after look (number)", ylabel="camera - fingertip (mm)")
     ax.legend(ncols=3)
-    fig.alt = "Camera minus fingertip, corner by corner and look by look, mm: " + "; ".join(
-        ", ".join(f"{a} {v:+.1f}" for a, v in zip("xyz", row, strict=True)) for row in gap
+    return fig.saying(
+        "Camera minus fingertip, corner by corner and look by look, mm: "
+        + "; ".join(
+            ", ".join(f"{a} {v:+.1f}" for a, v in zip("xyz", row, strict=True)) for row in gap
+        )
     )
-    return fig

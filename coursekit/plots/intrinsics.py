@@ -51,8 +51,7 @@ def best_fits(X: Floats, Y: Floats, seen: Mapping[str, Floats], f_px: float) -> 
     ax.set(xlim=(F_PX[0], F_PX[-1]), ylim=(0, 3), xlabel="assumed focal length f (px)",
            ylabel="smallest RMS (px)")  # fmt: skip
     fig.legend(loc="outside right upper")
-    fig.alt = f"The smallest RMS against the assumed focal length. {'; '.join(texts)}."
-    return fig
+    return fig.saying(f"The smallest RMS against the assumed focal length. {'; '.join(texts)}.")
 
 
 def _best_rms(X: Floats, Y: Floats, seen: Floats) -> Floats:
@@ -95,12 +94,11 @@ def board(board: Board) -> LessonFigure:
                 ha="center", va="center", bbox={"fc": "white", "ec": "none", "pad": 1})  # fmt: skip
     ax.set(xlabel="x (mm)", ylabel="y (mm)")
     columns, rows = board.corners
-    fig.alt = (
+    return fig.saying(
         f"The board: {board.squares[0]} x {board.squares[1]} squares of "
         f"{1000 * board.square_m:g} mm, {columns} x {rows} inner corners marked, and its frame: "
         "x to the right, y down, z into the board."
     )
-    return fig
 
 
 def views(folder: Path, detections: Sequence[Detection]) -> LessonFigure:
@@ -116,10 +114,10 @@ def views(folder: Path, detections: Sequence[Detection]) -> LessonFigure:
         ax.set_title(f"{found.name}: {len(found.ids)} corners", fontsize=10)
         ax.set(xlabel="u (px)", ylabel="v (px)")
         ax.label_outer()
-    fig.alt = "Views of the board: " + ", ".join(
-        f"{d.name} with {len(d.ids)} corners" for d in detections
+    return fig.saying(
+        "Views of the board: "
+        + ", ".join(f"{d.name} with {len(d.ids)} corners" for d in detections)
     )
-    return fig
 
 
 def coverage(result: IntrinsicsResult) -> LessonFigure:
@@ -140,12 +138,11 @@ def coverage(result: IntrinsicsResult) -> LessonFigure:
              xlabel="tilt about the vertical (deg)",
              ylabel="tilt about the horizontal (deg)")  # fmt: skip
     tilt.set_title("tilt of the board, one dot a view")
-    fig.alt = (
+    return fig.saying(
         f"Corners of {len(result.detections)} views over the image, and the tilts of the board: "
         f"{x.min():.0f} to {x.max():.0f} degrees about the horizontal, {y.min():.0f} to "
         f"{y.max():.0f} about the vertical."
     )
-    return fig
 
 
 # --- a result ---
@@ -169,11 +166,10 @@ def residuals(result: IntrinsicsResult) -> LessonFigure:
     cloud.set(xlim=(-reach, reach), ylim=(reach, -reach), aspect="equal",
               xlabel="residual in u (px)", ylabel="residual in v (px)")  # fmt: skip
     cloud.set_title("circles: 1 and 2 σ per axis")
-    fig.alt = (
+    return fig.saying(
         f"Residuals of {len(errors)} corners: RMS {result.rms_u_px:.3f} px in u, "
         f"{result.rms_v_px:.3f} px in v, {result.rms_px:.3f} px in two dimensions."
     )
-    return fig
 
 
 def _arrows(
@@ -205,7 +201,7 @@ def uncertainty(results: Mapping[str, IntrinsicsResult], range_m: float) -> Less
         ax.label_outer()
         ax.set_title(f"{name} at {range_m:g} m" if name else f"at {range_m:g} m")
     fig.colorbar(shown, ax=list(axes), label="σ of a projected pixel (px)", shrink=0.9)
-    fig.alt = (
+    return fig.saying(
         f"Standard deviation of a projected pixel over the image, for points {range_m:g} m away: "
         + "; ".join(
             f"{name or 'this calibration'} from {m.min():.3f} to {m.max():.3f} px"
@@ -213,7 +209,6 @@ def uncertainty(results: Mapping[str, IntrinsicsResult], range_m: float) -> Less
         )
         + "."
     )
-    return fig
 
 
 def two_sessions(results: Mapping[str, IntrinsicsResult]) -> LessonFigure:
@@ -230,11 +225,13 @@ def two_sessions(results: Mapping[str, IntrinsicsResult]) -> LessonFigure:
         for outline in outlines(result):
             image.add_patch(Polygon(outline, fill=False, ec=COLORS["measured"], lw=1))
         image_axes(image, *result.intrinsics.size)
-    fig.alt = "RMS of each view and the outlines of the boards: " + "; ".join(
-        f"session {name} has RMS {r.rms_px:.3f} px and fx {r.intrinsics.fx:.1f} px"
-        for name, r in results.items()
+    return fig.saying(
+        "RMS of each view and the outlines of the boards: "
+        + "; ".join(
+            f"session {name} has RMS {r.rms_px:.3f} px and fx {r.intrinsics.fx:.1f} px"
+            for name, r in results.items()
+        )
     )
-    return fig
 
 
 def outlines(result: IntrinsicsResult) -> list[Floats]:
@@ -267,11 +264,13 @@ def rules(rows: Mapping[str, IntrinsicsResult], range_m: float) -> LessonFigure:
             ax.text(1.1 * value, y, f"{value:.2g}", va="center", fontsize=10)
     axes[0].invert_yaxis()
     axes[0].set_ylabel(" ")
-    fig.alt = "What each rule buys: " + "; ".join(
-        f"{n}: fx to {f:.2g} %, worst pixel {w:.2g} px"
-        for n, f, w in zip(names, fx, worst, strict=True)
+    return fig.saying(
+        "What each rule buys: "
+        + "; ".join(
+            f"{n}: fx to {f:.2g} %, worst pixel {w:.2g} px"
+            for n, f, w in zip(names, fx, worst, strict=True)
+        )
     )
-    return fig
 
 
 # --- the museum ---
@@ -282,12 +281,14 @@ def signature(results: Mapping[str, IntrinsicsResult]) -> LessonFigure:
     fig, axes = panels(len(results), 3, 9.6, 3.3)
     for ax, (name, result) in zip(axes, results.items(), strict=True):
         _worst_view(ax, name, result)
-    fig.alt = "Residuals in the worst view of each session: " + "; ".join(
-        f"{name}, RMS of all views {r.rms_px:.2f} px, of the worst one "
-        f"{r.per_view_rms_px.max():.2f} px"
-        for name, r in results.items()
+    return fig.saying(
+        "Residuals in the worst view of each session: "
+        + "; ".join(
+            f"{name}, RMS of all views {r.rms_px:.2f} px, of the worst one "
+            f"{r.per_view_rms_px.max():.2f} px"
+            for name, r in results.items()
+        )
     )
-    return fig
 
 
 def _worst_view(ax: Any, name: str, result: IntrinsicsResult) -> None:
@@ -330,8 +331,7 @@ def power(table: Mapping[str, Mapping[str, Any]]) -> LessonFigure:
             )
         )
     axes[0].set_ylabel("share named (1)")
-    fig.alt = "Share of sessions in which the cause is named. " + "; ".join(texts)
-    return fig
+    return fig.saying("Share of sessions in which the cause is named. " + "; ".join(texts))
 
 
 # --- against the factory ---
@@ -355,9 +355,8 @@ def difference(comparison: Comparison) -> LessonFigure:
         fig.colorbar(shown, ax=ax, location="bottom", label=label, shrink=0.9)
         image_axes(ax, width, height)
         ax.label_outer()
-    fig.alt = (
+    return fig.saying(
         f"The fit against the factory over the image: {np.nanmin(pixels):.2f} to "
         f"{np.nanmax(pixels):.2f} px, and {np.nanmin(shift_mm):.2f} to "
         f"{np.nanmax(shift_mm):.2f} mm at {comparison.range_m:g} m."
     )
-    return fig

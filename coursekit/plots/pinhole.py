@@ -13,15 +13,7 @@ from coursekit import geometry
 from coursekit.arrays import AnyArray, Floats, NDArray
 from coursekit.cameras import Frame
 from coursekit.geometry import Intrinsics
-from coursekit.plots.style import (
-    COLORS,
-    LessonFigure,
-    cross,
-    figure,
-    image_axes,
-    panels,
-    single,
-)
+from coursekit.plots.style import COLORS, LessonFigure, cross, figure, image_axes, panels, single
 from coursekit.simulation import Box
 
 DISPLACEMENT_PX = 0.1, 120.0  # the colour scale of `displacement`
@@ -44,12 +36,11 @@ def similar_triangles(focal_length_mm: float = 1.93, depth_m: float = 0.45) -> L
     sensor.plot([x_mm], [0], "o", color=COLORS["measured"], ms=10)
     sensor.set(xlim=(-1.3, 1.3), ylim=(-1.3, 1.3), xlabel="$x_s$ on the sensor (mm)")
     sensor.set(aspect="equal", yticks=[], title=f"$x_s = f\\,X/Z$ = {x_mm:.3f} mm")
-    fig.alt = (
+    return fig.saying(
         f"Side by side: the ray from a point {1000 * POINT_X_M:.0f} mm off the axis at Z = "
         f"{depth_m:.2f} m through the pinhole, and its image {x_mm:.3f} mm off the sensor's "
         f"centre for f = {focal_length_mm:.2f} mm."
     )
-    return fig
 
 
 def _triangles(ax: Any, plane_m: float, depth_m: float) -> None:
@@ -87,11 +78,10 @@ def pixel_grid(principal: tuple[float, float] = (3.3, 2.2)) -> LessonFigure:
     ax.set(xlim=(-0.8, columns - 0.2), ylim=(rows - 0.2, -0.8), aspect="equal")
     ax.set(xlabel="u (px), to the right", ylabel="v (px), down")
     fig.legend(loc="outside lower center", ncols=3)
-    fig.alt = (
+    return fig.saying(
         f"A grid of {columns} by {rows} pixels. The origin (0, 0) is the centre of the top-left "
         f"pixel; the principal point, {principal}, falls between pixel centres."
     )
-    return fig
 
 
 def entries_of_K(scene: tuple[Box, ...], camera: Intrinsics, **moved: float) -> LessonFigure:
@@ -111,8 +101,9 @@ def entries_of_K(scene: tuple[Box, ...], camera: Intrinsics, **moved: float) -> 
     ax.legend(loc="upper right")
     values = ", ".join(f"{k} = {getattr(changed, k):.0f}" for k in ("fx", "fy", "cx", "cy"))
     ax.set_title(values + " px")
-    fig.alt = f"Wire frame of the tabletop in the image with the camera's K and with {values} px."
-    return fig
+    return fig.saying(
+        f"Wire frame of the tabletop in the image with the camera's K and with {values} px."
+    )
 
 
 def _edges(scene: tuple[Box, ...]) -> list[Floats]:
@@ -145,8 +136,7 @@ def field_of_view(depth: Intrinsics, color: Intrinsics | None, distance_m: float
     ax.plot([0, 0], [0, 1.25 * distance_m], color=COLORS["ink"], lw=1)
     ax.set(xlabel="X (m)", ylabel="Z (m)", aspect="equal", ylim=(0, 1.25 * distance_m))
     fig.legend(loc="outside lower center", ncols=2)
-    fig.alt = "Fields of view from above. " + "; ".join(texts) + "."
-    return fig
+    return fig.saying("Fields of view from above. " + "; ".join(texts) + ".")
 
 
 def same_pixel(near_m: float, near_size_m: float, far_m: float, K: Floats) -> LessonFigure:
@@ -164,11 +154,10 @@ def same_pixel(near_m: float, near_size_m: float, far_m: float, K: Floats) -> Le
     ax.set(xlabel="Z (m)", ylabel="X (m)", title=f"both are {pixels:.1f} px wide in the image")
     ax.invert_yaxis()  # from above, the camera's right hand is towards the bottom
     fig.legend(loc="outside lower center", ncols=2)
-    fig.alt = (
+    return fig.saying(
         f"Two objects between the same two rays: {1000 * near_size_m:.0f} mm wide at {near_m:.4g} m"
         f" and {1000 * far_size:.0f} mm wide at {far_m:.4g} m; both are {pixels:.1f} px wide."
     )
-    return fig
 
 
 def displacement(lenses: Mapping[str, Intrinsics]) -> LessonFigure:
@@ -193,8 +182,7 @@ def displacement(lenses: Mapping[str, Intrinsics]) -> LessonFigure:
         texts.append(f"{name}, {edge:.1f} px at an edge, {corner:.1f} px in a corner")
     bar = fig.colorbar(shown, ax=list(axes), label="displacement (px)", shrink=0.6)
     bar.set_ticks([0.1, 1, 10, 100], labels=["0.1", "1", "10", "100"])
-    fig.alt = "Maps of the displacement by distortion: " + "; ".join(texts) + "."
-    return fig
+    return fig.saying("Maps of the displacement by distortion: " + "; ".join(texts) + ".")
 
 
 def displacement_px(lens: Intrinsics) -> tuple[Floats, Floats]:
@@ -225,12 +213,11 @@ def frame(shot: Frame) -> LessonFigure:
         axes[1].imshow(shot.color)
         axes[1].set(title="colour", xlabel="u (px)", ylabel="v (px)")
     height, width = depth.shape
-    fig.alt = (
+    return fig.saying(
         f"Depth image of {width} by {height} pixels, half of them nearer than "
         f"{np.nanmedian(depth):.2f} m, {np.isnan(depth).mean():.0%} of it without depth"
         + ("." if shot.color is None else ", and the colour image beside it.")
     )
-    return fig
 
 
 def _far(depth_m: AnyArray) -> float:
@@ -265,11 +252,10 @@ def point_cloud(points: NDArray[np.float32]) -> LessonFigure:
     above.set_xlim(-side, side)
     above.set_title(f"from above, |Y| < {1000 * SLICE_M:.0f} mm")
     low, high = cloud.min(axis=0), cloud.max(axis=0)
-    fig.alt = (
+    return fig.saying(
         f"Point cloud of {len(cloud)} points, X from {low[0]:.2f} to {high[0]:.2f} m, Z from "
         f"{low[2]:.2f} to {high[2]:.2f} m, and a slice of {len(flat)} points from above."
     )
-    return fig
 
 
 def _solid(ax: Any, cloud: NDArray[np.float32]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import matplotlib as mpl
@@ -51,6 +51,11 @@ class LessonFigure(Figure):
 
     alt: str = ""
 
+    def saying(self, alt: str) -> LessonFigure:
+        """The figure itself, with its text alternative: what a drawing function returns."""
+        self.alt = alt
+        return self
+
     def png(self) -> bytes:
         """The figure as a PNG file."""
         buffer = io.BytesIO()
@@ -66,7 +71,7 @@ Draw = Callable[..., LessonFigure]
 
 
 def figure(width: float = 8.0, height: float = 4.0) -> LessonFigure:
-    """An empty figure, size in inches; the caller draws into it and sets `alt`."""
+    """An empty figure, size in inches; who draws into it returns it `saying` what it shows."""
     return LessonFigure(figsize=(width, height), layout="constrained")
 
 
@@ -78,7 +83,7 @@ def single(width: float, height: float) -> tuple[LessonFigure, Axes]:
 
 def panels(
     n: int, columns: int, width: float, row: float, more: float = 0.0, shared: bool = False
-) -> tuple[LessonFigure, Sequence[Axes]]:
+) -> tuple[LessonFigure, list[Any]]:
     """A figure of n axes in so many columns, and the n axes; `shared`: with the same limits.
 
     width of the figure and height of a row in inches; more: how much higher the figure is.
@@ -88,7 +93,7 @@ def panels(
     axes = fig.subplots(rows, columns, squeeze=False, sharex=shared, sharey=shared).ravel()
     for empty in axes[n:]:
         empty.set_visible(False)
-    return fig, axes[:n]
+    return fig, list(axes[:n])
 
 
 def image_axes(ax: Axes, width: int, height: int) -> None:
