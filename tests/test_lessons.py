@@ -510,13 +510,6 @@ def test_the_widget_commits() -> None:
     assert kinds == ["wrong", "right"]
 
 
-def test_what_a_cell_stores_is_the_same_every_time() -> None:
-    for checkpoint in CHECKPOINTS.values():
-        first, second = checkpoint._repr_mimebundle_(), checkpoint._repr_mimebundle_()
-        for mime in ("text/plain", "text/html"):
-            assert first[mime] == second[mime]
-
-
 # --- progress and evidence ---
 
 

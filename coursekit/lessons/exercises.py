@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 
+from coursekit.arrays import Floats
 from coursekit.lessons import progress
 from coursekit.lessons.progress import Verdict
 
@@ -83,12 +84,12 @@ class Exercise:
     unit: str
     tolerance: float
     describe: Callable[[tuple[Any, ...]], str]
-    show: Callable[[np.ndarray], str]
+    show: Callable[[Floats], str]
     nan_answers: bool = False
     core: Core | None = None
     mistakes: list[Mistake] = field(default_factory=list)
     part_of: Exercise | None = field(default=None, repr=False)
-    _known: dict[tuple[int, ...], np.ndarray | None] = field(
+    _known: dict[tuple[int, ...], Floats | None] = field(
         default_factory=dict, init=False, repr=False
     )
 
@@ -180,7 +181,7 @@ class Exercise:
                 )
         return None
 
-    def _compare(self, runs: list[Run], expected: list[np.ndarray]) -> Verdict:
+    def _compare(self, runs: list[Run], expected: list[Floats]) -> Verdict:
         values = [v for r in runs if (v := _as_numbers(r.value)) is not None]
         changed = any(r.changed_input for r in runs)
         turned = [
@@ -229,8 +230,8 @@ class Exercise:
 
     def _wrong(
         self,
-        values: list[np.ndarray],
-        expected: list[np.ndarray],
+        values: list[Floats],
+        expected: list[Floats],
         agree: list[bool],
         formal: list[Mistake],
     ) -> Verdict:
@@ -256,7 +257,7 @@ class Exercise:
             "case by hand, one step at a time, and compare.",
         )
 
-    def _seen_in(self, case: int, mistakes: tuple[Mistake, ...], want: np.ndarray) -> Mistake:
+    def _seen_in(self, case: int, mistakes: tuple[Mistake, ...], want: Floats) -> Mistake:
         """The first of several mistakes that by itself shows in this case."""
         for mistake in mistakes:
             value = self._answer((mistake,), self.cases[case])
@@ -295,7 +296,7 @@ class Exercise:
             if a.step != b.step:
                 yield (a, b) if order.index(a.step) < order.index(b.step) else (b, a)
 
-    def _explains(self, mistakes: tuple[Mistake, ...], values: list[np.ndarray]) -> bool:
+    def _explains(self, mistakes: tuple[Mistake, ...], values: list[Floats]) -> bool:
         """Whether a wrong model gives exactly these values.
 
         Where the model itself overflows (an iteration that diverges, say) nobody's arithmetic
@@ -312,7 +313,7 @@ class Exercise:
             shown = shown or right is None or not self._agrees(wrong, right)
         return shown
 
-    def _answer(self, mistakes: tuple[Mistake, ...], args: tuple[Any, ...]) -> np.ndarray | None:
+    def _answer(self, mistakes: tuple[Mistake, ...], args: tuple[Any, ...]) -> Floats | None:
         """What a wrong model makes of a case, None where it overflows.
 
         It is kept, because every check asks all of them.
@@ -324,7 +325,7 @@ class Exercise:
             self._known[key] = None if overflows else value
         return self._known[key]
 
-    def _agrees(self, value: np.ndarray, want: np.ndarray) -> bool:
+    def _agrees(self, value: Floats, want: Floats) -> bool:
         """As np.allclose says with equal_nan, in a third of its time: checks ask this often."""
         with np.errstate(all="ignore"):
             off = np.abs(value - want)
@@ -333,7 +334,7 @@ class Exercise:
         equal = (value == want) | (np.isnan(value) & np.isnan(want))
         return bool((np.isfinite(off) | equal).all())
 
-    def _evidence(self, index: int, value: np.ndarray, want: np.ndarray) -> str:
+    def _evidence(self, index: int, value: Floats, want: Floats) -> str:
         """The first failing case, or its row that is furthest off, with its input."""
         args = self.cases[index]
         if want.ndim and self.per_row:
@@ -409,11 +410,11 @@ def _what_was_raised(error: BaseException, function: Callable[..., Any]) -> str:
     return f"{said} at `{source}`" if source else said
 
 
-def _shape(array: np.ndarray) -> str:
+def _shape(array: Floats) -> str:
     return f"an array of shape {array.shape}" if array.ndim else "one number"
 
 
-def _as_numbers(value: Any) -> np.ndarray | None:
+def _as_numbers(value: Any) -> Floats | None:
     try:
         array = np.asarray(value)
         return array.astype(float) if array.dtype.kind in "fiub" else None

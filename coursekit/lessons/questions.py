@@ -94,7 +94,15 @@ class Checkpoint:
 
 @dataclass(frozen=True, repr=False)
 class Choice(Checkpoint):
-    """A question with options A, B, C, ..., exactly one of them right."""
+    """A question with options A, B, C, ..., exactly one of them right.
+
+    >>> near = Option("nearer", "The farther one is smaller.", right=True)
+    >>> choice = Choice("a.b", "Which is larger?", (near, Option("farther", "It looks smaller.")))
+    >>> choice.judge("B")
+    B, farther: not this one.
+    It looks smaller.
+    Think again, and choose another.
+    """
 
     options: tuple[Option, ...]
 
@@ -136,14 +144,18 @@ class Choice(Checkpoint):
 
 @dataclass(frozen=True, repr=False)
 class Number(Checkpoint):
-    """A question whose answer is a number; classic wrong numbers are recognised."""
+    """A question whose answer is a number; classic wrong numbers are recognised.
+
+    value, and those of the classics: in `unit`. why: said with the right answer. hint: said with a
+    wrong one that is no classic. tolerance: relative, of the right one and of each classic.
+    """
 
     value: float
     unit: str
     why: str
     hint: str
     classics: tuple[Classic, ...]
-    tolerance: float = 0.02  # relative
+    tolerance: float = 0.02
 
     def judge(self, given: Any) -> Verdict:
         """The verdict on a number, or on text such as "2.4" or "2,4 mm"."""

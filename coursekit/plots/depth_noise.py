@@ -21,6 +21,9 @@ def technologies(fx: float, baseline_m: float, sigma_d_px: float) -> LessonFigur
     Active stereo: the law, for this camera. Structured light: Khoshelham and Elberink (2012),
     1.425e-5 Z^2 in cm, for the first Kinect. Time of flight: the maker's limit for the Azure
     Kinect, a standard deviation of at most 17 mm at any range; typical values are far below.
+
+    >>> technologies(447.0, 0.050, 0.08).alt[:65]
+    'Random depth error against distance: active stereo 3.6 mm at 1 m '
     """
     fig, ax = single(8.0, 4.2)
     stereo = 1000 * RANGE_M**2 * sigma_d_px / (fx * baseline_m)
@@ -45,7 +48,11 @@ def _at(values: Floats, distance_m: float) -> float:
 def reciprocal(fx_baseline: float, distance_m: float, sigma_d_px: float) -> LessonFigure:
     """Z = f B / d with one band of disparity noise, and what it becomes in depth.
 
-    fx_baseline: f B in px m. sigma_d_px: drawn ten times too large, or nobody would see it.
+    fx_baseline: f B in px m. distance_m: where the band is. sigma_d_px: drawn ten times too large,
+    or nobody would see it.
+
+    >>> reciprocal(21.6, 0.8, 0.08).axes[0].get_title()
+    'd = 27.0 px, Z = 0.80 m: 0.08 px become 2.37 mm'
     """
     d = np.linspace(5, 130, 400)
     at = fx_baseline / distance_m
@@ -69,7 +76,11 @@ def reciprocal(fx_baseline: float, distance_m: float, sigma_d_px: float) -> Less
 
 
 def prices(devices: Mapping[str, tuple[float, float]], sigma_d_px: float) -> LessonFigure:
-    """The law for several cameras, each (fx in px, baseline in m), on logarithmic axes."""
+    """The law for several cameras, each (fx in px, baseline in m), on logarithmic axes.
+
+    >>> prices({"D405": (425.0, 0.018)}, 0.08).alt
+    'Depth noise by the law for 0.08 px, at 0.45 m: D405 2.12 mm.'
+    """
     fig, ax = single(8.0, 4.4)
     texts = []
     for style, (name, (fx, baseline_m)) in zip(STYLES, devices.items(), strict=False):
@@ -89,7 +100,11 @@ def prices(devices: Mapping[str, tuple[float, float]], sigma_d_px: float) -> Les
 def infrared_pair(
     left: Floats, right: Floats, pixel: tuple[int, int], disparity_px: float, half: int
 ) -> LessonFigure:
-    """A crop of both infrared images with the window around `pixel` and where it is found."""
+    """A crop of both infrared images with the window around `pixel` and where it is found.
+
+    left, right: the images (H, W), grey levels. pixel: (u, v) of the left one. half: the window has
+    2 half + 1 pixels a side.
+    """
     u, v = pixel
     fig = figure(9.0, 3.8)
     axes = fig.subplots(1, 2, sharey=True)
@@ -110,7 +125,10 @@ def infrared_pair(
 
 
 def cost_curve(costs: Floats, disparity_px: float) -> LessonFigure:
-    """Matching cost against disparity: the whole search, and the neighbourhood of the minimum."""
+    """Matching cost against disparity: the whole search, and the neighbourhood of the minimum.
+
+    costs: of the candidates 0, 1, 2, ... px, in grey levels. disparity_px: what the matcher says.
+    """
     fig = figure(9.0, 3.6)
     whole, close = fig.subplots(1, 2)
     d = np.arange(len(costs))
@@ -143,7 +161,11 @@ def _flanks(ax: Any, costs: Floats, best: int, disparity_px: float) -> None:
 def depth_image(
     depth_m: Floats, labels: Mapping[str, tuple[float, float]] | None = None
 ) -> LessonFigure:
-    """A depth image, no depth in white, with labels at pixels if there are any."""
+    """A depth image (H, W) in m, no depth in white, with labels at pixels (u, v) if there are any.
+
+    >>> depth_image(np.eye(4)).alt
+    'Depth image, 75% of it without depth.'
+    """
     fig, ax = single(8.5, 4.6)
     shown = ax.imshow(np.where(depth_m > 0, depth_m, np.nan), vmin=0.2, vmax=1.2)
     fig.colorbar(shown, ax=ax, label="depth Z (m)", shrink=0.8)
@@ -166,7 +188,8 @@ def noise_law(
 ) -> LessonFigure:
     """Measured std of depth with its standard error over a curve (Z, mid, low, high), the `law`.
 
-    extra: other series (Z, std), by name. The legend stands beside the axes, clear of all points.
+    All standard deviations are in mm, all distances in m. extra: other series (Z, std), by name.
+    The legend stands beside the axes, clear of all points.
     """
     z, mid, low, high = curve
     fig, ax = single(9.5, 4.6)
@@ -196,7 +219,11 @@ def _listed(distances_m: ArrayLike, std_mm: ArrayLike) -> str:
 def averaging(
     counts: ArrayLike, std_mm: ArrayLike, error_mm: ArrayLike, ideal_mm: ArrayLike
 ) -> LessonFigure:
-    """Std of the mean of N frames with its error, over the 1 / sqrt(N) of independent frames."""
+    """Std of the mean of N frames with its error, over the 1 / sqrt(N) of independent frames, mm.
+
+    >>> averaging([1, 4], [1.0, 0.8], [0.1, 0.1], [1.0, 0.5]).alt[:47]
+    'Std of the mean of N frames: from 1.000 mm at N'
+    """
     fig, ax = single(8.0, 4.2)
     ax.plot(counts, ideal_mm, color=COLORS["model"], ls="--", label="independent frames: 1/√N")
     ax.errorbar(counts, std_mm, 1.96 * np.asarray(error_mm), fmt="o-", capsize=3,

@@ -27,6 +27,9 @@ def similar_triangles(focal_length_mm: float = 1.93, depth_m: float = 0.45) -> L
 
     focal_length_mm: lens to image plane, mm. depth_m: Z of a point 100 mm right of the axis, m.
     The image plane is drawn 80 times too far from the pinhole, or nobody would see it.
+
+    >>> similar_triangles(focal_length_mm=4.0, depth_m=0.8).alt[-55:]
+    "image 0.500 mm off the sensor's centre for f = 4.00 mm."
     """
     x_mm = focal_length_mm * POINT_X_M / depth_m
     fig = figure(9.0, 3.8)
@@ -64,7 +67,13 @@ def _triangles(ax: Any, plane_m: float, depth_m: float) -> None:
 
 
 def pixel_grid(principal: tuple[float, float] = (3.3, 2.2)) -> LessonFigure:
-    """A sensor of 8 x 5 pixels: (0, 0) is the centre of the top-left one, edges are at +-0.5."""
+    """A sensor of 8 x 5 pixels: (0, 0) is the centre of the top-left one, edges are at +-0.5.
+
+    principal: (cx, cy) px of the point that is marked.
+
+    >>> pixel_grid((3.3, 2.2)).alt[:25]
+    'A grid of 8 by 5 pixels. '
+    """
     columns, rows = 8, 5
     fig, ax = single(6.5, 4.4)
     u, v = np.arange(columns + 1) - 0.5, np.arange(rows + 1) - 0.5
@@ -85,7 +94,10 @@ def pixel_grid(principal: tuple[float, float] = (3.3, 2.2)) -> LessonFigure:
 
 
 def entries_of_K(scene: tuple[Box, ...], camera: Intrinsics, **moved: float) -> LessonFigure:
-    """The edges of a scene's boxes, drawn with the camera's K and with some entries changed."""
+    """The edges of a scene's boxes, drawn with the camera's K and with some entries changed.
+
+    moved: new values, px, of fx, fy, cx or cy. Raises ValueError for another name.
+    """
     changed = Intrinsics.from_dict(camera.to_dict() | moved)
     fig, ax = single(8.0, 4.8)
     for intrinsics, color, style, name in (
@@ -140,7 +152,11 @@ def field_of_view(depth: Intrinsics, color: Intrinsics | None, distance_m: float
 
 
 def same_pixel(near_m: float, near_size_m: float, far_m: float, K: Floats) -> LessonFigure:
-    """A small near and a large far object that cover the same pixels."""
+    """A small near and a large far object that cover the same pixels; K is (3, 3), px.
+
+    >>> same_pixel(0.5, 0.02, 1.0, np.diag([400.0, 400.0, 1.0])).axes[0].get_title()
+    'both are 16.0 px wide in the image'
+    """
     far_size = near_size_m * far_m / near_m
     pixels = K[0, 0] * near_size_m / near_m
     fig, ax = single(8.0, 3.2)
@@ -194,7 +210,10 @@ def displacement_px(lens: Intrinsics) -> tuple[Floats, Floats]:
 
 
 def edge_and_corner(size: Floats) -> tuple[float, float]:
-    """The largest displacement at the middle of the four edges, and in the four corners, px."""
+    """The largest displacement at the middle of the four edges, and in the four corners, px.
+
+    size: of each pixel's displacement (H, W), px, from `displacement_px`.
+    """
     height, width = size.shape
     edge = max(size[height // 2, [0, -1]].max(), size[[0, -1], width // 2].max())
     return float(edge), float(size[np.ix_([0, -1], [0, -1])].max())
