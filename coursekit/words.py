@@ -150,4 +150,3 @@ class Findings(Sequence[Finding]):
         notes = "".join(f"<p><small>{html.escape(line)}</small></p>" for line in self._looked_for())
         listed = f"<ol>{items}</ol>" if items else ""
         return f"<p><b>{self._headline()}</b></p>{listed}{notes}"
-

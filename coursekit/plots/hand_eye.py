@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from coursekit.arrays import ArrayLike, Floats
 from coursekit.hand_eye import StudyPoint
 from coursekit.plots.style import COLORS, LessonFigure, cross, figure, plain_ticks, single
-from coursekit.simulation.hand_eye_poses import Setup
+from coursekit.simulation.arm_poses import Setup
 
 AXIS_M = 0.09  # how long a frame's axes are drawn
 STYLES = ("-", "--", "-.", ":")

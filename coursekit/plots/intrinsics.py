@@ -13,7 +13,8 @@ from matplotlib.patches import Polygon
 from coursekit.arrays import Floats
 from coursekit.boards import Board, Detection
 from coursekit.geometry import project, transform_points
-from coursekit.intrinsics import Comparison, IntrinsicsResult, judge
+from coursekit.intrinsics import Comparison, IntrinsicsResult
+from coursekit.intrinsics.fit import tilts
 from coursekit.plots.style import (
     COLORS,
     LessonFigure,
@@ -129,8 +130,8 @@ def coverage(result: IntrinsicsResult) -> LessonFigure:
         image.plot(found.pixels[:, 0], found.pixels[:, 1], ".", ms=3, color=COLORS["measured"])
     image_axes(image, width, height)
     image.set_title("corners of all views")
-    tilts = judge.tilts(result)
-    x, y = tilts.about_x_deg, tilts.about_y_deg
+    turned = tilts(result)
+    x, y = turned.about_x_deg, turned.about_y_deg
     cross(tilt)
     tilt.plot(y, x, "o", color=COLORS["measured"])
     reach = max(50.0, 5 + np.abs([x, y]).max())
