@@ -263,7 +263,7 @@ def test_noise_on_the_face_has_the_size_that_the_matcher_gives_it(seed, distance
     """Temporal std of a pixel about sigma_d Z^2 / (f B), and the mean where the truth puts it."""
     with SimulatedCamera(seed=seed, depth_scale_m=1e-4) as camera:
         camera.place("60 mm block", distance_m)
-        depth = middle_mm(camera.frames(40, progress=False), half=10)  # clear of the edges
+        depth = middle_mm(camera.frames(24, progress=False), half=10)  # clear of the edges
         truth_mm = 1000 * expected_m(camera, distance_m)
         predicted_mm = SIGMA_D_PX * truth_mm**2 / (camera.depth.fx * 1000 * camera.baseline_m)
     pixel_std = np.sqrt(np.nanmean(np.nanvar(depth, axis=0, ddof=1)))
@@ -273,6 +273,22 @@ def test_noise_on_the_face_has_the_size_that_the_matcher_gives_it(seed, distance
     assert window_std > 0.1 * pixel_std
     assert np.nanmean(depth) == pytest.approx(truth_mm, abs=predicted_mm + 0.3)
     assert np.isnan(depth).mean() < 0.01
+
+
+def test_the_three_scenes():
+    with SimulatedCamera() as camera:
+        names = [
+            {box.name for box in camera.scene}
+            for name in ("60 mm block", "wall", "artefacts")
+            if camera.place(name, 0.6) is None
+        ]
+        assert names[0] == {"wall", "table", "60 mm block", "25 mm cube"}
+        assert names[1] == {"wall"}
+        assert names[2] > names[0] | {"dark card", "shiny plate", "finger"}
+        depth = camera.frame().depth
+        assert np.mean(depth[:200, 50:250] == 0) > 0.5  # the finger and its shadow
+        camera.place("wall", 0.6)
+        assert np.mean(camera.frame().depth[50:-50, 150:-50] == 0) < 0.02
 
 
 def test_another_unit_of_depth_rounds_the_same_images():

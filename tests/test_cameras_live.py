@@ -4,29 +4,20 @@ from __future__ import annotations
 
 import gc
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
-from fake_realsense import SERIAL, FakeRealSense, real_library
+from fake_realsense import SERIAL, plugged_in, real_library
 
-from coursekit.cameras import CameraError, librealsense, open_camera, realsense
+from coursekit.cameras import CameraError, open_camera, realsense
 from coursekit.cameras.librealsense import LibraryMissing, load_librealsense
 
 
 @pytest.fixture
 def plug_in(monkeypatch, tmp_path):
     """Plug in a fake D435 that behaves as the arguments say."""
-    monkeypatch.delenv("COURSEKIT_CAMERA", raising=False)
-    monkeypatch.setattr(librealsense, "USB_DEVICES", tmp_path)
-    monkeypatch.setattr(realsense, "_live_cameras", {})
-
-    def plug(**behaviour):
-        rs = FakeRealSense(**behaviour)
-        for module in (librealsense, realsense):
-            monkeypatch.setattr(module, "load_librealsense", lambda: rs)
-        return rs
-
-    return plug
+    return partial(plugged_in, monkeypatch, tmp_path)
 
 
 def put_on_usb(folder, product):
