@@ -9,15 +9,13 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-    from scipy.spatial.transform import Rotation
-
-    Floats = NDArray[np.float64]
+from coursekit import kernels
+from coursekit.arrays import ArrayLike, Floats, NDArray
 
 MODELS = ("none", "brown_conrady", "inverse_brown_conrady", "modified_brown_conrady")
 NEWTON_STEPS = 50
@@ -309,7 +307,6 @@ def deproject_image(
 def _scale_rays(
     image: NDArray[Any], intrinsics: Intrinsics, scale: float, out: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    from coursekit import kernels  # numba takes half a second to import
 
     if intrinsics.dist is None:
         kernels.deproject_pinhole(
@@ -350,7 +347,6 @@ def align_depth_to_color(
 
 def _align_sources(depth: Floats, of: Intrinsics, to: Intrinsics, T: Floats) -> NDArray[np.int64]:
     """For each colour pixel the flat index of the nearest depth pixel that covers it, else -1."""
-    from coursekit import kernels  # numba takes half a second to import
 
     corners = pixel_grid(of.width + 1, of.height + 1) - 0.5
     rays = deproject(corners, np.ones(corners.shape[:2]), of.K, of.dist)
@@ -407,6 +403,14 @@ def transform_points(T: ArrayLike, points: ArrayLike) -> Floats:
     if T.ndim != 2:
         raise ValueError(f"T: got shape {T.shape}, want one (4, 4) transform")
     return _array("points", points, (3,)) @ T[:3, :3].T + T[:3, 3]
+
+
+def cross_matrix(vectors: Floats) -> Floats:
+    """[a]x of vectors (..., 3): (..., 3, 3) with [a]x b = a x b."""
+    matrix = np.zeros((*vectors.shape, 3))
+    matrix[..., [2, 0, 1], [1, 2, 0]] = vectors
+    matrix[..., [1, 2, 0], [2, 0, 1]] = -vectors
+    return matrix
 
 
 # --- checks at the boundary ---

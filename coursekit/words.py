@@ -52,7 +52,7 @@ def html_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """The same as an HTML table; text is escaped."""
 
     def row(tag: str, cells: Sequence[str]) -> str:
-        texts = (f"<{tag} style='text-align:left'>{html.escape(c)}</{tag}>" for c in cells)
+        texts = (f'<{tag} style="text-align: left">{html.escape(c)}</{tag}>' for c in cells)
         return f"<tr>{''.join(texts)}</tr>"
 
     return f"<table>{row('th', head)}{''.join(row('td', cells) for cells in rows)}</table>"
@@ -150,4 +150,3 @@ class Findings(Sequence[Finding]):
         notes = "".join(f"<p><small>{html.escape(line)}</small></p>" for line in self._looked_for())
         listed = f"<ol>{items}</ol>" if items else ""
         return f"<p><b>{self._headline()}</b></p>{listed}{notes}"
-

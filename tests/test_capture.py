@@ -35,7 +35,7 @@ from coursekit.cameras.capture import (
 from coursekit.cameras.simulated import SimulatedCamera
 from coursekit.geometry import Intrinsics, make_transform, project, transform_points
 from coursekit.simulation.board_images import render_board
-from coursekit.simulation.sessions import corner_session
+from coursekit.simulation.corner_sessions import corner_session
 
 BOARD = Board("charuco", (9, 6), 0.025)
 CHECKERS = Board("checkerboard", (10, 7), 0.025)

@@ -19,7 +19,7 @@ from coursekit.intrinsics.derivatives import (
     scaled_inverse,
 )
 from coursekit.intrinsics.fit import parameter_vector, with_parameters
-from coursekit.simulation.sessions import Effects, bowed, corner_session
+from coursekit.simulation.corner_sessions import Effects, bowed, corner_session
 
 LENS = Intrinsics(
     640, 480, 612.0, 610.0, 322.0, 238.0, "brown_conrady", (0.08, -0.18, 0.0007, -0.0004, 0.05)

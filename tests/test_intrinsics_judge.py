@@ -18,10 +18,9 @@ from scipy.spatial.transform import Rotation
 from coursekit import intrinsics
 from coursekit.boards import Board, Detection, Detections
 from coursekit.geometry import Intrinsics, make_transform, project, transform_points
-from coursekit.intrinsics.differences import difference_px
-from coursekit.intrinsics.next_view import visible
-from coursekit.intrinsics.uncertainty import image_grid
-from coursekit.simulation.sessions import Effects, bowed, corner_session
+from coursekit.intrinsics.comparison import difference_px
+from coursekit.intrinsics.fit import image_grid
+from coursekit.simulation.corner_sessions import Effects, bowed, corner_session
 
 NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 LENS = Intrinsics(
@@ -339,75 +338,3 @@ def test_a_bow_moves_corners_by_less_than_the_lesson_says() -> None:
             _, r, t = cv2.solvePnP(CHECKERBOARD.points, bent, K, None)
             again = cv2.projectPoints(CHECKERBOARD.points, r, t, K, None)[0][:, 0]
             assert np.linalg.norm(again - bent, axis=1).max() < 0.95
-
-
-# --- the next view ---
-
-
-@pytest.mark.parametrize(
-    "arguments", [{"views": 5}, {"effects": FLAT}, {"effects": INNER}], ids=["few", "flat", "inner"]
-)
-def test_the_predicted_uncertainty_is_what_follows(arguments) -> None:
-    """The view is taken, everything is fitted again, and the map is as foretold."""
-    detections, _ = corner_session(CHARUCO, LENS, 3, **arguments)
-    result = intrinsics.calibrate(detections, CHARUCO)
-    best = intrinsics.next_view(result)
-    ids = visible(CHARUCO, LENS, best.T_camera_board)
-    rng = np.random.default_rng(0)
-    pixels = project(transform_points(best.T_camera_board, CHARUCO.points[ids]), LENS.K, LENS.dist)
-    taken = Detection(ids, pixels + rng.normal(0, 0.08, pixels.shape), LENS.size)
-    after = intrinsics.calibrate([*detections, taken], CHARUCO)
-
-    def worst(r: intrinsics.IntrinsicsResult) -> float:
-        return max(r.uncertainty_map(range_m, (7, 9)).max() for range_m in (0.45, math.inf))
-
-    assert worst(result) == pytest.approx(best.now_px)
-    assert worst(after) == pytest.approx(best.worst_px[best.index], rel=0.15)
-    assert worst(after) < 0.75 * worst(result)
-
-
-def test_next_view_goes_where_the_session_was_weak() -> None:
-    flat = intrinsics.next_view(fit(CHARUCO, 3, effects=FLAT))
-    tilt = math.degrees(math.acos(flat.T_camera_board[2, 2]))
-    assert tilt == pytest.approx(40)
-    inner = intrinsics.next_view(fit(CHARUCO, 3, effects=INNER))
-    seen = visible(CHARUCO, LENS, inner.T_camera_board)
-    pixels = project(
-        transform_points(inner.T_camera_board, CHARUCO.points[seen]), LENS.K, LENS.dist
-    )
-    # from 96 px free at the sides and 72 at top and bottom to corners in that margin
-    assert ((pixels < [96, 72]) | (pixels > [544, 408])).any()
-
-
-def test_candidates_show_enough_of_the_board() -> None:
-    for board, least in ((CHARUCO, 16), (CHECKERBOARD, 54)):
-        poses = intrinsics.candidate_views(board, LENS)
-        assert poses.shape == (459, 4, 4)
-        assert min(len(visible(board, LENS, T)) for T in poses) >= least
-    old = Board("charuco", (9, 6), 0.025, old_origin=True)
-    poses = intrinsics.candidate_views(old, LENS)
-    assert (poses[:, 2, 2] < 0).all()  # its z points at the viewer
-
-
-def test_candidates_that_show_nothing_are_never_chosen(good) -> None:
-    poses = intrinsics.candidate_views(CHARUCO, LENS)[:3]
-    behind = make_transform(np.eye(3), [0.0, 0.0, -0.5])
-    best = intrinsics.next_view(good, np.concatenate([behind[None], poses]), range_m=0.45)
-    assert np.isinf(best.worst_px[0])
-    assert best.index > 0
-    with pytest.raises(ValueError, match="none of them shows enough of the board"):
-        intrinsics.next_view(good, behind[None])
-    with pytest.raises(ValueError, match=r"candidates: got shape \(4, 4\), want \(m, 4, 4\)"):
-        intrinsics.next_view(good, behind)
-
-
-def test_a_bowed_boards_next_view_counts_the_bow(good) -> None:
-    """The bow's three coefficients widen the uncertainty, before and after.
-
-    A poor view may raise the worst a little: its pose counts in the mean over the boards.
-    """
-    poses = intrinsics.candidate_views(CHARUCO, LENS)[::40]
-    with_bow = intrinsics.next_view(intrinsics.fit_bow(good).result, poses)
-    without = intrinsics.next_view(good, poses)
-    assert with_bow.now_px > without.now_px
-    assert (with_bow.worst_px <= 1.02 * with_bow.now_px).all()

@@ -22,9 +22,8 @@ from coursekit.geometry import (
     project,
     transform_points,
 )
-from coursekit.intrinsics.fit import evaluate
-from coursekit.intrinsics.uncertainty import Information, image_grid
-from coursekit.simulation.sessions import Effects, corner_session
+from coursekit.intrinsics.fit import Information, evaluate, image_grid
+from coursekit.simulation.corner_sessions import Effects, corner_session
 
 NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 SESSIONS = 1000 if NIGHTLY else 120

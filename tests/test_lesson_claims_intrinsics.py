@@ -18,10 +18,9 @@ from scipy.spatial.transform import Rotation
 from coursekit import intrinsics
 from coursekit.boards import Board, BoardNotFound, Detection, Detections, detect
 from coursekit.geometry import Intrinsics, make_transform, project, transform_points
-from coursekit.intrinsics.differences import difference_px
-from coursekit.intrinsics.fit import evaluate
-from coursekit.intrinsics.uncertainty import image_grid
-from coursekit.simulation.sessions import Effects, bowed, corner_session
+from coursekit.intrinsics.comparison import difference_px
+from coursekit.intrinsics.fit import evaluate, image_grid
+from coursekit.simulation.corner_sessions import Effects, bowed, corner_session
 
 NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 SEEDS = range(9000, 9060 if NIGHTLY else 9006)

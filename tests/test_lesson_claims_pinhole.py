@@ -22,7 +22,7 @@ from coursekit.geometry import (
     project,
     transform_points,
 )
-from coursekit.simulation.sessions import corner_session
+from coursekit.simulation.corner_sessions import corner_session
 from coursekit.specifications import device, lens
 
 K = np.array([[447.0, 0, 424], [0, 447, 240], [0, 0, 1]])

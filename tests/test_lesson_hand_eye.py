@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import coursekit as ck
 from coursekit.lessons import hand_eye as lesson
-from coursekit.simulation.hand_eye_sessions import HandEyeMistakes, hand_eye_session
+from coursekit.simulation.arm_sessions import HandEyeMistakes, hand_eye_session
 
 BY_NAME = {c.name.partition(".")[2]: c for c in lesson.CHECKPOINTS}
 

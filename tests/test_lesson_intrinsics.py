@@ -13,7 +13,7 @@ from coursekit.geometry import Intrinsics, make_transform
 from coursekit.intrinsics.derivatives import project_with_derivatives, twist_columns
 from coursekit.lessons import intrinsics as lesson
 from coursekit.plots import intrinsics as figures
-from coursekit.simulation.sessions import Effects, corner_session
+from coursekit.simulation.corner_sessions import Effects, corner_session
 
 BOARD = ck.boards.Board("charuco", squares=(9, 6), square_m=0.025)
 CHECKERBOARD = ck.boards.Board("checkerboard", squares=(10, 7), square_m=0.025)

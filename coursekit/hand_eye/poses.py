@@ -21,16 +21,12 @@ so a covariance of (omega, v) can be read directly: v is the position's.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
+from coursekit.arrays import ArrayLike, Floats
 from coursekit.geometry import check_transform, invert_transform
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    Floats = NDArray[np.float64]
 
 Mount = Literal["eye_in_hand", "eye_to_hand"]
 MOUNTS = ("eye_in_hand", "eye_to_hand")
@@ -106,14 +102,6 @@ def turned(T: Floats, twists: Floats) -> Floats:
     flat[:, :3, :3] = Rotation.from_rotvec(steps[:, :3]).as_matrix() @ flat[:, :3, :3]
     flat[:, :3, 3] += steps[:, 3:]
     return flat.reshape(*twists.shape[:-1], 4, 4)
-
-
-def cross_matrix(vectors: Floats) -> Floats:
-    """[a]x of vectors (..., 3): (..., 3, 3) with [a]x b = a x b."""
-    matrix = np.zeros((*vectors.shape, 3))
-    matrix[..., [2, 0, 1], [1, 2, 0]] = vectors
-    matrix[..., [1, 2, 0], [2, 0, 1]] = -vectors
-    return matrix
 
 
 def mean_pose(T: Floats) -> Floats:

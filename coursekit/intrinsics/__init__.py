@@ -8,9 +8,10 @@ how far the fitted camera may be wrong about where a point is seen (`projection_
 Intervals are 95 %. Pixels, metres and radians; a pose is T_camera_board, (4, 4).
 """
 
-from coursekit.intrinsics.bow import Bow, fit_bow
-from coursekit.intrinsics.diagnose import diagnose
-from coursekit.intrinsics.differences import (
+from __future__ import annotations
+
+from coursekit.intrinsics.causes import Bow, fit_bow
+from coursekit.intrinsics.comparison import (
     Comparison,
     HalvesDifference,
     HeldOut,
@@ -18,11 +19,18 @@ from coursekit.intrinsics.differences import (
     halves,
     held_out,
 )
-from coursekit.intrinsics.fit import MODELS, CalibrationFailed, IntrinsicsResult, calibrate
-from coursekit.intrinsics.judge import Coverage, Tilts, coverage, tilts
-from coursekit.intrinsics.next_view import NextView, candidate_views, next_view
-from coursekit.intrinsics.power import stored_power
-from coursekit.intrinsics.uncertainty import image_grid
+from coursekit.intrinsics.diagnosis import diagnose, stored_power
+from coursekit.intrinsics.fit import (
+    MODELS,
+    CalibrationFailed,
+    Coverage,
+    IntrinsicsResult,
+    Tilts,
+    calibrate,
+    coverage,
+    image_grid,
+    tilts,
+)
 
 __all__ = [
     "MODELS",
@@ -33,10 +41,8 @@ __all__ = [
     "HalvesDifference",
     "HeldOut",
     "IntrinsicsResult",
-    "NextView",
     "Tilts",
     "calibrate",
-    "candidate_views",
     "compare",
     "coverage",
     "diagnose",
@@ -44,7 +50,6 @@ __all__ = [
     "halves",
     "held_out",
     "image_grid",
-    "next_view",
     "stored_power",
     "tilts",
 ]

@@ -8,22 +8,14 @@ columns, and the pose that several boards have in common is the mean of their xi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from coursekit.geometry import distort, distortion_jacobian
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from coursekit.geometry import Intrinsics
-
-    Floats = NDArray[np.float64]
+from coursekit.arrays import Floats
+from coursekit.geometry import Intrinsics, distort, distortion_jacobian
 
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 

@@ -13,7 +13,7 @@ from coursekit.plots.style import COLORS, LessonFigure, figure
 
 if TYPE_CHECKING:
     from coursekit.hand_eye import StudyPoint
-    from coursekit.simulation.hand_eye_poses import Setup
+    from coursekit.simulation.arm_poses import Setup
 
 Floats = NDArray[np.float64]
 

@@ -127,7 +127,7 @@ def views(folder: Path, detections: Sequence[Detection]) -> LessonFigure:
 
 def coverage(result: IntrinsicsResult) -> LessonFigure:
     """Where the corners are in the image, and how the board was tilted."""
-    from coursekit.intrinsics import judge
+    from coursekit.intrinsics.fit import tilts as tilts_of
 
     fig = figure(9.0, 3.9)
     image, tilt = fig.subplots(1, 2, width_ratios=(1.45, 1))
@@ -136,7 +136,7 @@ def coverage(result: IntrinsicsResult) -> LessonFigure:
         image.plot(found.pixels[:, 0], found.pixels[:, 1], ".", ms=3, color=COLORS["measured"])
     _frame(image, width, height)
     image.set_title("corners of all views")
-    tilts = judge.tilts(result)
+    tilts = tilts_of(result)
     x, y = tilts.about_x_deg, tilts.about_y_deg
     tilt.axhline(0, color=COLORS["faint"], lw=1)
     tilt.axvline(0, color=COLORS["faint"], lw=1)

@@ -4,47 +4,38 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from coursekit.arrays import Bools, Floats, Interval, NDArray, Window
+from coursekit.checks import positive
 from coursekit.geometry import Intrinsics, deproject
 from coursekit.stereo.law import rounded_variance, unrounded_std
-from coursekit.stereo.stacks import (
+from coursekit.stereo.windows import (
+    CORRELATION_PX,
+    WindowStats,
     clip_window,
     cut,
     depth_stack,
+    effective_frames,
     first_frame,
     plane_design,
     plane_image,
-    positive,
+    series_std,
     std_error,
     valid_mean,
     valid_median,
     valid_std,
-    wrapped,
-)
-from coursekit.stereo.windows import (
-    CORRELATION_PX,
-    WindowStats,
-    effective_frames,
-    series_std,
     window_stats,
 )
+from coursekit.words import wrapped
 
 HALF_WINDOW_PX = 5.5  # of the matching window; edges are pushed out by up to that
 EDGE_BAND_PX = 8  # on either side of an edge, where flying pixels are counted
 GAP_PX = 4  # holes up to this wide do not end a face
 FACE_WINDOW_PX = 40
 NEAR_FACE = 0.35  # of the width: tilt, noise and pattern move no pixel of a face farther
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Floats = NDArray[np.float64]
-    Bools = NDArray[np.bool_]
-    Interval = tuple[float, float]
-    Window = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -108,7 +99,8 @@ class BlockFace:
                 f", edges {self.fattening_px:+.2f} ± {self.fattening_error_px:.2f} px outwards "
                 "if its depth is right"
             )
-        return wrapped(f"{text}, {self.flying_fraction:.1%} flying pixels at its edges")
+        said = f"{text}, {self.flying_fraction:.1%} flying pixels at its edges"
+        return wrapped(said, 84, indent="    ")
 
 
 @dataclass(frozen=True)

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
-from coursekit.stereo.stacks import fx_baseline, numbers
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    Floats = NDArray[np.float64]
+from coursekit.arrays import ArrayLike, Floats
+from coursekit.checks import positive
 
 
 def depth_from_disparity(disparity_px: ArrayLike, fx: float, baseline_m: float | None) -> Floats:
@@ -107,3 +103,31 @@ def unrounded_std(std: float, step: float | None) -> float:
     if step is None or not std > 0:
         return std
     return float(brentq(lambda s: float(rounded_variance(s, step)) - std**2, 0.0, std))
+
+
+def numbers(name: str, values: ArrayLike, shape: tuple[int, ...] | None = None) -> Floats:
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}: got {values!r}, want numbers") from None
+    if shape is not None and array.shape != shape:
+        raise ValueError(f"{name}: got shape {array.shape}, want {shape}, one for each distance")
+    return array
+
+
+def increasing(name: str, values: ArrayLike) -> Floats:
+    array = np.atleast_1d(numbers(name, values))
+    if array.ndim != 1 or array.size == 0 or not (np.isfinite(array) & (array > 0)).all():
+        raise ValueError(f"{name}: got {array.tolist()}, want positive distances in m")
+    if (np.diff(array) <= 0).any():
+        raise ValueError(f"{name}: got {array.tolist()}, want them to increase")
+    return array
+
+
+def fx_baseline(fx: Any, baseline_m: Any) -> float:
+    if baseline_m is None:
+        raise ValueError(
+            "baseline_m: got None: this recording does not say how far apart its eyes are; give "
+            "the data sheet's baseline if that will do"
+        )
+    return positive("fx", fx) * positive("baseline_m", baseline_m)
