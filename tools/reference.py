@@ -7,7 +7,6 @@ has its public members, and a class that a named function or such a member retur
 
 from __future__ import annotations
 
-import ast
 import inspect
 import re
 import sys
@@ -27,19 +26,16 @@ from tools.build_notebooks import ROOT, find, joined, read
 FOLDER = "reference"
 TEMPLATES = Path(__file__).resolve().parent / "site" / "reference"
 NAMED = re.compile(r"\bck\.([a-z]\w*(?:\.[A-Za-z]\w*)*)")
-CLI = ROOT / "coursekit" / "cli.py"
+IMPORTED = re.compile(r"from coursekit\.([\w.]+) import (\w+)")
+CLI = "coursekit/cli.py"
 
 
 def named() -> set[str]:
-    """What notebooks (code and text), README and command line name, without `coursekit.`."""
+    """What notebooks (code and text), README and command line name, without `ck.`."""
     texts = [joined(cell["source"]) for path in find([]) for cell in read(path)["cells"]]
-    texts.append((ROOT / "README.md").read_text(encoding="utf-8"))
-    names = {name for text in texts for name in NAMED.findall(text)}
-    for node in ast.walk(ast.parse(CLI.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("coursekit."):
-            room = (node.module or "").removeprefix("coursekit.")
-            names |= {f"{room}.{alias.name}" for alias in node.names}
-    return names
+    texts += [(ROOT / name).read_text(encoding="utf-8") for name in ("README.md", CLI)]
+    imported = IMPORTED.findall(texts[-1])
+    return {name for text in texts for name in NAMED.findall(text)} | set(map(".".join, imported))
 
 
 def pages() -> dict[str, dict[str, Any]]:
