@@ -137,9 +137,8 @@ def _submit(options: argparse.Namespace) -> None:
 
 
 def _grade(options: argparse.Namespace) -> None:
-    from coursekit.submission.batch import (
-        grade_folder,
-    )  # no notebook needs it: it has no short name
+    # No notebook needs it, so it has no short name.
+    from coursekit.submission.batch import grade_folder
 
     where = options.folder, options.out
     print(grade_folder(*where, options.workers, options.timeout, overwrite=options.overwrite))

@@ -6,10 +6,12 @@ from motion in pictures, not in made-up numbers.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
+import pickle
 import zlib
-from functools import lru_cache, wraps
+from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -64,14 +66,8 @@ def once(function):
     """The function, which does what it is asked for with the same things only once."""
     done = {}
 
-    def named(thing):
-        if isinstance(thing, np.random.Generator):
-            return str(thing.bit_generator.state)
-        return hash(thing.tobytes()) if isinstance(thing, np.ndarray) else thing
-
-    @wraps(function)
     def remembering(*things):
-        key = tuple(map(named, things))
+        key = hashlib.sha256(pickle.dumps(things)).digest()
         if key not in done:
             done[key] = function(*things)
         return done[key]
@@ -347,21 +343,16 @@ def moving(px_per_frame, frames, noise_px=0.05, seed=0):
     """Detections of a board that moves by so much a frame."""
     rng = np.random.default_rng(seed)
     pixels = project(transform_points(POSES[0], BOARD.points), LENS.K)
-    steps = np.outer(np.arange(frames), px_per_frame)
-    return [
-        Detection(
-            np.arange(len(pixels)),
-            pixels + step + noise_px * rng.standard_normal(pixels.shape),
-            LENS.size,
-            noise_px=noise_px,
-        )
-        for step in steps
-    ]
+    ids, views = np.arange(len(pixels)), []
+    for step in np.outer(np.arange(frames), px_per_frame):
+        seen = pixels + step + noise_px * rng.standard_normal(pixels.shape)
+        views.append(Detection(ids, seen, LENS.size, noise_px=noise_px))
+    return views
 
 
 @pytest.mark.parametrize("noise_px", [0.02, 0.1, 0.3])
 def test_noise_alone_is_still(noise_px):
-    assert all(is_still(moving((0, 0), 5, noise_px, seed)) for seed in range(200))
+    assert all(is_still(moving((0, 0), 5, noise_px, seed)) for seed in range(50))
 
 
 def test_a_slow_motion_is_not_still():
