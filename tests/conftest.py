@@ -1,5 +1,6 @@
 """What is made once a run for the tests of several modules."""
 
+import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -37,3 +38,20 @@ def small_cameras():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulated, "specifications", SimpleNamespace(device=device))
         yield
+
+
+@pytest.fixture
+def no_library(monkeypatch):
+    """As where pyrealsense2 is not installed."""
+    monkeypatch.delenv("COURSEKIT_CAMERA", raising=False)
+    for name in ("pyrealsense2", "libusb_package"):
+        monkeypatch.setitem(sys.modules, name, None)
+
+
+@pytest.fixture
+def broken_library(monkeypatch, tmp_path):
+    """As where pyrealsense2 is installed and does not load."""
+    content = "raise ImportError('libusb-1.0.so.0: no such file')"
+    (tmp_path / "pyrealsense2.py").write_text(content, encoding="utf-8")
+    monkeypatch.delitem(sys.modules, "pyrealsense2", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import sys
 from functools import partial
 
 import numpy as np
@@ -370,13 +369,6 @@ def test_lock_of_a_closed_camera(camera):
 # --- without the library ---
 
 
-@pytest.fixture
-def no_library(monkeypatch):
-    monkeypatch.delenv("COURSEKIT_CAMERA", raising=False)
-    monkeypatch.setitem(sys.modules, "pyrealsense2", None)
-    monkeypatch.setitem(sys.modules, "libusb_package", None)
-
-
 def test_without_the_library_auto_is_simulated_and_says_why(no_library):
     camera = open_camera()
     assert camera.source == "simulated"
@@ -399,11 +391,6 @@ def test_without_the_library_nothing_is_recorded(no_library, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_library_that_does_not_load_says_so(monkeypatch, tmp_path):
-    (tmp_path / "pyrealsense2.py").write_text(
-        "raise ImportError('libusb-1.0.so.0: no such file')", encoding="utf-8"
-    )
-    monkeypatch.delitem(sys.modules, "pyrealsense2", raising=False)
-    monkeypatch.syspath_prepend(tmp_path)
+def test_a_library_that_does_not_load_says_so(broken_library):
     with pytest.raises(LibraryMissing, match=r"does not load \(libusb-1\.0\.so\.0: no such file"):
         load_librealsense()

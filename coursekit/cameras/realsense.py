@@ -469,8 +469,8 @@ def _decimal(value: float) -> float:
 def specified(name: str) -> specifications.Device | None:
     """The device of data/devices.toml that a camera of this name is, or a variant of, or None.
 
-    >>> specified("Intel RealSense D435i").name
-    'D435'
+    >>> specified("Intel RealSense D435i").nominal.baseline_m
+    0.05
     """
     devices = (d for d in specifications.device_names() if re.search(rf"\b{d}", name))
     found = next(devices, None)
