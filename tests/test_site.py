@@ -273,7 +273,7 @@ def test_a_hidden_source_is_collapsed():
 
 
 def test_every_checkpoint_keeps_its_explanation_closed(pages):
-    text = "".join(str(page) for page in pages.values())
+    text = "".join(str(page) for name, page in pages.items() if not name.startswith("reference/"))
     for name, checkpoint in ck.lessons.CHECKPOINTS.items():
         assert text.count(f'ck.checkpoint("{name}").answer(') == 1, name
         assert checkpoint.explanation().headline.split(":")[0] in text.replace("&amp;", "&")
