@@ -5,11 +5,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["AnyArray", "ArrayLike", "Bools", "Floats", "Image", "Integers", "Interval", "NDArray"]
-
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Bools = NDArray[np.bool_]
+Mask = Bools
+Grey = NDArray[np.uint8]  # a grey image (H, W)
 Image = NDArray[np.uint8]  # grey (H, W) or BGR (H, W, 3)
 AnyArray = NDArray[Any]
 Interval = tuple[float, float]  # low and high end, mostly of 95 %
+Window = tuple[int, int, int, int]  # left, top, width, height, px
+__all__ = [
+    "AnyArray",
+    "ArrayLike",
+    "Bools",
+    "Floats",
+    "Grey",
+    "Image",
+    "Integers",
+    "Interval",
+    "Mask",
+    "NDArray",
+    "Window",
+]

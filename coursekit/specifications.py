@@ -7,13 +7,12 @@ import math
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+
+from coursekit.arrays import NDArray
 from coursekit.geometry import Intrinsics, make_transform
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 

@@ -28,7 +28,7 @@ from coursekit.simulation import (
     tabletop,
     wall_scene,
 )
-from coursekit.simulation import active_stereo as rig_module
+from coursekit.simulation import rig as rig_module
 from coursekit.specifications import device
 
 UNIT = device("D435").unit

@@ -15,7 +15,7 @@ from coursekit import arm as arms
 from coursekit.arm import ArmErrors, SimulatedArm, fk_covariance, fk_error, pose_difference, widowx
 from coursekit.boards import Board
 from coursekit.geometry import project, transform_points
-from coursekit.simulation import hand_eye_poses as poses
+from coursekit.simulation import arm_poses as poses
 from coursekit.specifications import device
 
 NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"

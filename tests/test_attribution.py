@@ -23,15 +23,19 @@ from scipy.stats import binom, f, f_oneway, ncf, t
 from coursekit.arm import widowx
 from coursekit.attribution import Entry, Ledger, attribute, simulate_misses
 from coursekit.attribution.ledger import HEADER
-from coursekit.attribution.mean_test import (
+from coursekit.attribution.significance import (
+    GROUPS,
     POOLED,
+    STILL,
     effective_axes,
+    find_places,
     mean_power,
     mean_test,
+    place_test,
+    pose_columns,
     pose_power,
+    pose_test,
 )
-from coursekit.attribution.place_test import find_places, place_test
-from coursekit.attribution.pose_test import GROUPS, STILL, pose_columns, pose_test
 
 NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 SETS = 1000

@@ -19,7 +19,7 @@ from coursekit.cameras.capture import see
 from coursekit.geometry import Intrinsics, make_transform, project, transform_points
 from coursekit.simulation import board_images
 from coursekit.simulation.board_images import board_scene, render_board
-from coursekit.simulation.sessions import Effects, bowed, rolling_shutter, view_poses
+from coursekit.simulation.corner_sessions import Effects, bowed, rolling_shutter, view_poses
 from tools import make_data
 
 NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"

@@ -11,7 +11,7 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 
-import coursekit.boards.folder
+import coursekit.boards.detector
 from coursekit.boards import (
     Board,
     BoardNotFound,
@@ -22,9 +22,8 @@ from coursekit.boards import (
     detect_all,
     save_sheet,
 )
-from coursekit.boards.blur import blur_covariance
+from coursekit.boards.corners import blur_covariance, noise_levels
 from coursekit.boards.find import find
-from coursekit.boards.refine import noise_levels
 
 CHECKERBOARD = Board("checkerboard", (10, 7), 0.025)
 CHARUCO = Board("charuco", (9, 6), 0.025)
@@ -542,7 +541,7 @@ def test_ctrl_c_keeps_what_was_detected(charuco_image, monkeypatch, capsys):
             raise KeyboardInterrupt
         return detect(image, board, name)
 
-    monkeypatch.setattr(coursekit.boards.folder, "detect", until_third)
+    monkeypatch.setattr(coursekit.boards.detector, "detect", until_third)
     seen = detect_all([charuco_image] * 5, CHARUCO)
     assert [one.name for one in seen] == ["image 0", "image 1"]
     assert capsys.readouterr().out == "Stopped after 2 of 5 images; they are kept.\n"

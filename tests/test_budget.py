@@ -21,7 +21,7 @@ from coursekit.budget import (
     lesson_view,
     wrist_budget,
 )
-from coursekit.budget.tables import LESSON_CAMERA
+from coursekit.budget.handover import LESSON_CAMERA
 from coursekit.geometry import Intrinsics, deproject, project
 from coursekit.stereo import depth_noise
 

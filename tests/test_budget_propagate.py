@@ -22,8 +22,8 @@ from coursekit.budget import (
     monte_carlo,
     propagate,
 )
-from coursekit.budget.propagate import PARAMETERS
-from coursekit.budget.tables import LESSON_CAMERA
+from coursekit.budget.handover import LESSON_CAMERA
+from coursekit.budget.propagation import PARAMETERS
 from coursekit.geometry import Intrinsics, deproject, invert_transform, transform_points, undistort
 
 LENS = Intrinsics(
@@ -107,7 +107,7 @@ def test_samples_go_through_the_exact_chain(mount: str) -> None:
     for name, covariance in one.items():
         alone = Covariances(names=PARAMETERS, **{name: covariance})
         samples = monte_carlo(where, alone, 20, seed=5)
-        from coursekit.budget.propagate import _root
+        from coursekit.budget.propagation import _root
 
         used = _root(alone.joint) @ np.random.default_rng(5).standard_normal(
             (np.linalg.matrix_rank(alone.joint, tol=1e-16), 20)

@@ -20,11 +20,11 @@ from coursekit.arm import ArmErrors, pose_difference, widowx
 from coursekit.geometry import invert_transform, make_transform
 from coursekit.hand_eye import causes, misread
 from coursekit.hand_eye.causes import Arms, Search
-from coursekit.hand_eye.diagnose import diagnose
+from coursekit.hand_eye.diagnosis import diagnose
 from coursekit.hand_eye.pairs import Pairs, robust_fit
 from coursekit.hand_eye.session import HandEyeSession
-from coursekit.simulation.hand_eye_sessions import HandEyeMistakes as M
-from coursekit.simulation.hand_eye_sessions import HandEyeTruth, hand_eye_session
+from coursekit.simulation.arm_sessions import HandEyeMistakes as M
+from coursekit.simulation.arm_sessions import HandEyeTruth, hand_eye_session
 
 NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 FIRST_SEED = 100_000

@@ -19,9 +19,8 @@ from coursekit.arm import ArmErrors, pose_difference, widowx
 from coursekit.boards import Board, Detections
 from coursekit.geometry import invert_transform, project
 from coursekit.hand_eye.poses import camera_board, turned
-from coursekit.hand_eye.refine import by_arm_twist, by_X_and_Y
+from coursekit.hand_eye.refinement import PixelViews, PoseViews, by_arm_twist, by_X_and_Y
 from coursekit.hand_eye.result import board_gap
-from coursekit.hand_eye.views import PixelViews, PoseViews
 
 NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 SESSIONS = 1000 if NIGHTLY else 40

@@ -17,7 +17,7 @@ from coursekit.geometry import invert_transform
 from coursekit.hand_eye import observability
 from coursekit.hand_eye.poses import camera_board
 from coursekit.hand_eye.session import HandEyeSession
-from coursekit.simulation.hand_eye_sessions import (
+from coursekit.simulation.arm_sessions import (
     SECONDS,
     HandEyeMistakes,
     hand_eye_session,

@@ -20,13 +20,18 @@ from scipy.stats import f as f_distribution
 
 from coursekit.boards import Board, Detection, Detections, Skipped
 from coursekit.geometry import Intrinsics, invert_transform, make_transform
-from coursekit.intrinsics import causes, extended
-from coursekit.intrinsics.diagnose import blur_lengths_px, diagnose
+from coursekit.intrinsics import causes
+from coursekit.intrinsics.diagnosis import (
+    blur_lengths_px,
+    depth_at_corners,
+    depth_scale,
+    diagnose,
+    robot_scale,
+    stored_power,
+)
 from coursekit.intrinsics.fit import calibrate
-from coursekit.intrinsics.metric_scale import depth_at_corners, depth_scale, robot_scale
-from coursekit.intrinsics.power import stored_power
+from coursekit.simulation.corner_sessions import Effects, Truth, corner_session
 from coursekit.simulation.diagnosis_power import power
-from coursekit.simulation.sessions import Effects, Truth, corner_session
 
 NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 FIRST_SEED = 100_000
@@ -155,13 +160,13 @@ def test_the_sizes_of_focus_drift_and_shutter_motion_come_out() -> None:
 # --- the statistics ---
 
 
-def small_session() -> tuple[extended.Model, extended.Data]:
+def small_session() -> tuple[causes.Model, causes.Data]:
     detections, _ = corner_session(CHARUCO, LENS, FIRST_SEED + 5, views=6)
-    model, data = extended.begin(calibrate(detections, CHARUCO))
-    return extended.refit(model, data), data
+    model, data = causes.begin(calibrate(detections, CHARUCO))
+    return causes.refit(model, data), data
 
 
-def dense_jacobian(linear: extended.Linear, data: extended.Data) -> np.ndarray:
+def dense_jacobian(linear: causes.Linear, data: causes.Data) -> np.ndarray:
     n = len(data.view)
     poses = np.zeros((n, 2, 6, 6))
     poses[np.arange(n), :, data.view] = linear.pose
@@ -178,13 +183,13 @@ def test_the_derivatives_are_those_of_the_model() -> None:
         focal=1 + 0.01 * rng.normal(size=6),
         motion=1e-3 * rng.normal(size=(6, 3)),
     )
-    linear = extended.linearise(model, data)
+    linear = causes.linearise(model, data)
 
     def change(**fields: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
         """d residuals along a direction of one field."""
         (name, (value, direction)), step = *fields.items(), 1e-6
         ahead, back = (
-            extended.linearise(replace(model, **{name: value + s * direction}), data).residuals
+            causes.linearise(replace(model, **{name: value + s * direction}), data).residuals
             for s in (step, -step)
         )
         return (ahead - back) / (2 * step)
@@ -204,7 +209,7 @@ def test_the_derivatives_are_those_of_the_model() -> None:
 def test_the_f_test_is_the_textbooks() -> None:
     """Against two full least-squares fits, with and without the columns."""
     model, data = small_session()
-    linear = extended.linearise(model, data)
+    linear = causes.linearise(model, data)
     J = dense_jacobian(linear, data)
     E = linear.columns[causes.BOW].reshape(len(J), 3)
     r = linear.residuals.ravel()
@@ -228,9 +233,9 @@ def test_the_size_of_a_cause_is_the_restricted_maximum_likelihood() -> None:
     detections, _ = corner_session(
         CHARUCO, LENS, FIRST_SEED + 6, views=6, effects=Effects(focus_drift=0.02)
     )
-    model, data = extended.begin(calibrate(detections, CHARUCO))
-    model = extended.refit(model, data)
-    linear = extended.linearise(model, data)
+    model, data = causes.begin(calibrate(detections, CHARUCO))
+    model = causes.refit(model, data)
+    linear = causes.linearise(model, data)
     n = len(data.view)
     E = np.zeros((n, 2, 6))
     E[np.arange(n), :, data.view] = linear.columns[causes.FOCUS][..., 0]
@@ -260,8 +265,8 @@ def test_p_values_of_healthy_sessions_are_uniform() -> None:
     p_values: dict[str, list[float]] = {cause: [] for cause in causes.PHYSICAL}
     for seed in range(FIRST_SEED + 3000, FIRST_SEED + 3000 + count):
         detections, _, board = session(seed, Effects(noise_spread=0.2))
-        model, data = extended.begin(calibrate(detections, board))
-        linear = extended.linearise(model, data)
+        model, data = causes.begin(calibrate(detections, board))
+        linear = causes.linearise(model, data)
         plain = causes.Projector(model, data, linear)
         for cause in causes.PHYSICAL:
             columns = causes._dense(data, cause, linear.columns[cause])
@@ -274,8 +279,8 @@ def test_the_refit_without_causes_is_opencvs_minimum() -> None:
     detections, _ = corner_session(CHARUCO, LENS, FIRST_SEED + 7)
     result = calibrate(detections, CHARUCO)
     away = replace(result.intrinsics, fx=result.intrinsics.fx * 1.03, cx=330.0)
-    start, data = extended.begin(result)
-    refitted = extended.refit(replace(start, camera=away), data).camera
+    start, data = causes.begin(result)
+    refitted = causes.refit(replace(start, camera=away), data).camera
     for name in ("fx", "fy", "cx", "cy"):
         assert abs(getattr(refitted, name) - result.value(name)) < 0.05 * result.sigma(name)
 

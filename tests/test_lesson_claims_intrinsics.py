@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import replace
+from functools import cache
 
 import cv2
 import numpy as np
@@ -18,10 +19,9 @@ from scipy.spatial.transform import Rotation
 from coursekit import intrinsics
 from coursekit.boards import Board, BoardNotFound, Detection, Detections, detect
 from coursekit.geometry import Intrinsics, make_transform, project, transform_points
-from coursekit.intrinsics.differences import difference_px
-from coursekit.intrinsics.fit import evaluate
-from coursekit.intrinsics.uncertainty import image_grid
-from coursekit.simulation.sessions import Effects, bowed, corner_session
+from coursekit.intrinsics.comparison import difference_px
+from coursekit.intrinsics.fit import evaluate, image_grid
+from coursekit.simulation.corner_sessions import Effects, bowed, corner_session
 
 NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 SEEDS = range(9000, 9060 if NIGHTLY else 9006)
@@ -33,6 +33,7 @@ CHARUCO = Board("charuco", (9, 6), 0.025)
 CHECKERBOARD = Board("checkerboard", (10, 7), 0.025)  # 9 x 6 inner corners
 
 
+@cache
 def fits(board: Board, seeds: range = SEEDS, **session) -> list[intrinsics.IntrinsicsResult]:
     return [
         intrinsics.calibrate(corner_session(board, LENS, seed, **session)[0], board)

@@ -8,8 +8,13 @@ import pytest
 from coursekit.arm import ArmErrors
 from coursekit.geometry import transform_points
 from coursekit.hand_eye import MOUNTS
-from coursekit.simulation.hand_eye_sessions import hand_eye_session, truth_of
-from coursekit.simulation.physical_tests import SEEN_TO_M, shared_target, touch_corners
+from coursekit.simulation.arm_sessions import (
+    SEEN_TO_M,
+    hand_eye_session,
+    shared_target,
+    touch_corners,
+    truth_of,
+)
 from coursekit.specifications import DATA
 
 NO_ERRORS = ArmErrors(0.0, 0.0, 0.0, 0.0)

@@ -10,14 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from coursekit.boards import Board
 from coursekit.geometry import Intrinsics
-from coursekit.simulation.diagnosis_power import power
-from coursekit.simulation.sessions import (
+from coursekit.simulation.corner_sessions import (
     Effects,
     Truth,
     bowed,
     corner_session,
     rolling_shutter,
 )
+from coursekit.simulation.diagnosis_power import power
 
 LENS = Intrinsics(
     640, 480, 612.0, 610.0, 322.0, 238.0, "brown_conrady", (-0.12, 0.08, 0.001, -0.0008, 0.02)

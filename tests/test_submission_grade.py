@@ -18,9 +18,9 @@ from coursekit import cli
 from coursekit.submission import rubric
 from coursekit.submission.flags import Fingerprint, copies, fingerprint
 from coursekit.submission.format import Claims, Conclusion, Plot, Stack, Submission
-from coursekit.submission.recompute import RULES, grading_rules, recompute
+from coursekit.submission.recompute import MISTAKES, RULES, grading_rules, recompute
 from coursekit.submission.report import student_page
-from coursekit.submission.rubric import MISTAKES, Item, grade, judged, shortcomings
+from coursekit.submission.rubric import Item, grade, judged, shortcomings
 
 MANY = 8 if os.environ.get("COURSEKIT_NIGHTLY") == "1" else 1
 FIELDS = {

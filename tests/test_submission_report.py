@@ -19,7 +19,8 @@ import sample_submissions as samples
 from coursekit.submission import report
 from coursekit.submission.flags import Flag, same_words
 from coursekit.submission.format import Stack, Submission
-from coursekit.submission.rubric import LABELS, MISTAKES, Grade
+from coursekit.submission.recompute import LABELS, MISTAKES
+from coursekit.submission.rubric import Grade
 
 VOID = {"meta", "br", "img", "hr", "input", "link"}
 

@@ -152,14 +152,14 @@ def test_nothing_is_kept_of_what_cannot_be_handed_in(block, own_results):
     ):
         keep(camera, [one], found, law, [0.7, 1.2, 1.9], 0.0, 0.06)
     for quantity, message in (
-        (0.6, r"depth_std_at_450_mm: got a float, want Quantity\(value, 'mm', standard error\)"),
-        (Quantity(0.6, "inch"), "depth_std_at_450_mm: got the unit 'inch', want 'mm' or 'm'"),
+        (0.6, r"depth_std_at_450_mm: got 0.6, want Quantity\(value, 'mm', standard error\)"),
+        (Quantity(0.6, "inch"), "depth_std_at_450_mm: got 'inch', want the unit 'mm' or 'm'"),
     ):
         with pytest.raises(ValueError, match=message):
             keep(camera, [one], {"depth_std_at_450_mm": quantity}, law, None, 0.0, 0.06)
     for table, message in (
         ([1], r"table: got \[1\], want \{0.30: "),
-        ({0.5: (1, 1, 1, 1, 0)}, "table: got the distance 0.5, want one of 0.45"),
+        ({0.5: (1, 1, 1, 1, 0)}, "table: got 0.5, want one of the distances 0.45"),
         ({0.45: (1, 1)}, r"table at 0.45 m: got \(1, 1\), want five: bias, its standard error"),
         ({0.45: (1, 1, "x", 1, 0)}, "depth_std_mm: got 'x', want a number"),
     ):

@@ -31,8 +31,8 @@ from coursekit import (
 )
 from coursekit.cameras.librealsense import LibraryMissing, load_librealsense
 from coursekit.geometry import Intrinsics
-from coursekit.simulation.hand_eye_sessions import hand_eye_session
-from coursekit.simulation.sessions import corner_session
+from coursekit.simulation.arm_sessions import hand_eye_session
+from coursekit.simulation.corner_sessions import corner_session
 from coursekit.submission.batch import grade_folder
 from coursekit.submission.format import Stack, Submission, bundle_bytes, read_bundle
 from coursekit.submission.report import grade_file

@@ -19,16 +19,16 @@ import numpy as np
 import coursekit as ck
 from coursekit.arm import ArmErrors
 from coursekit.boards import Board
-from coursekit.boards.folder import SESSION
+from coursekit.boards.detector import SESSION
 from coursekit.budget.handover import REFERENCE
 from coursekit.cameras.capture import session_card
 from coursekit.cameras.simulated import SimulatedCamera
 from coursekit.hand_eye.poses import Mount
-from coursekit.intrinsics.power import STORED
+from coursekit.intrinsics.diagnosis import STORED
 from coursekit.results import Quantity, write_bytes, write_json
+from coursekit.simulation.arm_sessions import SIMULATED, rendered_session
+from coursekit.simulation.corner_sessions import Effects, view_poses
 from coursekit.simulation.diagnosis_power import power
-from coursekit.simulation.hand_eye_sessions import SIMULATED, rendered_session
-from coursekit.simulation.sessions import Effects, view_poses
 from coursekit.specifications import DATA
 from coursekit.submission.format import Conclusion, Stack, Submission, bundle_bytes, write_bundle
 from coursekit.submission.submit import measured
@@ -51,7 +51,7 @@ HAND_EYE_ORIGIN = (
     "Rendered by tools/make_data.py: a WidowX AI with hidden errors, its seed as given, stops at "
     "each pose; the lens is this device's colour camera, and the intrinsics given are the true "
     "ones. The table behind a board in the gripper goes along with it. No real arm or camera took "
-    "it. Where the camera really is, coursekit.simulation.hand_eye_sessions.truth_of tells."
+    "it. Where the camera really is, coursekit.simulation.arm_sessions.truth_of tells."
 )
 
 

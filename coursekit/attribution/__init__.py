@@ -1,9 +1,10 @@
 """Whose fault a missed grasp is: decided with a test from repeated misses, and kept in a ledger."""
 
-from coursekit.attribution.attribute import Attribution, attribute
-from coursekit.attribution.decision import Verdict
+from __future__ import annotations
+
 from coursekit.attribution.ledger import Entry, Ledger
 from coursekit.attribution.simulate import SimulatedMisses, four_sets, simulate_misses
+from coursekit.attribution.verdict import Attribution, Verdict, attribute
 
 __all__ = [
     "Attribution",

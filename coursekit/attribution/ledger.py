@@ -15,12 +15,10 @@ import sys
 from collections.abc import Iterator
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import Any, TextIO
 
+from coursekit.attribution.verdict import Attribution
 from coursekit.results import folder, now, write_bytes
-
-if TYPE_CHECKING:
-    from coursekit.attribution.attribute import Attribution
 
 FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")  # what a spreadsheet takes as a formula
 LONGEST = 500

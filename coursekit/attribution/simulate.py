@@ -5,18 +5,14 @@ from __future__ import annotations
 import zlib
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, get_args
+from typing import get_args
 
 import numpy as np
 
 from coursekit.arm import widowx
-from coursekit.attribution.decision import Verdict
+from coursekit.arrays import ArrayLike, Floats
+from coursekit.attribution.verdict import Verdict
 from coursekit.geometry import make_transform
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    Floats = NDArray[np.float64]
 
 BIAS_M = 0.003
 NOISE_M = 0.002  # std of one axis

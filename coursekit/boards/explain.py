@@ -5,19 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
+from coursekit.arrays import Floats, Grey, NDArray
 from coursekit.boards.board import FEWEST_CHECKERBOARD, FEWEST_SQUARES, Board
 from coursekit.boards.find import SEARCHES, checkerboard_grid
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Floats = NDArray[np.float64]
-    Grey = NDArray[np.uint8]
 
 COMMON = (
     (9, 6),

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from coursekit.arrays import Floats, Grey, NDArray
+from coursekit.boards.board import Board
 
-    from coursekit.boards.board import Board
-
-    Floats = NDArray[np.float64]
-    Grey = NDArray[np.uint8]
-    Found = tuple[NDArray[np.intp], Floats]
-    Search = Callable[[Grey, tuple[int, int]], Any]
+Found = tuple[NDArray[np.intp], Floats]
+Search = Callable[[Grey, tuple[int, int]], Any]
 
 # Longest side in px at which a board is looked for; a larger image is made smaller first, and
 # looked at again in the next size when nothing is found.

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.path import Path as Outline
 
+from coursekit.arrays import NDArray
 from coursekit.boards.board import Board
 
-if TYPE_CHECKING:
-    from matplotlib.path import Path as Outline
-    from numpy.typing import NDArray
-
-    Boxes = NDArray[np.float64]
+Boxes = NDArray[np.float64]
 
 PAPERS_MM = {  # short and long side
     "A4": (210.0, 297.0),

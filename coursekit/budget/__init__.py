@@ -1,7 +1,17 @@
 """The error budget: pixels, depth, hand-eye and arm errors as one table in millimetres."""
 
-from coursekit.budget.beside import beside
-from coursekit.budget.budget import AxisBudget, Draws, ErrorBudget, Row
+from __future__ import annotations
+
+from coursekit.budget.budget import (
+    AxisBudget,
+    Draws,
+    ErrorBudget,
+    ErrorTerm,
+    Row,
+    autocorrelation,
+    beside,
+    effective_frames,
+)
 from coursekit.budget.grasp import (
     CUBE,
     LESSON_GRIPPER,
@@ -18,8 +28,15 @@ from coursekit.budget.grasp import (
     success_probability,
     with_gripper,
 )
-from coursekit.budget.handover import Found, HandOver, hand_over
-from coursekit.budget.propagate import (
+from coursekit.budget.handover import (
+    Found,
+    HandOver,
+    hand_over,
+    lesson_budget,
+    lesson_view,
+    wrist_budget,
+)
+from coursekit.budget.propagation import (
     Chain,
     Covariances,
     FirstOrderCheck,
@@ -29,8 +46,6 @@ from coursekit.budget.propagate import (
     monte_carlo,
     propagate,
 )
-from coursekit.budget.tables import lesson_budget, lesson_view, wrist_budget
-from coursekit.budget.terms import ErrorTerm, autocorrelation, effective_frames
 from coursekit.budget.view import AXES, GraspAxes, View, looking_down
 
 __all__ = [

@@ -5,18 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from coursekit.arrays import Floats
 from coursekit.budget.budget import ErrorBudget
 from coursekit.budget.view import AXES, GraspAxes, positive
 from coursekit.results import Kind
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Floats = NDArray[np.float64]
 
 DRAWS = 20_000  # of a probability that is redrawn while dragging: a standard error of 0.4 % at most
 DISTANCES = 200

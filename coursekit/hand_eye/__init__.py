@@ -7,25 +7,26 @@ result is off at poses that it has not seen. The frames and the equation are in 
 Metres and radians; T_base_gripper takes gripper coordinates to base coordinates.
 """
 
-from coursekit.hand_eye.board_pose import BoardPose, board_pose, board_poses
+from __future__ import annotations
+
 from coursekit.hand_eye.closed_form import (
     CLOSED_FORMS,
     NotDetermined,
     SolverFailed,
+    StudyPoint,
+    error_study,
     motions,
     rotation_from_shifts,
     rotation_half,
     translation_half,
 )
-from coursekit.hand_eye.diagnose import diagnose
-from coursekit.hand_eye.judge import HeldOut, held_out
-from coursekit.hand_eye.next_pose import NextPose, candidate_joints, next_pose
-from coursekit.hand_eye.observability import Observability, observability
+from coursekit.hand_eye.diagnosis import diagnose
+from coursekit.hand_eye.planning import NextPose, candidate_joints, next_pose
 from coursekit.hand_eye.poses import MOUNTS
-from coursekit.hand_eye.result import HandEyeResult
+from coursekit.hand_eye.refinement import BoardPose, board_pose, board_poses
+from coursekit.hand_eye.result import HandEyeResult, HeldOut, Observability, held_out, observability
 from coursekit.hand_eye.session import HandEyeSession
-from coursekit.hand_eye.solve import METHODS, solve
-from coursekit.hand_eye.study import StudyPoint, error_study
+from coursekit.hand_eye.solver import METHODS, solve
 
 __all__ = [
     "CLOSED_FORMS",

@@ -17,21 +17,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from coursekit.arm import fk_covariance
+from coursekit.arm import Arm, ArmErrors, fk_covariance
+from coursekit.arrays import Floats, NDArray
 from coursekit.hand_eye.pairs import LEAST_M, LEAST_RAD, MEDIAN_3D, Fit, Pairs, robust_fit
 from coursekit.hand_eye.poses import turned
-from coursekit.hand_eye.refine import by_arm_twist
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from coursekit.arm import Arm, ArmErrors
-
-    Floats = NDArray[np.float64]
+from coursekit.hand_eye.refinement import by_arm_twist
 
 SCALE, LATE, SLIP, OUTLIER, OFFSET = (
     "wrong_square_size", "late_time_stamps", "slipping_board", "outlier_pose", "arm_error",

@@ -10,19 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from coursekit.arrays import Floats
 from coursekit.geometry import invert_transform
 from coursekit.hand_eye.pairs import LEAST_M, Fit, Pairs, robust_fit
 from coursekit.hand_eye.poses import nearest_rotation
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Floats = NDArray[np.float64]
 
 PER_RADIAN = 180.0 / np.pi
 MENDED, KEPT = 0.5, 1.5  # most displacement left over: of pairs put right, of rotations alone

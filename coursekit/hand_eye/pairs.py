@@ -7,22 +7,16 @@ it does, rad and m, in the camera's axes.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from coursekit.arm import pose_difference
+from coursekit.arrays import Floats, NDArray
 from coursekit.geometry import invert_transform
 from coursekit.hand_eye.closed_form import motions, rotation_by_axes
 from coursekit.hand_eye.poses import Mount, camera_board, carrier_stand, mean_pose, turned
-from coursekit.hand_eye.refine import by_X_and_Y
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from coursekit.hand_eye.session import HandEyeSession
-
-    Floats = NDArray[np.float64]
+from coursekit.hand_eye.refinement import by_X_and_Y
+from coursekit.hand_eye.session import HandEyeSession
 
 STEPS = 15
 ARRIVED = 1e-7  # m and rad

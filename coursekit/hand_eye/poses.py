@@ -21,16 +21,13 @@ so a covariance of (omega, v) can be read directly: v is the position's.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
-from coursekit.geometry import check_transform, invert_transform
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    Floats = NDArray[np.float64]
+from coursekit.arrays import ArrayLike, Floats
+from coursekit.checks import transform
+from coursekit.geometry import invert_transform
 
 Mount = Literal["eye_in_hand", "eye_to_hand"]
 MOUNTS = ("eye_in_hand", "eye_to_hand")
@@ -108,14 +105,6 @@ def turned(T: Floats, twists: Floats) -> Floats:
     return flat.reshape(*twists.shape[:-1], 4, 4)
 
 
-def cross_matrix(vectors: Floats) -> Floats:
-    """[a]x of vectors (..., 3): (..., 3, 3) with [a]x b = a x b."""
-    matrix = np.zeros((*vectors.shape, 3))
-    matrix[..., [2, 0, 1], [1, 2, 0]] = vectors
-    matrix[..., [1, 2, 0], [2, 0, 1]] = -vectors
-    return matrix
-
-
 def mean_pose(T: Floats) -> Floats:
     """The mean of poses (n, 4, 4): the chordal mean of the rotations, the mean position."""
     mean = np.eye(4)
@@ -133,10 +122,7 @@ def nearest_rotation(matrix: Floats) -> Floats:
 
 def check_one(name: str, value: ArrayLike) -> Floats:
     """`value` as one (4, 4) rigid transform."""
-    T = check_transform(name, value)
-    if T.ndim != 2:
-        raise ValueError(f"{name}: got shape {T.shape}, want one (4, 4) transform")
-    return T
+    return transform(name, value)
 
 
 def same_number(arm_poses: int, seen: int) -> None:

@@ -20,25 +20,22 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from coursekit.arm import widowx
+from coursekit.arrays import ArrayLike, Floats, NDArray
 from coursekit.boards import Board, Detections, detect_all
-from coursekit.boards.detection import Skipped
-from coursekit.boards.folder import SESSION
+from coursekit.boards.board import Skipped
+from coursekit.boards.detector import SESSION
 from coursekit.geometry import Intrinsics, make_transform
-from coursekit.hand_eye.board_pose import BoardPose, board_poses
 from coursekit.hand_eye.closed_form import FEWEST
 from coursekit.hand_eye.poses import Mount, check_mount, check_poses
+from coursekit.hand_eye.refinement import BoardPose, board_poses
 from coursekit.hand_eye.result import HandEyeResult
-from coursekit.hand_eye.solve import solve
+from coursekit.hand_eye.solver import solve
 from coursekit.results import write_bytes
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    Floats = NDArray[np.float64]
 
 POSES = "poses.csv"
 PLACE = ("x", "y", "z")
@@ -348,8 +345,6 @@ def _read_row(
     if columns.issuperset((*PLACE, *TURN)):
         T = _pose(_numbers(cells, PLACE), _numbers(cells, TURN))
     else:
-        from coursekit.arm import widowx
-
         assert q is not None
         T = widowx().forward(q)
     return _Row(file, T, q, dq, time)

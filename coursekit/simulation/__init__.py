@@ -1,18 +1,27 @@
 """Scenes of boxes, their exact images, and the active-stereo rig that looks at them."""
 
-from coursekit.simulation.active_stereo import Rig, StereoFrame, View
-from coursekit.simulation.board_images import render_board
-from coursekit.simulation.hand_eye_sessions import (
+from __future__ import annotations
+
+from coursekit.simulation.arm_sessions import (
     HandEyeMistakes,
     default_setup,
     hand_eye_session,
+    shared_target,
+    touch_corners,
     truth_of,
 )
-from coursekit.simulation.matching import cost_curve, match
-from coursekit.simulation.physical_tests import shared_target, touch_corners
-from coursekit.simulation.render import RenderResult, render
-from coursekit.simulation.scenes import Box, Scene, artefact_scene, tabletop, wall_scene
-from coursekit.simulation.sessions import Effects, Truth, corner_session
+from coursekit.simulation.board_images import render_board
+from coursekit.simulation.corner_sessions import Effects, Truth, corner_session
+from coursekit.simulation.rig import Rig, StereoFrame, View, cost_curve, match
+from coursekit.simulation.scenes import (
+    Box,
+    RenderResult,
+    Scene,
+    artefact_scene,
+    render,
+    tabletop,
+    wall_scene,
+)
 
 __all__ = [
     "Box",

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from coursekit.intrinsics.diagnose import diagnose
-from coursekit.simulation.sessions import Effects, corner_session
+from coursekit.intrinsics.diagnosis import diagnose
+from coursekit.simulation.corner_sessions import Effects, corner_session
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -28,35 +28,32 @@ intrinsics and the depth unit come with the frames, a camera's frames can be giv
 A window is (left, top, width, height) in px. Intervals are 95 %.
 """
 
-from coursekit.stereo.bias import BiasFit, fit_bias
+from __future__ import annotations
+
 from coursekit.stereo.face import BlockFace, block_face
+from coursekit.stereo.fits import BiasFit, BiasPriors, NoiseFit, fit_bias, fit_noise
 from coursekit.stereo.law import (
     depth_from_disparity,
     depth_noise,
     depth_slope,
-    disparity_from_depth,
     robust_depth,
     rounded_variance,
     unrounded_std,
 )
-from coursekit.stereo.noise import NoiseFit, fit_noise
-from coursekit.stereo.quality import DepthQuality, depth_quality
 from coursekit.stereo.windows import AveragingCurve, WindowStats, averaging_curve, window_stats
 
 __all__ = [
     "AveragingCurve",
     "BiasFit",
+    "BiasPriors",
     "BlockFace",
-    "DepthQuality",
     "NoiseFit",
     "WindowStats",
     "averaging_curve",
     "block_face",
     "depth_from_disparity",
     "depth_noise",
-    "depth_quality",
     "depth_slope",
-    "disparity_from_depth",
     "fit_bias",
     "fit_noise",
     "robust_depth",

@@ -23,27 +23,19 @@ from coursekit.stereo.windows import effective_frames, series_std
 from coursekit.submission.format import Stack, Submission
 
 RULES = Path(__file__).with_name("rubric.toml")
-KEYS = {  # of each section of rubric.toml, and the largest value in it
-    "exercise": (2000, "distances_m slack_m frames window_px words tape_at_most_m"),
-    "points": (
-        1000,
-        "data bias bias_se std std_se invalid plot sigma_d sigma_d_interval exponent verdict "
-        "paragraph",
-    ),
-    "tolerance": (
-        1000,
-        "standard_errors error_of_an_error prediction prediction_factor near",
-    ),
-    "digits": (9, "bias bias_se std std_se invalid sigma_d sigma_d_interval exponent"),
-    "credit": (
-        1,
-        "close sign metres counts percent complement unrounded unpooled variance level zeros "
-        "of_the_mean standard_error spatial mixed not_divided independent one_pixel tape_only "
-        "no_tape ever millimetres not_squared no_interval one_sigma not_widened of_variance "
-        "proportional copied_prediction off_scale no_prediction other_dominates "
-        "not_measured_there incomplete short",
-    ),
-    "flags": (1e6, "least_sigma_d_px flat_exponent white pattern fastest_hz"),
+WORDS = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding="utf-8"))
+LABELS: dict[str, str] = WORDS["labels"]  # of what is asked for, by topic
+MISTAKES: dict[str, str] = WORDS["mistakes"]
+EXERCISE = ("distances_m", "slack_m", "frames", "window_px", "words", "tape_at_most_m")
+TOLERANCES = ("standard_errors", "error_of_an_error", "prediction", "prediction_factor", "near")
+FLAGS = ("least_sigma_d_px", "flat_exponent", "white", "pattern", "fastest_hz")
+KEYS: dict[str, tuple[float, Collection[str]]] = {  # of rubric.toml: the largest value, the keys
+    "exercise": (2000, EXERCISE),
+    "points": (1000, LABELS),
+    "tolerance": (1000, TOLERANCES),
+    "digits": (9, [*LABELS][1:6] + [*LABELS][7:10]),
+    "credit": (1, MISTAKES),
+    "flags": (1e6, FLAGS),
 }
 AT_LEAST_ONE = ("frames", "window_px", "prediction_factor", "near")
 WHOLE_NUMBERS = ("frames", "window_px", "words")
@@ -60,7 +52,7 @@ def grading_rules() -> dict[str, Any]:
         _check_keys("", found, KEYS)
         for section, (most, keys) in KEYS.items():
             want(isinstance(found[section], dict), section, found[section], "a section of keys")
-            _check_keys(f"{section}.", found[section], keys.split())
+            _check_keys(f"{section}.", found[section], keys)
             for key, value in found[section].items():
                 _check_rule(section, key, value, most)
     except ValueError as error:

@@ -28,8 +28,8 @@ from coursekit.arrays import Interval
 from coursekit.stereo import rounded_variance
 from coursekit.submission.flags import Copy, Fingerprint, Flag, copies, person, same_words
 from coursekit.submission.format import Plot, Refused, Submission, TableRow, read_bundle
-from coursekit.submission.recompute import Recomputed
-from coursekit.submission.rubric import LABELS, MISTAKES, Grade, Item, grade
+from coursekit.submission.recompute import LABELS, MISTAKES, Recomputed
+from coursekit.submission.rubric import Grade, Item, grade
 from coursekit.words import counted
 
 HEADER = (

@@ -18,7 +18,13 @@ from coursekit.arrays import Interval
 from coursekit.stereo import NoiseFit
 from coursekit.submission.flags import Fingerprint, Flag, data_flags, fingerprint
 from coursekit.submission.format import Plot, Submission, TableRow
-from coursekit.submission.recompute import Measured, Recomputed, grading_rules, recompute
+from coursekit.submission.recompute import (
+    LABELS,
+    Measured,
+    Recomputed,
+    grading_rules,
+    recompute,
+)
 from coursekit.words import counted
 
 Judgement = Literal["right", "partial", "wrong", "missing"]
@@ -26,58 +32,6 @@ Judgement = Literal["right", "partial", "wrong", "missing"]
 SAME_DISTANCE_M = 0.005  # a row or a point of the plot belongs to the stack this near
 EXPLAINED_WITHIN = 0.03  # a wrong number is explained by a mistake that gives it to this part
 
-# What a class page calls a mistake; rubric.toml says what each leaves of the points.
-MISTAKES = {
-    "close": "close, but outside the tolerance",
-    "sign": "sign of the bias turned",
-    "metres": "metres instead of millimetres",
-    "counts": "depth counts instead of millimetres",
-    "percent": "percent for a fraction or for millimetres",
-    "complement": "valid instead of invalid",
-    "unrounded": "corrected for rounding where the measured value is asked for",
-    "unpooled": "mean of the pixels' stds instead of their pooled std",
-    "variance": "variance instead of std",
-    "level": "the depth itself instead of its error",
-    "zeros": "invalid pixels (0) averaged in",
-    "of_the_mean": "std of the window's mean instead of a pixel's",
-    "standard_error": "standard error instead of std",
-    "spatial": "std over the pixels instead of over time",
-    "mixed": "std over pixels and time together",
-    "not_divided": "std instead of standard error",
-    "independent": "all samples taken as independent",
-    "one_pixel": "error of one pixel's std instead of the window's",
-    "tape_only": "the tape's error alone",
-    "no_tape": "no error of the tape",
-    "ever": "pixels that were ever invalid instead of samples",
-    "millimetres": "millimetres in a formula that wants metres",
-    "not_squared": "noise taken as proportional to Z",
-    "no_interval": "no interval",
-    "one_sigma": "one standard error instead of a 95 % interval",
-    "not_widened": "interval not widened for the scatter",
-    "of_variance": "exponent of the variance",
-    "proportional": "prediction not proportional to Z squared",
-    "copied_prediction": "prediction equal to the measurement",
-    "off_scale": "prediction far from the measurement",
-    "no_prediction": "prediction, or points of the plot, missing",
-    "other_dominates": "the other error dominates",
-    "not_measured_there": "conclusion far from where it was measured",
-    "incomplete": "something left out",
-    "short": "too short",
-}
-LABELS = {
-    "data": "raw depths",
-    "bias": "bias",
-    "bias_se": "standard error of the bias",
-    "std": "std of depth",
-    "std_se": "standard error of the std",
-    "invalid": "invalid part",
-    "plot": "plot",
-    "sigma_d": "sigma_d",
-    "sigma_d_interval": "95 % interval of sigma_d",
-    "exponent": "exponent",
-    "verdict": "bias or noise",
-    "paragraph": "paragraph",
-}
 UNITS = {"sigma_d": " px", "sigma_d_interval": " px", "exponent": "", "invalid": " %"}  # else mm
 
 

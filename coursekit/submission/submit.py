@@ -18,9 +18,8 @@ import numpy as np
 
 from coursekit import results
 from coursekit.cameras import Camera, Frames
-from coursekit.checks import shown, want
+from coursekit.checks import want
 from coursekit.lessons import progress
-from coursekit.lessons.verdict import Verdict
 from coursekit.stereo import NoiseFit
 from coursekit.submission.format import (
     CameraFacts,
@@ -101,7 +100,7 @@ class Handed:
 
     def _repr_html_(self) -> str:
         kind = "not attempted" if self.path is None else "wrong" if self.says else "right"
-        return Verdict("submit", kind, self.headline, self.says)._repr_html_()  # type: ignore[arg-type]
+        return progress.Verdict("submit", kind, self.headline, self.says)._repr_html_()  # type: ignore[arg-type]
 
 
 def stack(frames: Frames, window: tuple[int, int, int, int], distance_m: float) -> Stack:
@@ -279,36 +278,27 @@ def _row(distance_m: float, quantities: Mapping[str, results.Quantity]) -> Table
         quantity = quantities.get(full)
         if quantity is None:
             return None, None
-        if not isinstance(quantity, results.Quantity):
-            got, unit = type(quantity).__name__, next(iter(UNITS[name]))
-            raise ValueError(f"{full}: got a {got}, want Quantity(value, {unit!r}, standard error)")
-        factor = UNITS[name].get(quantity.unit)
-        if factor is None:
-            raise ValueError(f"{full}: got the unit {quantity.unit!r}, want {_or(UNITS[name])}")
+        units = UNITS[name]
+        wanted = f"Quantity(value, {next(iter(units))!r}, standard error)"
+        want(isinstance(quantity, results.Quantity), full, quantity, wanted)
+        unit = quantity.unit
+        want(unit in units, full, unit, f"the unit {' or '.join(map(repr, units))}")
+        factor = units[unit]
         sigma = None if quantity.sigma is None else factor * quantity.sigma
         return factor * quantity.value, sigma
 
     return TableRow(distance_m, *found("depth_bias"), *found("depth_std"), found("invalid")[0])
 
 
-def _or(words: Iterable[str]) -> str:
-    return " or ".join(repr(word) for word in words)
-
-
 def _with_own(rows: tuple[TableRow, ...], table: Table) -> tuple[TableRow, ...]:
     """The rows with the student's own numbers in them, wherever these are not None."""
-    if not isinstance(table, Mapping):
-        raise ValueError(f"table: got {shown(table)}, want {{0.30: (five numbers), ...}}")
+    want(isinstance(table, Mapping), "table", table, "{0.30: (five numbers), ...}")
     at = [row.distance_m for row in rows]
+    five = "five: bias, its standard error, std, its standard error (mm), invalid part"
     for z, numbers in table.items():
-        if z not in at:
-            measured_at = ", ".join(f"{distance:g}" for distance in at)
-            raise ValueError(f"table: got the distance {shown(z)}, want one of {measured_at}")
-        if not isinstance(numbers, (tuple, list, np.ndarray)) or len(numbers) != len(COLUMNS):
-            raise ValueError(
-                f"table at {z:g} m: got {shown(numbers)}, want five: bias, its standard error, "
-                "std, its standard error (mm), invalid part"
-            )
+        want(z in at, "table", z, f"one of the distances {', '.join(f'{d:g}' for d in at)}")
+        several = isinstance(numbers, (tuple, list, np.ndarray)) and len(numbers) == len(COLUMNS)
+        want(several, f"table at {z:g} m", numbers, five)
         own = {part: n for part, n in zip(COLUMNS, numbers, strict=True) if n is not None}
         i = at.index(z)
         rows = (*rows[:i], replace(rows[i], **own), *rows[i + 1 :])

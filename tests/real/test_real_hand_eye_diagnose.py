@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from coursekit.geometry import invert_transform
-from coursekit.hand_eye.diagnose import diagnose
+from coursekit.hand_eye.diagnosis import diagnose
 
 pytestmark = pytest.mark.real
 

@@ -1,0 +1,578 @@
+"""Where the gripper is for given joint angles, how it moves with them, and the way back.
+
+Everything takes angles (..., 6) in rad and returns arrays with the same leading shape. The chain is
+read from data/wxai.json, which says where it comes from.
+
+What makes forward kinematics wrong: encoder offsets, gear play, links unlike the drawing.
+
+The sizes in `ArmErrors` are **assumed, not measured**: nobody has published them for this arm. Each
+is plausible for an arm of this class, and together they put the flange 2.6 mm and the fingertip
+3.1 mm, on average over units and poses, from where forward kinematics says.
+
+- Encoder offset (0.14 degree): how well a joint's zero can be set with a jig.
+- Gear play (0.06 degree to either side): small planetary gears have 0.1 to 0.2 degree in all. The
+  encoder sits before the gears and does not see it. Gravity pushes a joint that carries weight on
+  to one flank; there the play acts like an offset for as long as the side stays the same. A joint
+  without load (a vertical axis, the roll of the wrist) trails behind its last move.
+- Links (0.5 mm and 0.06 degree a direction, at each of the six joint origins and at the
+  fingertip): machining, bearings and screwed joints.
+
+Bending under load, temperature and wear are left out.
+"""
+
+from __future__ import annotations
+
+import json
+import zlib
+from dataclasses import dataclass, fields, replace
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from coursekit.arrays import ArrayLike, Floats, Mask
+from coursekit.checks import transforms
+from coursekit.geometry import cross_matrix, invert_transform, make_transform
+from coursekit.specifications import DATA
+
+Tool = Literal["gripper", "flange"]
+
+LIMIT_SLACK_RAD = 1e-9  # rounding, and no more
+# Coarse bodies for `Arm.is_free`: the hand and the camera as points with this much around them.
+HAND_RADIUS_M = 0.04
+CAMERA_RADIUS_M = 0.02
+ARM_RADIUS_M = 0.05
+# Inverse kinematics: damped Gauss-Newton steps from several starts, joint_0 turned to the target.
+IK_STEPS, IK_DAMPING, IK_STEP_RAD, IK_TOLERANCE = 40, 1e-4, 0.4, 1e-9
+IK_STARTS = (
+    (0.0, 1.2, 1.0, 0.3, 0.0, 0.0),
+    (0.0, 1.6, 1.6, -0.9, 0.0, 0.0),
+    (0.0, 1.0, 1.3, 1.0, 0.0, 0.0),
+    (0.0, 2.0, 1.8, 0.5, 0.0, 0.0),
+    (0.0, 1.2, 1.0, 0.0, 0.7, 1.2),
+    (0.0, 1.2, 1.0, 0.0, -0.7, -1.2),
+    (0.5, 1.4, 1.4, -0.5, -0.5, 2.2),
+    (-0.5, 1.4, 1.4, -0.5, 0.5, -2.2),
+)
+IK_MORE_STARTS = 16  # all over the joints' ranges, always the same ones
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """A chain of six revolute joints with a gripper, and the camera that its maker mounts on it.
+
+    joints: their names. origins (6, 4, 4): each joint's frame in its parent's at angle zero, m.
+    axes (6, 3): unit vectors in the joint's own frame. limits (6, 2): lower and upper, rad.
+    velocity_rad_s (6,): the largest. T_flange_gripper, T_gripper_camera (4, 4): the gripper in
+    the flange (`link_6`), and the camera's colour optical frame in the gripper. The table is the
+    plane z = 0 of the base.
+    """
+
+    name: str
+    joints: tuple[str, ...]
+    origins: Floats
+    axes: Floats
+    limits: Floats
+    velocity_rad_s: Floats
+    T_flange_gripper: Floats
+    T_gripper_camera: Floats
+    source: str
+
+    def forward(self, q: ArrayLike, tool: Tool = "gripper") -> Floats:
+        """T_base_gripper (..., 4, 4), or T_base_flange, at joint angles q (..., 6), rad.
+
+        Limits are not checked here (`check` does that), so that a mistake can be computed too.
+        Raises ValueError for a wrong shape, NaN, or an unknown tool.
+        """
+        return self._tool(self.link_frames(q), tool)
+
+    def link_frames(self, q: ArrayLike) -> Floats:
+        """The frames of the base and of link_1 to link_6, in the base, (..., 7, 4, 4)."""
+        q = self._angles(q)
+        skew = cross_matrix(self.axes)
+        sin, versine = np.sin(q)[..., None, None], (1 - np.cos(q))[..., None, None]
+        turns = np.eye(3) + sin * skew + versine * (skew @ skew)  # Rodrigues
+        frames = np.empty((*q.shape[:-1], 7, 4, 4))
+        frames[...] = np.eye(4)
+        for j, origin in enumerate(self.origins):
+            parent, child = frames[..., j, :, :], frames[..., j + 1, :, :]
+            child[..., :3, :3] = parent[..., :3, :3] @ (origin[:3, :3] @ turns[..., j, :, :])
+            child[..., :3, 3] = parent[..., :3, :3] @ origin[:3, 3] + parent[..., :3, 3]
+        return frames
+
+    def jacobian(self, q: ArrayLike, tool: Tool = "gripper") -> Floats:
+        """How the tool moves with each joint, (..., 6, 6): rows omega and v, columns joints.
+
+        Both in the base's axes: omega is the tool's rotation (rad per rad), v the motion of the
+        **tool's origin** (m per rad), so a small step gives R <- exp(omega) R, t <- t + v.
+        """
+        frames = self.link_frames(q)
+        return self._jacobian(frames, self._tool(frames, tool))
+
+    def _jacobian(self, frames: Floats, T: Floats) -> Floats:
+        axes = (frames[..., 1:, :3, :3] @ self.axes[:, :, None])[..., 0]
+        arms = T[..., None, :3, 3] - frames[..., 1:, :3, 3]
+        return np.swapaxes(np.concatenate([axes, np.cross(axes, arms)], axis=-1), -1, -2)
+
+    def _tool(self, frames: Floats, tool: Tool) -> Floats:
+        if tool not in get_args(Tool):
+            raise ValueError(f"tool: got {tool!r}, want 'gripper' or 'flange'")
+        flange = frames[..., 6, :, :]
+        return flange @ self.T_flange_gripper if tool == "gripper" else flange
+
+    def check(self, q: ArrayLike) -> Floats:
+        """q (..., 6) as an array, or a ValueError that names the joint outside its limits."""
+        q = self._angles(q)
+        outside = np.argwhere(~self._inside(q))
+        if outside.size:
+            *index, j = outside[0].tolist()
+            where = f"q[{', '.join(map(str, index))}]" if index else "q"
+            degrees = np.abs(q).max() > 2 * np.pi
+            raise ValueError(
+                f"{where}: {self.joints[j]} is at {q[(*index, j)]:.4f} rad, want "
+                f"{self.limits[j, 0]:.4f} to {self.limits[j, 1]:.4f} rad"
+                + (" (are these degrees?)" if degrees else "")
+            )
+        return q
+
+    def within_limits(self, q: ArrayLike) -> Mask:
+        """(...): whether all joints at q (..., 6), rad, are inside their limits."""
+        return np.asarray(self._inside(self._angles(q)).all(axis=-1))
+
+    def _inside(self, q: Floats) -> Mask:
+        low, high = self.limits.T
+        return (q >= low - LIMIT_SLACK_RAD) & (q <= high + LIMIT_SLACK_RAD)
+
+    def is_free(self, q: ArrayLike, clearance_m: float = 0.02) -> Mask:
+        """(...): whether the arm at q (..., 6) is clear of the table and, coarsely, of itself.
+
+        Elbow, wrist, flange, fingertip and camera are at least clearance_m above the table, the
+        last two of them and the middle of the hand with their own thickness away from the base's
+        column and the upper arm. There are no exact bodies in the description that is used here.
+        """
+        frames = self.link_frames(q)
+        T = self._tool(frames, "gripper")
+        flange, tip = frames[..., 6, :3, 3], T[..., :3, 3]
+        camera = (T @ self.T_gripper_camera)[..., :3, 3]
+        lowest = np.concatenate(
+            [frames[..., 3:, 2, 3], tip[..., 2:], camera[..., 2:] - CAMERA_RADIUS_M], axis=-1
+        ).min(axis=-1)
+        hand = np.stack([tip, (flange + tip) / 2, camera], axis=-2)
+        column = np.broadcast_to([0.0, 0.0, 0.0], tip.shape), frames[..., 2, :3, 3]
+        upper = frames[..., 2, :3, 3], frames[..., 3, :3, 3]
+        gap = np.minimum(_distance(hand, *column), _distance(hand, *upper)).min(axis=-1)
+        return (lowest >= clearance_m) & (gap >= HAND_RADIUS_M + ARM_RADIUS_M)
+
+    def random(self, rng: np.random.Generator, n: int, clearance_m: float = 0.02) -> Floats:
+        """n joint configurations (n, 6), rad: uniform inside the limits, `is_free` of the rest."""
+        if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1:
+            raise ValueError(f"n: got {n!r}, want at least 1")
+        found = np.empty((0, 6))
+        for _ in range(100):
+            q = rng.uniform(self.limits[:, 0], self.limits[:, 1], (4 * int(n) + 16, 6))
+            found = np.concatenate([found, q[self.is_free(q, clearance_m)]])
+            if len(found) >= n:
+                return found[:n]
+        raise ValueError(f"clearance_m: got {clearance_m}, hardly any configuration has that")
+
+    def inverse(
+        self, T_base_gripper: ArrayLike, start: ArrayLike | None = None, elsewhere: bool = True
+    ) -> tuple[Floats, Mask]:
+        """Joint angles that bring the gripper to poses, and which of the poses were reached.
+
+        T_base_gripper (..., 4, 4), m. start (..., 6): where to begin, rad; without it, or where
+        it leads nowhere, a fixed set of starts (unless `elsewhere` is False). Returns q (..., 6)
+        inside the limits and a mask (...): True where the pose is met to 1e-9 m and rad. A pose
+        has several solutions and the first one found is returned; some close to a joint's limit
+        are missed (the mask says so).
+        """
+        targets = transforms("T_base_gripper", T_base_gripper)
+        shape = targets.shape[:-2]
+        targets = targets.reshape(-1, 4, 4)
+        q, reached = np.zeros((len(targets), 6)), np.zeros(len(targets), bool)
+        starts = [*np.array(IK_STARTS), *self._more_starts()] if elsewhere or start is None else []
+        if start is not None:
+            starts.insert(0, np.broadcast_to(self._angles(start), (*shape, 6)).reshape(-1, 6))
+        towards = np.arctan2(targets[:, 1, 3], targets[:, 0, 3])
+        for begin in starts:
+            open_ = np.flatnonzero(~reached)
+            if not open_.size:
+                break
+            q0 = np.broadcast_to(begin, q.shape)[open_].copy()
+            if begin.ndim == 1:
+                q0[:, 0] += towards[open_]
+            q[open_], reached[open_] = self._descend(targets[open_], q0)
+        return q.reshape(*shape, 6), reached.reshape(shape)
+
+    def _more_starts(self) -> Floats:
+        low, high = self.limits.T
+        starts = np.random.default_rng(0).uniform(low, high, (IK_MORE_STARTS, 6))
+        return starts * [0.5, 1.0, 1.0, 1.0, 1.0, 1.0]  # joint_0 roughly towards the target
+
+    def _descend(self, targets: Floats, q: Floats) -> tuple[Floats, Mask]:
+        q = self._into_limits(q)
+        reached, open_ = np.zeros(len(q), bool), np.arange(len(q))
+        for _ in range(IK_STEPS):
+            frames = self.link_frames(q[open_])
+            T = self._tool(frames, "gripper")
+            miss = pose_difference(T, targets[open_])
+            there = (np.abs(miss) < IK_TOLERANCE).all(axis=-1)
+            reached[open_[there]] = True
+            if there.all():
+                break
+            open_ = open_[~there]
+            step = _damped_step(self._jacobian(frames, T)[~there], miss[~there])
+            q[open_] = self._into_limits(q[open_] + step)
+        return q, reached
+
+    def _into_limits(self, q: Floats) -> Floats:
+        low, high = self.limits.T
+        wrapped = low + (q - low) % (2 * np.pi)  # a joint that can turn all the way goes round
+        return np.clip(np.where(high - low > 2 * np.pi - 1e-9, wrapped, q), low, high)
+
+    def _angles(self, q: ArrayLike) -> Floats:
+        try:
+            angles = np.asarray(q, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise ValueError("q: want an array of joint angles in rad") from None
+        if angles.ndim == 0 or angles.shape[-1] != 6:
+            raise ValueError(f"q: got shape {angles.shape}, want (..., 6) angles in rad")
+        if not np.isfinite(angles).all():
+            index = np.argwhere(~np.isfinite(angles))[0].tolist()
+            raise ValueError(f"q: the angle at index {index} is not finite")
+        return angles
+
+
+def pose_difference(T: ArrayLike, to: ArrayLike) -> Floats:
+    """What brings T to another pose, (..., 6): (omega, v) as in `Arm.jacobian`.
+
+    T, to (..., 4, 4): R_to = exp(omega) R and t_to = t + v; rad and m, in the parent's axes.
+    """
+    from scipy.spatial.transform import Rotation
+
+    T, to = np.asarray(T, dtype=np.float64), np.asarray(to, dtype=np.float64)
+    turn = to[..., :3, :3] @ np.swapaxes(T[..., :3, :3], -1, -2)
+    omega = Rotation.from_matrix(turn.reshape(-1, 3, 3)).as_rotvec().reshape(*turn.shape[:-2], 3)
+    return np.concatenate([omega, to[..., :3, 3] - T[..., :3, 3]], axis=-1)
+
+
+def _damped_step(J: Floats, miss: Floats) -> Floats:
+    """Gauss-Newton steps (n, 6), rad, damped by the square of what is missing and cut in length."""
+    JT = np.swapaxes(J, -1, -2)
+    damping = IK_DAMPING * np.minimum(1.0, (miss**2).sum(axis=-1)) + 1e-14
+    normal = JT @ J + damping[:, None, None] * np.eye(6)
+    step = np.linalg.solve(normal, JT @ miss[..., None])[..., 0]
+    size = np.abs(step).max(axis=-1, keepdims=True)
+    return np.asarray(step * np.minimum(1.0, IK_STEP_RAD / np.maximum(size, 1e-300)))
+
+
+@cache
+def widowx() -> Arm:
+    """The WidowX AI follower arm with its wrist camera, from data/wxai.json; arrays read-only."""
+    return _load(DATA / "wxai.json")
+
+
+def _load(path: Path) -> Arm:
+    try:
+        table = json.loads(path.read_text("utf-8"))
+        joints = table["joints"]
+        T_flange_gripper = _chain(table["gripper"])
+        arm = Arm(
+            table["name"],
+            tuple(joint["name"] for joint in joints),
+            np.stack([_origin(joint) for joint in joints]),
+            np.array([joint["axis"] for joint in joints], dtype=np.float64),
+            np.array([joint["limit_rad"] for joint in joints], dtype=np.float64),
+            np.array([joint["velocity_rad_s"] for joint in joints], dtype=np.float64),
+            T_flange_gripper,
+            invert_transform(T_flange_gripper) @ _chain(table["camera"]),
+            table["source"],
+        )
+    except FileNotFoundError:
+        raise ValueError(
+            f"{path} is missing: coursekit reads it from the course's folder, "
+            "so install the course with `python3 course.py lab`"
+        ) from None
+    except KeyError as error:
+        raise ValueError(f"{path}: {error} is missing") from error
+    for value in vars(arm).values():
+        if isinstance(value, np.ndarray):
+            value.flags.writeable = False
+    return arm
+
+
+def _chain(joints: list[dict[str, Any]]) -> Floats:
+    T = np.eye(4)
+    for joint in joints:
+        T = T @ _origin(joint)
+    return T
+
+
+def _origin(joint: dict[str, Any]) -> Floats:
+    """A joint's origin, as URDF writes it: turned about fixed axes x, y, z in that order."""
+    from scipy.spatial.transform import Rotation
+
+    return make_transform(Rotation.from_euler("xyz", joint["rpy_rad"]), joint["xyz_m"])
+
+
+def _distance(points: Floats, a: Floats, b: Floats) -> Floats:
+    """Distances (..., k) of points (..., k, 3) from the segment from a to b, (..., 3) each."""
+    along, from_a = (b - a)[..., None, :], points - a[..., None, :]
+    length2 = (along**2).sum(axis=-1)
+    share = np.clip((from_a * along).sum(axis=-1) / np.maximum(length2, 1e-12), 0.0, 1.0)
+    return np.asarray(np.linalg.norm(from_a - share[..., None] * along, axis=-1))
+
+
+STOP_RAD = 5e-4  # std by which the controller misses the commanded angle; the encoder sees it
+STILL_RAD = 1e-6  # a joint that is sent no farther stays where it is
+LOAD_ARM_M = 0.03  # gravity decides on which flank a joint rests from this lever arm on
+HOME = (0.0, 1.2, 1.0, 0.2, 0.0, 0.0)  # rad; where the simulated arm starts
+
+
+@dataclass(frozen=True)
+class ArmErrors:
+    """Sizes of an arm's hidden errors, one standard deviation each; assumed, not measured.
+
+    offset_rad: of a joint's zero. play_rad: of half a joint's gear play. link_m, link_rad: of the
+    place and the direction of each joint's origin, and of the fingertip, along or about one axis.
+    """
+
+    offset_rad: float = 2.5e-3
+    play_rad: float = 1e-3
+    link_m: float = 5e-4
+    link_rad: float = 1e-3
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not (np.isfinite(value) and value >= 0):
+                raise ValueError(f"{field.name}: got {value!r}, want a finite number, 0 or more")
+
+
+@dataclass(frozen=True, eq=False)
+class ArmTruth:
+    """What a simulated arm really is, and does not report.
+
+    offset_rad (6,): true minus read angle of each joint, without play. play_rad (6,): half of each
+    joint's play, not negative. link (7, 6): of the six joint origins and the fingertip, rotation
+    (rad) and displacement (m) in the parent's axes. arm: the chain with those links.
+    """
+
+    offset_rad: Floats
+    play_rad: Floats
+    link: Floats
+    arm: Arm
+
+    def __repr__(self) -> str:
+        def listed(values: Floats, digits: int) -> str:
+            return ", ".join(f"{value:+.{digits}f}" for value in values)
+
+        length = 1e3 * np.linalg.norm(self.link[:, 3:], axis=1)
+        angle = np.degrees(np.linalg.norm(self.link[:, :3], axis=1))
+        return "\n".join(
+            [
+                f"joint offsets    {listed(np.degrees(self.offset_rad), 3)} deg",
+                f"half gear play   {', '.join(f'{p:.3f}' for p in np.degrees(self.play_rad))} deg",
+                f"link errors      {', '.join(f'{d:.2f}' for d in length)} mm",
+                f"and              {', '.join(f'{a:.2f}' for a in angle)} deg",
+            ]
+        )
+
+
+class SimulatedArm:
+    """An arm that is not quite what its drawing says: `move`, then ask where the gripper really is.
+
+    seed names the unit: its offsets, play and links, which stay, and the scatter of its moves.
+    nominal: the arm as drawn, whose `forward` at the reported angles is all that a user has.
+    """
+
+    def __init__(
+        self, seed: int, errors: ArmErrors | None = None, nominal: Arm | None = None
+    ) -> None:
+        self.nominal = nominal or widowx()
+        self.errors = errors or ArmErrors()
+        self._truth = _hidden(seed, self.errors, self.nominal)
+        self._rng = np.random.default_rng([seed, zlib.crc32(b"moves")])
+        self._at = np.array(HOME)
+        self._last = self._rng.choice([-1.0, 1.0], 6)  # direction of each joint's last move
+        self._joints = self._true_joints(self._at[None], self._last[None])[0]
+
+    def move(self, q: ArrayLike) -> Floats:
+        """Go to joint angles (6,), or through (n, 6) in turn; what the encoders then read, rad.
+
+        Raises ValueError for angles outside the limits.
+        """
+        commanded = self.nominal.check(q)
+        if commanded.ndim > 2:
+            raise ValueError(f"q: got shape {commanded.shape}, want (6,) or (n, 6)")
+        path = commanded.reshape(-1, 6)
+        directions = _directions(np.concatenate([self._at[None], path]), self._last)
+        missed = STOP_RAD * self._rng.standard_normal(path.shape)
+        read = np.clip(path + missed, self.nominal.limits[:, 0], self.nominal.limits[:, 1])
+        self._joints = self._true_joints(read, directions).reshape(commanded.shape)
+        if len(path):
+            self._at, self._last = path[-1], directions[-1]
+        return read.reshape(commanded.shape)
+
+    def true_pose(self, tool: Tool = "gripper") -> Floats:
+        """The tool's true pose in the base after the last `move`, (4, 4), or (n, 4, 4) after n."""
+        return self._truth.arm.forward(self._joints, tool)
+
+    def reveal(self) -> ArmTruth:
+        """The unit's hidden errors."""
+        return self._truth
+
+    def _true_joints(self, read: Floats, directions: Floats) -> Floats:
+        loaded = load_side(self.nominal, read)
+        side = np.where(loaded != 0, loaded, -directions)
+        return read + self._truth.offset_rad + side * self._truth.play_rad
+
+
+def load_side(arm: Arm, q: ArrayLike) -> Floats:
+    """Which way gravity turns each joint at q (..., 6): -1 or 1, and 0 where it hardly does.
+
+    Everything that hangs on a joint is taken as one weight half way between flange and fingertip;
+    0 where its lever arm about the joint's axis is under LOAD_ARM_M.
+    """
+    frames = arm.link_frames(q)
+    weight = frames[..., 6, :3, 3] + frames[..., 6, :3, :3] @ arm.T_flange_gripper[:3, 3] / 2
+    axes = (frames[..., 1:, :3, :3] @ arm.axes[:, :, None])[..., 0]
+    levers = weight[..., None, :] - frames[..., 1:, :3, 3]
+    arms = -np.cross(axes, levers)[..., 2]  # axis . (lever x down), positive where it turns along
+    return np.where(np.abs(arms) > LOAD_ARM_M, np.sign(arms), 0.0)
+
+
+# --- what a fit may know about these errors ---
+
+
+@dataclass(frozen=True, eq=False)
+class FkErrors:
+    """First-order error of forward kinematics at n poses: a part they share, and a part of each.
+
+    A pose's error is the twist (omega, v) of `Arm.jacobian`: R_true = exp(omega) R, t_true = t + v,
+    rad and m in the base's axes, v at the tool's origin. It is `shared[i] @ x` + e_i, where x has
+    independent normal entries with standard deviations `sigma` and the same value in every pose,
+    and e_i is independent from pose to pose with covariance `each[i]`.
+
+    shared (..., 6, 55); sigma (55,); names (55,): six offsets, six plays and what the plays have in
+    common, and three rotations and three displacements at each of seven origins. each (..., 6, 6).
+    """
+
+    shared: Floats
+    sigma: Floats
+    names: tuple[str, ...]
+    each: Floats
+
+    @property
+    def covariance(self) -> Floats:
+        """Of each pose's error by itself, (..., 6, 6)."""
+        scaled = self.shared * self.sigma
+        return scaled @ np.swapaxes(scaled, -1, -2) + self.each
+
+    @property
+    def joint_covariance(self) -> Floats:
+        """Of the errors of all n poses together, (6 n, 6 n): the shared part does not average."""
+        scaled = (self.shared * self.sigma).reshape(-1, len(self.sigma))
+        joint = scaled @ scaled.T
+        for i, block in enumerate(self.each.reshape(-1, 6, 6)):
+            joint[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += block
+        return joint
+
+
+def fk_covariance(
+    q: ArrayLike, errors: ArmErrors | None = None, arm: Arm | None = None, tool: Tool = "gripper"
+) -> FkErrors:
+    """What forward kinematics at q (..., 6), rad, may be wrong by if the arm's errors have a size.
+
+    Play under load is shared, with the side that gravity gives at each pose; play without load
+    belongs to each pose, because its side depends on the moves. No play is negative, so all of
+    them together make the arm sag: that is the common play. Second moments are those of half
+    normal variables; that their mean is not zero is left to a spread of the same size.
+    """
+    arm, errors = arm or widowx(), errors or ArmErrors()
+    frames = arm.link_frames(q)
+    T = arm.forward(q, tool)
+    by_joint = arm.jacobian(q, tool)
+    side = load_side(arm, q)
+    loose = by_joint * (errors.play_rad * (side == 0))[..., None, :]
+    by_play, by_link = by_joint * side[..., None, :], _by_link(frames, T)
+    if tool == "flange":
+        by_link[..., -6:] = 0.0  # the fingertip lies behind it
+    shared = np.concatenate(
+        [by_joint, by_play, by_play.sum(axis=-1, keepdims=True), by_link], axis=-1
+    )
+    common = np.sqrt(2 / np.pi)  # the mean of a half normal variable, over its root mean square
+    sigma = np.concatenate(
+        [
+            np.full(6, errors.offset_rad),
+            np.full(6, errors.play_rad * np.sqrt(1 - common**2)),
+            [errors.play_rad * common],
+            np.tile(np.repeat([errors.link_rad, errors.link_m], 3), 7),
+        ]
+    )
+    return FkErrors(shared, sigma, _names(arm), loose @ np.swapaxes(loose, -1, -2))
+
+
+def _by_link(frames: Floats, T: Floats) -> Floats:
+    """(..., 6, 42): the tool's twist by (rotation, displacement) of the seven origins."""
+    turns = frames[..., :3, :3]  # an origin's error is in the axes of the link it sits on
+    pivots = np.concatenate([frames[..., 1:, :3, 3], T[..., None, :3, 3]], axis=-2)
+    levers = T[..., None, :3, 3] - pivots
+    columns = np.zeros((*frames.shape[:-2], 6, 6))
+    columns[..., :3, :3] = columns[..., 3:, 3:] = turns
+    columns[..., 3:, :3] = np.cross(turns, levers[..., :, None], axisa=-2, axisb=-2, axisc=-2)
+    columns = np.moveaxis(columns, -3, -2)  # (..., 6 rows, 7 origins, 6 columns)
+    return columns.reshape(*columns.shape[:-2], 42)
+
+
+def _names(arm: Arm) -> tuple[str, ...]:
+    axes = ("rx", "ry", "rz", "x", "y", "z")
+    origins = (*arm.joints, "fingertip")
+    return (
+        *(f"offset of {joint}" for joint in arm.joints),
+        *(f"play of {joint}" for joint in arm.joints),
+        "play of all joints",
+        *(f"{axis} of {origin}" for origin in origins for axis in axes),
+    )
+
+
+def fk_error(true: ArrayLike, computed: ArrayLike) -> tuple[Floats, Floats]:
+    """How far true poses (..., 4, 4) are from the computed ones: (...) m and (...) rad."""
+    miss = pose_difference(computed, true)
+    return np.linalg.norm(miss[..., 3:], axis=-1), np.linalg.norm(miss[..., :3], axis=-1)
+
+
+# --- the unit that a seed names ---
+
+
+def _hidden(seed: int, errors: ArmErrors, nominal: Arm) -> ArmTruth:
+    rng = np.random.default_rng([seed, zlib.crc32(b"arm")])
+    offset = errors.offset_rad * rng.standard_normal(6)
+    play = errors.play_rad * np.abs(rng.standard_normal(6))
+    sizes = np.repeat([errors.link_rad, errors.link_m], 3)
+    link = sizes * rng.standard_normal((7, 6))
+    return ArmTruth(offset, play, link, with_link_errors(nominal, link))
+
+
+def with_link_errors(arm: Arm, link: ArrayLike) -> Arm:
+    """The arm with its six joint origins and fingertip displaced by link (7, 6): rad, then m."""
+    from scipy.spatial.transform import Rotation
+
+    link = np.asarray(link, dtype=np.float64)
+    if link.shape != (7, 6) or not np.isfinite(link).all():
+        raise ValueError(f"link: got shape {link.shape}, want (7, 6) finite numbers")
+    origins = np.concatenate([arm.origins, arm.T_flange_gripper[None]])
+    turned = Rotation.from_rotvec(link[:, :3]).as_matrix()
+    origins[:, :3, :3] = turned @ origins[:, :3, :3]
+    origins[:, :3, 3] += link[:, 3:]
+    return replace(arm, origins=origins[:6], T_flange_gripper=origins[6])
+
+
+def _directions(path: Floats, before: Floats) -> Floats:
+    """(n, 6): -1 or 1, the way each joint last moved at each of path (n + 1, 6) but the first."""
+    change = np.diff(path, axis=0)
+    change[np.abs(change) < STILL_RAD] = 0.0  # rounding is no move, and differs between machines
+    moved = np.concatenate([before[None], np.sign(change)])
+    last = np.maximum.accumulate(np.where(moved != 0, np.arange(len(moved))[:, None], 0), axis=0)
+    return np.take_along_axis(moved, last, axis=0)[1:]

@@ -1,0 +1,479 @@
+"""Corners to a fraction of a pixel, and how far the image's noise moves them.
+
+A corner q is where all edges around it point to: at a pixel p with the brightness gradient g, g is
+at right angles to the edge, so g . (p - q) = 0. The weighted least-squares answer is
+
+    q = A^-1 sum(w g g' p),    A = sum(w g g'),
+
+found by repeating it with the window moved to q (Foerstner and Guelch 1987; OpenCV's cornerSubPix).
+What is done differently here: the window is not a number of pixels but 0.4 of a square, in the
+board's own directions, so that it holds as much of the four edges as there is and never reaches
+the next corner; where a ChArUco board has a marker in the window, its pixels get no weight; and the
+image is smoothed by a pixel first, which halves the error of gradients taken from a sharp image's
+samples (0.03 px without) and costs no noise, since the differences smooth anyway.
+
+How blurred an image is, and in which direction, from the edges between a board's corners.
+
+Let C be the blur's covariance, px^2. An edge with the unit normal n turns into a step of standard
+deviation w with w^2 = n' C n: a board's two directions of edges give two of C's three numbers. The
+third is in the corners. There two edges cross, and the grey at the crossing would be half-way if
+the blur were round; a blur along a diagonal mixes in more of the squares on that diagonal. For a
+Gaussian blur it is off by a share (2 / pi) arcsin(rho) of half the contrast (Sheppard 1899), rho
+being the correlation of the blur across the two edges: n1' C n2 = rho w1 w2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.special import ndtr
+
+from coursekit.arrays import Floats, Grey, NDArray
+from coursekit.boards.board import Board
+
+Patch = NDArray[np.float32]
+
+REACH = 0.4  # half the window's side, in squares
+LEAST_PX = 2.0  # ... and at least this
+SMOOTH_PX = 1.0  # standard deviation of the smoothing
+KERNEL = (7, 7)
+RIM_PX = 4  # beside the image's rim, what smoothing and differences made up from outside
+MARKER_MARGIN_PX = 2.5  # the blur of a marker's edge stays out of the window
+MAX_STEPS = 10
+NEAR_PX = 0.02  # a step this short is near enough for Newton's method
+NEWTON_STEPS = 2
+PROBE_PX = 0.25  # to measure how the window pulls back
+LEAST_PULL = 0.3  # per px; less than this and something else than one corner is in the window
+FARTHEST = 0.3  # squares from where the search began: what moves farther found something else
+BLOCK = 4  # px; noise is measured in blocks,
+BLOCKS = 30_000  # at most so many
+FLAT = 0.04  # of the image's contrast: a block as bright as its neighbours within this has no edge
+CLIPPED = (3.0, 252.0)  # grey levels at which noise may be cut off
+BINS = 12  # of brightness
+LEAST_BLOCKS = 30  # in a bin
+# About its plane, a block of pure noise has the noise's variance times chi2(13) / 13:
+QUANTILE, QUANTILE_AT = 0.25, 0.715  # this share of blocks lies below that,
+HIGHEST = 2.5  # and next to none above this
+
+
+@dataclass(frozen=True)
+class Window:
+    """A corner's window at its whole-pixel size: weights and offsets from the centre.
+
+    weight (h, w); dx (w,), dy (h,): px.
+    """
+
+    weight: Patch
+    dx: Patch
+    dy: Patch
+
+
+def refine(
+    grey: NDArray[np.uint8], start: Floats, steps: Floats, ids: NDArray[np.intp], board: Board
+) -> tuple[Floats, Floats]:
+    """Corners near `start` and the covariance of each.
+
+    grey (H, W). start (N, 2): px. steps (N, 2, 2): px per square, columns along the board's x and
+    y. Returns (N, 2) px, NaN where no corner is, and (N, 2, 2) px^2, NaN likewise.
+    """
+    image = np.asarray(cv2.GaussianBlur(grey.astype(np.float32), KERNEL, SMOOTH_PX), np.float32)
+    levels, variances = noise_levels(grey)
+    pixels = np.full((len(start), 2), np.nan)
+    covariances = np.full((len(start), 2, 2), np.nan)
+    for k, (centre, step) in enumerate(zip(start, steps, strict=True)):
+        window = _window(step, bool(board.falling[ids[k]]), board)
+        found = _corner(image, centre, window, FARTHEST * np.linalg.norm(step, axis=0).min())
+        if found is None:
+            continue
+        pixels[k], pull = found
+        covariances[k] = _covariance(image, pixels[k], pull, window, levels, variances)
+    return pixels, covariances
+
+
+def noise_levels(grey: NDArray[np.uint8]) -> tuple[Floats, Floats]:
+    """The variance of an image's noise at several grey levels, (M,) each, for `np.interp`.
+
+    Measured in blocks of 4x4 px without an edge, about the plane through each. Noise counts as
+    independent from pixel to pixel: what compression or demosaicing has smoothed away is not seen.
+    """
+    rows, columns = (size // BLOCK for size in grey.shape)
+    blocks = grey[: rows * BLOCK, : columns * BLOCK].reshape(rows, BLOCK, columns, BLOCK)
+    level = blocks.mean(axis=(1, 3), dtype=np.float32)
+    contrast = np.subtract(*np.quantile(level, [0.99, 0.01]))
+    flat = _is_flat(level, FLAT * contrast) & (level > CLIPPED[0]) & (level < CLIPPED[1])
+    if flat.sum() < LEAST_BLOCKS:  # nothing but edges: all blocks, whose lowest are still noise
+        flat = np.ones_like(flat)
+    row, column = np.nonzero(flat)
+    some = slice(None, None, -(-len(row) // BLOCKS))
+    row, column = row[some], column[some]
+    level, variance = level[row, column], _plane_residual(blocks[row, :, column])
+    edges = np.linspace(level.min(), level.max() + 1e-3, BINS + 1)
+    bins = np.digitize(level, edges)
+    groups = [bins == k for k in range(1, BINS + 1) if (bins == k).sum() >= LEAST_BLOCKS]
+    groups = groups or [np.ones(len(level), bool)]
+    return (
+        np.array([level[group].mean() for group in groups], np.float64),
+        np.array([_noise_variance(variance[group]) for group in groups]),
+    )
+
+
+def _is_flat(level: Patch, most: float) -> NDArray[np.bool_]:
+    """(rows, columns): blocks whose four neighbours are as bright within `most` grey levels."""
+    down = np.abs(np.diff(level, axis=0)) <= most
+    right = np.abs(np.diff(level, axis=1)) <= most
+    flat = np.zeros(level.shape, bool)
+    flat[1:-1, 1:-1] = down[1:, 1:-1] & down[:-1, 1:-1] & right[1:-1, 1:] & right[1:-1, :-1]
+    return flat
+
+
+def _plane_residual(blocks: NDArray[np.uint8]) -> Patch:
+    """Variance (M,) of blocks (M, 4, 4) about their planes."""
+    v, u = np.mgrid[:BLOCK, :BLOCK]
+    planes, _ = np.linalg.qr(np.stack([np.ones(BLOCK**2), u.ravel(), v.ravel()], axis=1))
+    flat = blocks.reshape(-1, BLOCK**2).astype(np.float32)
+    flat = flat - flat.mean(axis=1, keepdims=True)
+    squares = (flat**2).sum(axis=1) - ((flat @ planes.astype(np.float32)) ** 2).sum(axis=1)
+    return np.maximum(squares, 0.0) / (BLOCK**2 - 3)
+
+
+def _noise_variance(variance: Patch) -> float:
+    """The noise's variance from blocks, some of which may have texture."""
+    noise = float(np.quantile(variance, QUANTILE)) / QUANTILE_AT
+    return float(variance[variance <= HIGHEST * noise].mean())
+
+
+def _window(step: Floats, falling: bool, board: Board) -> Window:
+    """Weights exp(-(x^2 + y^2) / reach^2) in the board's directions, none on a marker."""
+    reach = np.maximum(REACH, LEAST_PX / np.linalg.norm(step, axis=0))  # squares along x and y
+    half = np.ceil(np.abs(step) @ reach).astype(int)
+    dx = np.arange(-half[0], half[0] + 1, dtype=np.float32)
+    dy = np.arange(-half[1], half[1] + 1, dtype=np.float32)
+    back = np.linalg.inv(step)
+    x = back[0, 0] * dx + back[0, 1] * dy[:, None]
+    y = back[1, 0] * dx + back[1, 1] * dy[:, None]
+    weight = np.exp(-((x / reach[0]) ** 2) - (y / reach[1]) ** 2)
+    weight[(np.abs(x) > reach[0]) | (np.abs(y) > reach[1])] = 0.0
+    if board.marker_m is not None:
+        weight[_marker(x, y, step, falling, board.marker_m / board.square_m)] = 0.0
+    return Window(weight.astype(np.float32), dx, dy)
+
+
+def _marker(x: Floats, y: Floats, step: Floats, falling: bool, share: float) -> NDArray[np.bool_]:
+    """Which pixels at (x, y) squares from a corner lie on a marker or in the blur of its edge."""
+    px = np.linalg.norm(step, axis=0)
+    gap = 0.5 * (1.0 - share)
+    free = np.maximum(np.minimum(gap - MARKER_MARGIN_PX / px, 0.5 * gap), 1.0 / px)
+    white = (x * y > 0) == falling
+    return white & (np.abs(x) > free[0]) & (np.abs(y) > free[1])
+
+
+def _corner(
+    image: Patch, start: Floats, window: Window, farthest: float
+) -> tuple[Floats, Floats] | None:
+    """The corner (2,) in the window that begins at `start`, and how the window pulls towards it.
+
+    The pull (2, 2) is the derivative of `_step` by its q: minus one where the window holds the
+    four edges alone. None where no corner is.
+    """
+    q = start
+    for _ in range(MAX_STEPS):
+        step = _step(image, q, window)
+        q = q + step
+        if not np.hypot(*(q - start)) <= farthest:  # also NaN
+            return None
+        if np.hypot(*step) < NEAR_PX:
+            break
+    else:
+        return None
+    probes = PROBE_PX * np.eye(2)
+    change = [_step(image, q + d, window) - _step(image, q - d, window) for d in probes]
+    pull = np.stack(change, axis=1) / (2 * PROBE_PX)
+    if not np.isfinite(pull).all() or np.linalg.svd(pull)[1][-1] < LEAST_PULL:
+        return None
+    for _ in range(NEWTON_STEPS):
+        q = q - np.linalg.solve(pull, _step(image, q, window))
+    return (q, pull) if np.hypot(*(q - start)) <= farthest else None
+
+
+def _step(image: Patch, q: Floats, window: Window) -> Floats:
+    """From q to where the edges in the window around it point; NaN when they are all parallel."""
+    gx, gy, weight = _gradients(image, q, window)
+    A = _structure(gx, gy, weight)
+    if not np.linalg.det(A) > 1e-6 * np.trace(A) ** 2:
+        return np.full(2, np.nan)
+    along = gx * window.dx + gy * window.dy[:, None]
+    return np.linalg.solve(A, [np.vdot(weight * gx, along), np.vdot(weight * gy, along)])
+
+
+def _gradients(image: Patch, q: Floats, window: Window) -> tuple[Patch, Patch, Patch]:
+    """Twice the gradient (h, w) around q, and the weights: 0 at the image's rim and outside."""
+    patch = _patch(image, q, window)
+    gx = patch[1:-1, 2:] - patch[1:-1, :-2]
+    gy = patch[2:, 1:-1] - patch[:-2, 1:-1]
+    height, width = image.shape
+    x, y = q[0] + window.dx, q[1] + window.dy
+    right, below = width - 1 - RIM_PX, height - 1 - RIM_PX
+    if x[0] >= RIM_PX and y[0] >= RIM_PX and x[-1] <= right and y[-1] <= below:
+        return gx, gy, window.weight
+    inside = ((y >= RIM_PX) & (y <= below))[:, None] & ((x >= RIM_PX) & (x <= right))
+    inside &= inside[::-1, ::-1]  # half a blurred corner would pull to its side
+    return gx, gy, window.weight * inside
+
+
+def _patch(image: Patch, q: Floats, window: Window) -> Patch:
+    """The image around q, a pixel wider than the window on each side, bilinear."""
+    size = (len(window.dx) + 2, len(window.dy) + 2)
+    return np.asarray(cv2.getRectSubPix(image, size, (float(q[0]), float(q[1]))), np.float32)
+
+
+def _structure(gx: Patch, gy: Patch, weight: Patch) -> Floats:
+    wx, wy = weight * gx, weight * gy
+    mixed = np.vdot(wx, gy)
+    return np.array([[np.vdot(wx, gx), mixed], [mixed, np.vdot(wy, gy)]], np.float64)
+
+
+def _covariance(
+    image: Patch, q: Floats, pull: Floats, window: Window, levels: Floats, variances: Floats
+) -> Floats:
+    """Covariance (2, 2) of a corner from the noise of the pixels, px^2.
+
+    At the corner s = sum(w g r) = 0 with r = g . (p - q). A change n of the image changes g, and
+    with it s by sum(w (dg r + g (dg . (p - q)))): linear in n, so s = C n with C from differences,
+    interpolation and smoothing, each transposed. The corner moves by G s with G = -(A pull)^-1, so
+    cov(q) = G C cov(n) C' G'.
+    """
+    gx, gy, weight = _gradients(image, q, window)
+    dx, dy = window.dx, window.dy[:, None]
+    r = gx * dx + gy * dy
+    C = np.stack(
+        [
+            _transposed(weight * (r + gx * dx), weight * gx * dy, q),
+            _transposed(weight * gy * dx, weight * (r + gy * dy), q),
+        ]
+    )
+    sigma2 = np.interp(_patch(image, q, window), levels, variances)
+    margin = KERNEL[0] // 2
+    sigma2 = np.pad(sigma2, (margin, margin + 1), mode="edge")
+    gain = -np.linalg.inv(_structure(gx, gy, weight) @ pull)
+    return gain @ np.einsum("aij,bij,ij->ab", C, C, sigma2, optimize=True) @ gain.T
+
+
+def _transposed(on_gx: Patch, on_gy: Patch, q: Floats) -> Floats:
+    """What multiplies each image pixel, given what multiplies the two differences.
+
+    (h, w) become (h + 9, w + 9): a pixel more on each side for the differences, one below and
+    right for the interpolation, three on each side for the smoothing.
+    """
+    rows, columns = on_gx.shape
+    on_patch = np.zeros((rows + 2, columns + 2))
+    on_patch[1:-1, 2:] += on_gx
+    on_patch[1:-1, :-2] -= on_gx
+    on_patch[2:, 1:-1] += on_gy
+    on_patch[:-2, 1:-1] -= on_gy
+    fx, fy = np.mod(q, 1.0)
+    m = KERNEL[0] // 2
+    image = np.zeros((rows + 3 + 2 * m, columns + 3 + 2 * m))
+    below, right = slice(m + 1, rows + 3 + m), slice(m + 1, columns + 3 + m)
+    above, left = slice(m, rows + 2 + m), slice(m, columns + 2 + m)
+    image[above, left] = (1 - fx) * (1 - fy) * on_patch
+    image[above, right] += fx * (1 - fy) * on_patch
+    image[below, left] += (1 - fx) * fy * on_patch
+    image[below, right] += fx * fy * on_patch
+    smoothed = cv2.GaussianBlur(image, KERNEL, SMOOTH_PX, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(smoothed, np.float64)
+
+
+ALONG = np.linspace(0.3, 0.7, 9)  # where an edge is sampled, as shares of its length
+ACROSS = np.linspace(-1.0, 1.0, 27)  # ... and in units of the reach
+BLUR_REACH = 0.35  # squares from the edge,
+REACH_PX = 13.0  # no more than this,
+REACH_CELLS = 0.5  # and so far into a marker's black frame
+FIRST_PX = 1.0  # where the fit of a width begins
+FIT_STEPS = 12
+DAMPING = 1e-3
+LONGEST_STEP = 0.5  # px, or in the logarithm of the width
+WIDTHS_PX = (0.1, 10.0)  # what a fit may find
+LEAST_CONTRAST = 10.0  # grey levels
+FEWEST = 4  # edges in each direction
+BILINEAR = 1.0 / 6.0  # px^2: the mean variance that bilinear interpolation adds
+
+
+@dataclass(frozen=True)
+class _Edges:
+    """Edges in one direction of the board, sampled.
+
+    normal (E, 2): towards the white side. distance, grey (E, M): samples, px along the normal and
+    grey levels. marker (E,): px from the edge to the marker, infinite on a checkerboard.
+    """
+
+    normal: Floats
+    distance: Floats
+    grey: Floats
+    marker: Floats
+
+
+@dataclass(frozen=True)
+class _Profiles:
+    """What was fitted to each edge: normal (E, 2), width (E,) px, black and white (E,)."""
+
+    normal: Floats
+    width: Floats
+    black: Floats
+    white: Floats
+
+
+def blur_covariance(
+    grey: Grey, pixels: Floats, ids: NDArray[np.intp], steps: Floats, board: Board
+) -> Floats | None:
+    """The blur's covariance (2, 2), px^2, the pixel's own width included.
+
+    pixels (N, 2): corners, px. steps (N, 2, 2): px per square, as `find.steps` gives them. None
+    where fewer than four edges in either direction can be measured.
+    """
+    sets = [_fit(_edges(grey, pixels, ids, steps, board, axis)) for axis in (0, 1)]
+    if min(len(profiles.width) for profiles in sets) < FEWEST:
+        return None
+    rows = [_products(p.normal, p.normal) / p.width[:, None] ** 2 for p in sets]
+    values = [np.ones(len(p.width)) for p in sets]
+    w1, w2 = (float(np.median(p.width)) for p in sets)
+    black = np.median(np.concatenate([p.black for p in sets]))
+    white = np.median(np.concatenate([p.white for p in sets]))
+    shifts = 2.0 * (_at(grey, pixels) - black) / (white - black) - 1.0
+    rho = _correlation(shifts, board.falling[ids])
+    rho *= np.sqrt((1.0 + BILINEAR / w1**2) * (1.0 + BILINEAR / w2**2))
+    first, second = _across(steps, 0), _across(steps, 1)
+    rows.append(_products(first, second) / (w1 * w2))
+    values.append(np.full(len(pixels), rho))
+    xx, xy, yy = np.linalg.lstsq(np.concatenate(rows), np.concatenate(values))[0]
+    variances, directions = np.linalg.eigh([[xx, xy], [xy, yy]])
+    return (directions * np.maximum(variances, 0.0)) @ directions.T
+
+
+def _products(a: Floats, b: Floats) -> Floats:
+    """(N, 3): what multiplies Cxx, Cxy and Cyy in a' C b."""
+    mixed = a[:, 0] * b[:, 1] + a[:, 1] * b[:, 0]
+    return np.stack([a[:, 0] * b[:, 0], mixed, a[:, 1] * b[:, 1]], axis=1)
+
+
+def _across(steps: Floats, axis: int) -> Floats:
+    """Unit normals (N, 2) of edges along the board's `axis`, towards growing other axis."""
+    along, other = steps[:, :, axis], steps[:, :, 1 - axis]
+    normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    return normal * np.sign((normal * other).sum(axis=1, keepdims=True))
+
+
+def _correlation(shifts: Floats, falling: NDArray[np.bool_]) -> float:
+    """Correlation of the blur across the two edges, from the grey at the corners.
+
+    shifts (N,): -1 black, 1 white. The two kinds of corners move apart; what they have in common
+    is light, gamma, or bleeding of ink, and cancels.
+    """
+    if falling.all() or not falling.any():
+        return 0.0
+    shift = 0.5 * (np.median(shifts[falling]) - np.median(shifts[~falling]))
+    return float(np.sin(0.5 * np.pi * np.clip(shift, -1.0, 1.0)))
+
+
+def _at(grey: Grey, pixels: Floats) -> Floats:
+    """Grey levels (N,) at pixels (N, 2), bilinear."""
+    maps = pixels.astype(np.float32)
+    values = cv2.remap(
+        grey.astype(np.float32),
+        maps[:, :1],
+        maps[:, 1:],
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    return np.asarray(values, np.float64).ravel()
+
+
+def _edges(
+    grey: Grey,
+    pixels: Floats,
+    ids: NDArray[np.intp],
+    steps: Floats,
+    board: Board,
+    axis: int,
+) -> _Edges:
+    """Samples of the edges between neighbours along the board's x (axis 0) or y (axis 1).
+
+    Whole pixels are taken, each with its own distance from the straight line between the two
+    corners: interpolating would blur.
+    """
+    columns = board.corners[0]
+    where = np.full(len(board.points) + columns + 1, -1)
+    where[ids] = np.arange(len(ids))
+    second = where[ids + (1, columns)[axis]]
+    pair = (second >= 0) & ((axis == 1) | (ids % columns < columns - 1))
+    second = second[pair]
+    start, line = pixels[pair], pixels[second] - pixels[pair]
+    other = 0.5 * (steps[pair] + steps[second])[:, :, 1 - axis]
+    normal = _across(np.stack([line, other][:: 1 - 2 * axis], axis=-1), axis)
+    square = np.abs((normal * other).sum(axis=1))
+    normal = np.where(board.falling[ids[pair], None], normal, -normal)
+    marker, reach = _marker_and_reach(square, board)
+    on_line = start[:, None, None] + ALONG[:, None, None] * line[:, None, None]
+    spots = on_line + (reach[:, None] * ACROSS)[:, None, :, None] * normal[:, None, None]
+    spots = np.rint(spots).astype(int).reshape(len(start), ALONG.size * ACROSS.size, 2)
+    inside = ((spots >= 0) & (spots < grey.shape[::-1])).all(axis=(1, 2))
+    spots, normal = spots[inside], normal[inside]
+    distance = np.einsum("emi,ei->em", spots - start[inside, None], normal)
+    levels = grey[spots[..., 1], spots[..., 0]].astype(np.float64)
+    return _Edges(normal, distance, levels, marker[inside])
+
+
+def _marker_and_reach(square: Floats, board: Board) -> tuple[Floats, Floats]:
+    """Distance of the markers from edges, and how far to sample, px, for squares this wide, px."""
+    reach = np.minimum(BLUR_REACH * square, REACH_PX)
+    if board.marker_m is None:
+        return np.full(len(square), np.inf), reach
+    share = board.marker_m / board.square_m
+    gap = 0.5 * (1.0 - share)
+    cell = share / len(board.markers[0][2])
+    return gap * square, np.minimum(reach, (gap + REACH_CELLS * cell) * square)
+
+
+def _fit(edges: _Edges) -> _Profiles:
+    """Width of each edge: black + contrast (Phi(z) - Phi(z - marker / width)), z = (d - m) / width.
+
+    Levenberg-Marquardt with fixed damping on all edges at once.
+    """
+    if len(edges.grey) == 0:
+        return _Profiles(edges.normal, *np.empty((3, 0)))
+    bright = edges.distance > 0
+    black = np.average(edges.grey, axis=1, weights=~bright)
+    white = np.average(edges.grey, axis=1, weights=bright)
+    zero = np.zeros_like(black)
+    p = np.stack([black, white - black, zero, zero + np.log(FIRST_PX)])
+    for _ in range(FIT_STEPS):
+        model, J = _profile(edges, *p)
+        normal = np.einsum("iem,jem->eij", J, J)
+        normal += DAMPING * normal * np.eye(4) + 1e-9 * np.eye(4)
+        step = np.linalg.solve(normal, np.einsum("iem,em->ei", J, edges.grey - model)[..., None])
+        step = step[..., 0].T
+        step[2:] = np.clip(step[2:], -LONGEST_STEP, LONGEST_STEP)
+        p = p + step
+        p[3] = np.clip(p[3], *np.log(WIDTHS_PX))
+    black, contrast, offset, width = *p[:3], np.exp(p[3])
+    good = (width > 1.01 * WIDTHS_PX[0]) & (width < 0.99 * WIDTHS_PX[1])
+    good &= (np.abs(contrast) > LEAST_CONTRAST) & (np.abs(offset) < 1.0 + width)
+    return _Profiles(edges.normal[good], width[good], black[good], (black + contrast)[good])
+
+
+def _profile(
+    edges: _Edges, black: Floats, contrast: Floats, offset: Floats, log_width: Floats
+) -> tuple[Floats, Floats]:
+    """The model (E, M) and its derivatives by the four parameters (4, E, M)."""
+    width = np.exp(log_width)[:, None]
+    z = (edges.distance - offset[:, None]) / width
+    up, bump = ndtr(z), np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi)
+    zbump = z * bump
+    if np.isfinite(edges.marker).all():
+        y = z - edges.marker[:, None] / width
+        fall = np.exp(-0.5 * y * y) / np.sqrt(2 * np.pi)
+        up, bump, zbump = up - ndtr(y), bump - fall, zbump - y * fall
+    c = contrast[:, None]
+    return black[:, None] + c * up, np.stack([np.ones_like(up), up, -c * bump / width, -c * zbump])

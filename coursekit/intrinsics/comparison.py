@@ -1,0 +1,269 @@
+"""How different two cameras are: two halves of one session, or the fit and the factory's K.
+
+Two calibrations of one camera place its frame differently, by a small rotation and translation
+that every pose, and every hand-eye transform after it, absorbs. So the difference over the image
+is taken after the motion that brings the two nearest to each other (after mrcal's
+`show-projection-diff`), each pixel weighted by how well it is known.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from coursekit.arrays import Floats
+from coursekit.boards import Board, Detection
+from coursekit.checks import want
+from coursekit.geometry import Intrinsics, deproject, project
+from coursekit.intrinsics.derivatives import (
+    moved,
+    parameter_vector,
+    project_with_derivatives,
+    scaled_inverse,
+    selection,
+    twist_columns,
+)
+from coursekit.intrinsics.fit import (
+    MAP_SHAPE,
+    IntrinsicsResult,
+    calibrate,
+    image_grid,
+    points_at,
+    projection_columns,
+    worst_direction,
+)
+from coursekit.words import p_text
+
+_GAUSS_NEWTON_STEPS = 20
+
+
+# --- two halves ---
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class HalvesDifference:
+    """What two independent halves of the views say differently about the same camera.
+
+    first, second: the fits to every other view. range_m: at which they are compared.
+    difference_px (rows, columns, 2): second - first where each sees the same point, after the best
+    motion of the camera's frame. expected_px (rows, columns): the standard deviation of that, in
+    its worst direction, from the covariances of both. Both are NaN where a half has no ray.
+    p_value: how often halves with nothing but corner noise between them have intrinsics at least
+    this far apart (Wald test).
+    """
+
+    first: IntrinsicsResult
+    second: IntrinsicsResult
+    range_m: float
+    difference_px: Floats
+    expected_px: Floats
+    p_value: float
+
+    @property
+    def length_px(self) -> Floats:
+        """The length of the difference, (rows, columns), px."""
+        return np.linalg.norm(self.difference_px, axis=-1)
+
+    def __repr__(self) -> str:
+        length, wide = self.length_px, self.expected_px
+        agree = "as corner noise explains" if self.p_value > 0.01 else "more than noise explains"
+        return (
+            f"two halves ({len(self.first.residuals)} and {len(self.second.residuals)} views) "
+            f"differ by {np.nanmedian(length):.2f} px in the median\nof the image and "
+            f"{np.nanmax(length):.2f} px at worst, at {self.range_m:.2f} m; noise alone: sigma "
+            f"{np.nanmedian(wide):.2f} and {np.nanmax(wide):.2f} px\n"
+            f"{agree} ({p_text(self.p_value)})"
+        )
+
+
+def halves(
+    detections: Sequence[Detection],
+    board: Board,
+    model: str = "brown_conrady",
+    same_focal: bool = False,
+    range_m: float | None = None,
+    shape: tuple[int, int] = MAP_SHAPE,
+) -> HalvesDifference:
+    """Calibrate the even and the odd views apart and compare.
+
+    range_m: where to compare, m; None takes the boards' median distance. shape: (rows, columns)
+    of the map. Raises ValueError where a half is too small to fit, and as `calibrate`.
+
+    >>> halves([], Board("checkerboard", (10, 7), 0.025))
+    Traceback (most recent call last):
+    ValueError: detections: got 0 views, halves need at least 6
+    """
+    if len(detections) < 6:
+        raise ValueError(f"detections: got {len(detections)} views, halves need at least 6")
+    first, second = (
+        calibrate([detections[i] for i in part], board, model, same_focal)
+        for part in (range(0, len(detections), 2), range(1, len(detections), 2))
+    )
+    range_m = first.board_range_m if range_m is None else float(range_m)
+    grid = image_grid(first.intrinsics, shape).reshape(-1, 2)
+    weights = 1.0 / np.hypot(*(r.uncertainty_map(range_m, shape).ravel() for r in (first, second)))
+    weights[~np.isfinite(weights)] = 0.0  # where a half's distortion has no inverse
+    difference = difference_px(first.intrinsics, second.intrinsics, grid, range_m, weights)
+    columns = projection_columns(first.intrinsics, grid, range_m, first.names)
+    spread = _without_motion(columns, weights)
+    total = first.covariance + second.covariance
+    apart = np.array([second.value(name) - first.value(name) for name in first.names])
+    return HalvesDifference(
+        first=first,
+        second=second,
+        range_m=range_m,
+        difference_px=difference.reshape(*shape, 2),
+        expected_px=worst_direction(spread @ total @ np.swapaxes(spread, -1, -2)).reshape(shape),
+        p_value=_wald(apart, total, min(first.dof, second.dof)),
+    )
+
+
+def difference_px(
+    first: Intrinsics,
+    second: Intrinsics,
+    pixels: Floats,
+    range_m: float,
+    weights: Floats | None = None,
+) -> Floats:
+    """Where the second camera sees what the first sees at pixels (N, 2), less those: (N, 2), px.
+
+    The second camera's frame is moved to where the weighted squares of the difference are least:
+    a rotation, and, for points at a finite range_m (m), a translation. weights (N,): of each
+    pixel's residual; None weighs all alike. Gauss-Newton. NaN where the first camera's distortion
+    has no inverse.
+    """
+    points = points_at(pixels, range_m, first)
+    weights = np.ones(len(pixels)) if weights is None else weights
+    known = np.isfinite(points).all(axis=1) & (weights > 0)
+    weight = weights[known, None]
+    free = 6 if math.isfinite(range_m) else 3
+    T = np.eye(4)
+    for _ in range(_GAUSS_NEWTON_STEPS):
+        at = points[known] @ T[:3, :3].T + T[:3, 3]
+        seen, _, by_point = project_with_derivatives(at, second)
+        columns = (weight[..., None] * twist_columns(at, by_point)[..., :free]).reshape(-1, free)
+        residuals = (weight * (pixels[known] - seen)).ravel()
+        twist = np.zeros(6)
+        twist[:free] = scaled_inverse(columns.T @ columns) @ (columns.T @ residuals)
+        T = moved(T[None], twist[None])[0]
+        if np.abs(columns @ twist[:free]).max() < 1e-9 * weight.max():
+            break
+    moved_points = points @ T[:3, :3].T + T[:3, 3]
+    return project(moved_points, second.K, second.dist) - pixels
+
+
+def _without_motion(columns: Floats, weights: Floats) -> Floats:
+    """d difference / d parameters (N, 2, p) once the best motion has been taken out.
+
+    columns (N, 2, p + 6): by the parameters and by the motion of the points. Pixels with a weight
+    (N,) of 0 do not decide about the motion.
+    """
+    used = weights > 0
+    moving = columns[used, :, -6:].any(axis=(0, 1))  # at infinity a translation moves nothing
+    parameters, motion = columns[..., :-6], columns[..., -6:][..., moving]
+    flat = (columns[used] * weights[used, None, None]).reshape(-1, columns.shape[-1])
+    A, b = flat[:, -6:][:, moving], flat[:, :-6]
+    return parameters - motion @ (scaled_inverse(A.T @ A) @ (A.T @ b))
+
+
+def _wald(difference: Floats, covariance: Floats, dof: int) -> float:
+    """The p-value of a difference (p,) whose covariance (p, p) was estimated with `dof`."""
+    from scipy.stats import f
+
+    squares = float(difference @ scaled_inverse(covariance) @ difference)
+    return float(f.sf(squares / len(difference), len(difference), dof))
+
+
+# --- the factory's K ---
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Comparison:
+    """A fitted camera beside what the device reports of itself.
+
+    names (p): as in the result. differences, sigmas (p,): result - factory and the standard
+    deviation of the result. p_value: how often corner noise alone makes them differ as much, were
+    the factory's right (Wald test over `names`). difference_px (rows, columns): between the pixels
+    at which the two see the same point, after the best motion of the camera's frame. shift_m
+    (rows, columns): how far apart the two put the point at a pixel and the depth Z = range_m, with
+    no such motion; expected_shift_m: the standard deviation of that from the result's covariance.
+    size: (width, height) of the image that the maps cover, px.
+    """
+
+    names: tuple[str, ...]
+    differences: Floats
+    sigmas: Floats
+    p_value: float
+    range_m: float
+    difference_px: Floats
+    shift_m: Floats
+    expected_shift_m: Floats
+    size: tuple[int, int]
+
+    def __repr__(self) -> str:
+        lines = ["fitted - factory:"]
+        for name, difference, sigma in zip(self.names, self.differences, self.sigmas, strict=True):
+            places = 2 if name[0] in "fc" else 4
+            lines.append(
+                f"{name:>4} {difference:+9.{places}f}, {difference / sigma:+6.1f} of its sigma"
+            )
+        lines.append(
+            f"all together: {p_text(self.p_value)}; in the image "
+            f"{np.nanmedian(self.difference_px):.2f} px in the median, "
+            f"{np.nanmax(self.difference_px):.2f} px at worst"
+        )
+        lines.append(
+            f"a point {self.range_m:.2f} m away moves by "
+            f"{1e3 * np.nanmedian(self.shift_m):.2f} mm in the median, "
+            f"{1e3 * np.nanmax(self.shift_m):.2f} mm at worst "
+            f"(sigma {1e3 * np.nanmedian(self.expected_shift_m):.2f} mm)"
+        )
+        return "\n".join(lines)
+
+
+def compare(
+    result: IntrinsicsResult,
+    factory: Intrinsics,
+    range_m: float = 0.45,
+    shape: tuple[int, int] = MAP_SHAPE,
+) -> Comparison:
+    """A fitted camera against the factory's intrinsics, in sigmas, pixels and metres.
+
+    factory: its coefficients in OpenCV's sense (`Intrinsics.dist`). range_m: Z, m.
+    Raises ValueError where the two are for images of different sizes.
+
+    >>> from coursekit.intrinsics.fit import evaluate
+    >>> lens = Intrinsics(640, 480, 600, 600, 320, 240)
+    >>> board = Board("checkerboard", (10, 7), 0.025)
+    >>> pose = np.array([[1, 0, 0, -0.1], [0, 0.8, -0.6, 0], [0, 0.6, 0.8, 0.5], [0, 0, 0, 1]])
+    >>> seen = project(board.points @ pose[:3, :3].T + pose[:3, 3], lens.K)
+    >>> views = [Detection(np.arange(54), seen + [[0.1], [-0.1]] * 27, lens.size)]
+    >>> fit = evaluate(lens, pose[None], views, board, board.points, ("fx", "fy"), "none")
+    >>> print(compare(fit, Intrinsics(640, 480, 590, 600, 320, 240)).differences)
+    [10.  0.]
+    """
+    ours, names = result.intrinsics, result.names
+    want(factory.size == ours.size, "factory", factory.size, f"the fit's size, {ours.size} px")
+    grid = image_grid(ours, shape).reshape(-1, 2)
+    weights = 1.0 / result.uncertainty_map(range_m, shape).ravel()
+    pixels = difference_px(ours, factory, grid, range_m, weights).reshape(*shape, 2)
+    depth = np.full(len(grid), float(range_m))
+    theirs = deproject(grid, depth, factory.K, factory.dist)
+    shift = np.linalg.norm(deproject(grid, depth, ours.K, ours.dist) - theirs, axis=1)
+    full = parameter_vector(ours) - parameter_vector(factory)
+    difference = np.linalg.pinv(selection(names)) @ full  # "f" against the mean of fx and fy
+    sigma_px = result.uncertainty_map(range_m, shape, "camera")
+    return Comparison(
+        names=names,
+        differences=difference,
+        sigmas=np.sqrt(np.diag(result.covariance)),
+        p_value=_wald(difference, result.covariance, result.dof),
+        range_m=float(range_m),
+        difference_px=np.linalg.norm(pixels, axis=-1),
+        shift_m=shift.reshape(shape),
+        expected_shift_m=sigma_px * range_m / result.value("fx"),
+        size=ours.size,
+    )

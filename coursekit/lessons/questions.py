@@ -1,0 +1,287 @@
+"""Questions that the student answers before the notebook shows the answer.
+
+All texts come from the lesson's TOML file. The question and its options stand in the notebook's
+Markdown as well, where they can be read without a kernel; a test keeps both equal. An answer is
+committed by clicking, or by a plain call: `ck.checkpoint("pinhole.zoom").answer("B")`.
+"""
+
+from __future__ import annotations
+
+import html
+import math
+import re
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from coursekit.lessons import progress
+from coursekit.lessons.progress import Verdict
+
+EXAMPLES = "0.37 or 150"  # of numbers, and no checkpoint's answer
+LENGTHS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+LETTERS = "ABCDEFGH"
+
+
+@dataclass(frozen=True)
+class Option:
+    """One option of a choice: its text and why it is right or wrong."""
+
+    text: str
+    why: str
+    right: bool = False
+
+
+@dataclass(frozen=True)
+class Classic:
+    """A wrong number that a known slip leads to, and what that slip is."""
+
+    value: float
+    why: str
+
+
+@dataclass(frozen=True)
+class Objective:
+    """What a student can do after a lesson, and the checkpoints and exercises that show it."""
+
+    text: str
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A question; `answer` commits one answer and says why it is right or wrong."""
+
+    name: str
+    question: str
+
+    def answer(self, given: Any) -> Verdict:
+        """The verdict on an answer; the first one given is what `progress` keeps as first try."""
+        return progress.noted(self.judge(given), str(given))
+
+    def judge(self, given: Any) -> Verdict:
+        """The verdict on an answer, without noting it."""
+        raise NotImplementedError
+
+    @property
+    def example(self) -> str:
+        """What a plain call would pass, as source."""
+        raise NotImplementedError
+
+    def input_widget(self) -> Any:
+        """The ipywidget whose `value` is the answer."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        return f'Checkpoint: commit your answer with ck.checkpoint("{self.name}").answer(...)'
+
+    def explanation(self) -> Verdict:
+        """The verdict on the right answer, which says why every other one is wrong."""
+        raise NotImplementedError
+
+    def _repr_mimebundle_(self, **kwargs: Any) -> dict[str, Any]:
+        widget: dict[str, Any] = panel(self)._repr_mimebundle_(**kwargs)
+        return widget | {"text/plain": repr(self), "text/html": self._without_kernel()}
+
+    def _without_kernel(self) -> str:
+        call = f'ck.checkpoint("{self.name}").answer({self.example})'
+        return (
+            f"<em>Run this cell to answer here, or call <code>{call}</code>.</em>"
+            "<details><summary>Reading without a kernel? Decide first, then open the answer."
+            f"</summary>{self.explanation()._repr_html_()}</details>"
+        )
+
+
+@dataclass(frozen=True, repr=False)
+class Choice(Checkpoint):
+    """A question with options A, B, C, ..., exactly one of them right.
+
+    >>> near = Option("nearer", "The farther one is smaller.", right=True)
+    >>> choice = Choice("a.b", "Which is larger?", (near, Option("farther", "It looks smaller.")))
+    >>> choice.judge("B")
+    B, farther: not this one.
+    It looks smaller.
+    Think again, and choose another.
+    """
+
+    options: tuple[Option, ...]
+
+    def lettered(self) -> dict[str, Option]:
+        """The options by letter."""
+        return dict(zip(LETTERS, self.options, strict=False))
+
+    def judge(self, given: Any) -> Verdict:
+        """The verdict on a letter; a right one also says why each other option is wrong."""
+        options = self.lettered()
+        letter = str(given).strip().upper().rstrip(".")
+        if letter not in options:
+            want = f"one of {', '.join(options)}"
+            return Verdict(self.name, "not attempted", f"Choose {want}; got {given!r}.")
+        chosen = options[letter]
+        if not chosen.right:
+            again = "Think again, and choose another."
+            headline = f"{letter}, {chosen.text}: not this one."
+            return Verdict(self.name, "wrong", headline, (chosen.why, again), named=letter)
+        others = [f"{k}, {o.text}: {o.why}" for k, o in options.items() if not o.right]
+        headline = f"{letter}, {chosen.text}: right."
+        return Verdict(self.name, "right", headline, (chosen.why, *others))
+
+    def explanation(self) -> Verdict:
+        return self.judge(next(k for k, o in self.lettered().items() if o.right))
+
+    @property
+    def example(self) -> str:
+        return '"A"'
+
+    def input_widget(self) -> Any:
+        import ipywidgets
+
+        labels = [(f"{k}. {o.text}", k) for k, o in self.lettered().items()]
+        return ipywidgets.RadioButtons(
+            options=labels, value=None, layout=ipywidgets.Layout(width="max-content")
+        )
+
+
+@dataclass(frozen=True, repr=False)
+class Number(Checkpoint):
+    """A question whose answer is a number; classic wrong numbers are recognised.
+
+    value, and those of the classics: in `unit`. why: said with the right answer. hint: said with a
+    wrong one that is no classic. tolerance: relative, of the right one and of each classic.
+    """
+
+    value: float
+    unit: str
+    why: str
+    hint: str
+    classics: tuple[Classic, ...]
+    tolerance: float = 0.02
+
+    def judge(self, given: Any) -> Verdict:
+        """The verdict on a number, or on text such as "2.4" or "2,4 mm"."""
+        number = self._meant(_readings(given, self.unit))
+        if number is None:
+            say = f"Type a number in {self.unit}, such as {EXAMPLES}; got {given!r}."
+            return Verdict(self.name, "not attempted", say)
+        said = f"{number:g} {self.unit}"
+        if self._close(number, self.value):
+            others = [f"{c.value:g} {self.unit}: {c.why}" for c in self.classics]
+            return Verdict(self.name, "right", f"{said}: right.", (self.why, *others))
+        for classic in self.classics:
+            if self._close(number, classic.value):
+                lines = (classic.why, "Think again, and try another number.")
+                return Verdict(
+                    self.name, "wrong", f"{said}: not this.", lines, named=f"{classic.value:g}"
+                )
+        if any(self._close(number * factor, self.value) for factor in (1e-3, 1e3)):
+            say = f"The digits are right. The answer is wanted in {self.unit}."
+            return Verdict(self.name, "not attempted", say)
+        lines = (self.hint, "Think again, and try another number.")
+        return Verdict(self.name, "wrong", f"{said}: not this.", lines)
+
+    def _meant(self, readings: list[float]) -> float | None:
+        """The only reading, or else the one that is right or a known slip."""
+        for value in (self.value, *(c.value for c in self.classics)):
+            for number in readings:
+                if self._close(number, value):
+                    return number
+        return readings[0] if len(readings) == 1 else None
+
+    def _close(self, number: float, value: float) -> bool:
+        return math.isclose(number, value, rel_tol=self.tolerance, abs_tol=1e-12)
+
+    def explanation(self) -> Verdict:
+        return self.judge(self.value)
+
+    @property
+    def example(self) -> str:
+        return "1.0"
+
+    def input_widget(self) -> Any:
+        import ipywidgets
+
+        return ipywidgets.Text(placeholder=f"a number ({self.unit})")
+
+
+def _readings(given: Any, unit: str) -> list[float]:
+    """The number in the student's answer, in `unit`; none for what is no number.
+
+    A decimal comma, spaces between digits and a unit (of length, if `unit` is one) are accepted.
+    "2,000" has two readings: it is two to some writers and two thousand to others.
+    """
+    text = str(given).strip().replace("\N{MINUS SIGN}", "-")
+    match = re.fullmatch(r"([-+\d.,\s]+(?:[eE][-+]?\d+)?)\s*([a-zA-Zµ]*)", text)
+    if match is None:
+        return []
+    digits, given_unit = re.sub(r"(?<=\d)\s(?=\d{3}\b)", "", match[1]).strip(), match[2] or unit
+    written = [digits.replace(",", ".")] if re.fullmatch(r"[-+]?\d+,\d+", digits) else [digits]
+    if re.fullmatch(r"[-+]?\d{1,3},000", digits):
+        written.append(digits.replace(",", ""))
+    factor = 1.0 if given_unit == unit else LENGTHS.get(given_unit, 0.0) / LENGTHS.get(unit, 1.0)
+    try:
+        numbers = [float(text) * factor for text in written]
+    except ValueError:
+        return []
+    return [number for number in numbers if math.isfinite(number) and factor]
+
+
+def panel(checkpoint: Checkpoint) -> Any:
+    """The widget: input, a button that commits, and the verdict below."""
+    import ipywidgets
+
+    field = checkpoint.input_widget()
+    button = ipywidgets.Button(description="Commit", tooltip="Commit this answer")
+    said = ipywidgets.HTML(_earlier(checkpoint.name))
+
+    def commit(_: Any) -> None:
+        if field.value in (None, ""):
+            said.value = "<em>Choose or type an answer first.</em>"
+        else:
+            said.value = checkpoint.answer(field.value)._repr_html_()
+
+    button.on_click(commit)
+    return ipywidgets.VBox([field, button, said])
+
+
+def _earlier(name: str) -> str:
+    """What the student did here before, for the widget only: stored outputs never show it."""
+    attempts = progress.read().get(name, [])
+    if not attempts:
+        return ""
+    last = attempts[-1]
+    return f"<em>You have answered this one before ({html.escape(last['kind'])}).</em>"
+
+
+def load(lesson: str) -> tuple[tuple[Checkpoint, ...], tuple[Objective, ...]]:
+    """The checkpoints and the objectives of a lesson, in the order of its TOML file.
+
+    A choice has its options under A, B, C, ..., each with why it is right or wrong, and the right
+    letter; a number has slips, each a wrong number with what leads to it. Names in the file are
+    without the lesson's.
+    """
+    text = Path(__file__).with_name(f"{lesson}.toml").read_text(encoding="utf-8")
+    content = tomllib.loads(text)
+
+    def checkpoint(name: str, asked: dict[str, Any]) -> Checkpoint:
+        question = _single_spaced(asked["question"])
+        if "right" in asked:
+            texts = {k: map(_single_spaced, asked[k]) for k in LETTERS if k in asked}
+            options = (Option(next(t), next(t), k == asked["right"]) for k, t in texts.items())
+            return Choice(name, question, tuple(options))
+        slips = tuple(Classic(value, _single_spaced(why)) for value, why in asked["slips"])
+        why, hint = _single_spaced(asked["why"]), _single_spaced(asked["hint"])
+        return Number(name, question, asked["value"], asked["unit"], why, hint, slips)
+
+    return (
+        tuple(
+            checkpoint(f"{lesson}.{key}", asked) for key, asked in content["checkpoints"].items()
+        ),
+        tuple(
+            Objective(_single_spaced(o["text"]), tuple(f"{lesson}.{n}" for n in o["shown_by"]))
+            for o in content["objectives"]
+        ),
+    )
+
+
+def _single_spaced(text: str) -> str:
+    return " ".join(text.split())
