@@ -92,6 +92,7 @@ class Bundle:
 
     @property
     def page(self) -> str:
+        """Where the page of its student stands in the report."""
         plain = unicodedata.normalize("NFKD", self.path.stem).encode("ascii", "ignore").decode()
         return f"{STUDENTS}/{slug(plain)}_{self.key[:12]}.html"
 
@@ -260,6 +261,7 @@ def find_bundles(folder: Path, out: Path) -> tuple[list[Path], tuple[str, ...]]:
 
 
 def _bundles(folder: Path, paths: Iterable[Path]) -> Iterator[Bundle]:
+    """The files with a name each that can be written anywhere and is there once."""
     seen: Counter[str] = Counter()
     for path in paths:
         raw = path.relative_to(folder).as_posix()
@@ -344,6 +346,7 @@ def work_through(
 
 
 def _scheduled(pool: ProcessPool, work: Work, bundle: Bundle, limits: Limits) -> Future[Graded]:
+    """A bundle given to the pool; its future is broken where the pool is no more."""
     try:
         arguments = (str(bundle.path), bundle.name, bundle.page)
         return pool.schedule(work, arguments, timeout=limits.timeout_s)
@@ -354,6 +357,7 @@ def _scheduled(pool: ProcessPool, work: Work, bundle: Bundle, limits: Limits) ->
 
 
 def _outcome(future: Future[Graded], bundle: Bundle, limits: Limits) -> Graded:
+    """What became of a bundle. Raises BrokenProcessPool when the pool itself is lost."""
     error = future.exception()  # of a worker: even a SystemExit must not be raised here
     if error is None:
         return future.result()
@@ -372,6 +376,7 @@ def _outcome(future: Future[Graded], bundle: Bundle, limits: Limits) -> Graded:
 
 
 def _failed(bundle: Bundle, reason: str, says: str) -> Graded:
+    """The line of a bundle whose grading failed, and no page."""
     return not_graded(bundle.name, reason, says), ""
 
 
@@ -482,6 +487,7 @@ def _check_out(out: Path, overwrite: bool) -> None:
 
 
 def _is_ours(entry: Path) -> bool:
+    """Whether a report writes such a file or folder, with nothing else in it."""
     if entry.is_symlink():
         return False
     if entry.is_dir():
@@ -546,6 +552,7 @@ def _finish(out: Path, bundles: list[Bundle]) -> list[ReportLine]:
 
 
 def _kind(line: ReportLine) -> str:
+    """What the summary counts a line as: graded, refused or failed."""
     if line.points is not None:
         return "graded"
     return "failed" if line.reason in FAILED else "refused"
