@@ -6,7 +6,7 @@ What was seen of a board in one image, and in many.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any, Literal, get_args, overload
@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from coursekit.arrays import Floats, NDArray
+from coursekit.words import counted
 
 Kind = Literal["checkerboard", "charuco"]
 FEWEST_SQUARES = 3
@@ -386,6 +387,62 @@ class Detections(Sequence[Detection]):
         if len(self.skipped) > LISTED_SKIPPED:
             lines.append(f"  and {len(self.skipped) - LISTED_SKIPPED} more not used")
         return "\n".join(lines)
+
+
+def check_detections(
+    detections: Sequence[Detection],
+    board: Board,
+    least_corners: int,
+    least_views: int = 1,
+    *,
+    size: tuple[int, int] | None = None,
+    name: str = "detections",
+) -> None:
+    """ValueError unless each of these views can fix a pose of `board`.
+
+    least_corners: of each view. least_views: of all of them. size: (width, height) that each image
+    must have, px, the first one's by default. name: what the message calls the argument; it also
+    says which view cannot be used, and which of six faults that view has: another size, too few
+    corners, a pixel that is not finite, a corner that the board does not have, the same corner
+    twice, or all corners on one line.
+
+    >>> board = Board("checkerboard", (10, 7), 0.025)
+    >>> check_detections([Detection([0, 1, 2], np.zeros((3, 2)), (640, 480), "a.png")], board, 4)
+    Traceback (most recent call last):
+    ValueError: detections[0] (a.png): has 3 corners, want at least 4
+    """
+    if len(detections) < least_views:
+        skipped = getattr(detections, "skipped", ())
+        unused = f"; {len(skipped)} not used, the first: {skipped[0]!r}" if skipped else ""
+        raise ValueError(
+            f"{name}: got {counted(len(detections), 'view')}, want at least {least_views}{unused}"
+        )
+    for number, view in enumerate(detections):
+        fault = next(_faults(view, board, least_corners, size or detections[0].size), "")
+        if fault:
+            called = f" ({view.name})" if view.name else ""
+            raise ValueError(f"{name}[{number}]{called}: {fault}")
+
+
+def _faults(
+    view: Detection, board: Board, least_corners: int, size: tuple[int, int]
+) -> Iterator[str]:
+    """What is wrong with one view, the first thing first; later checks rely on earlier ones."""
+    ids, last = view.ids, len(board.points) - 1
+    if view.size != size:
+        yield f"is {view.size} px, not {size}: one calibration is for one size"
+    if len(ids) < least_corners:
+        yield f"has {len(ids)} corners, want at least {least_corners}"
+    if not np.isfinite(view.pixels).all():
+        yield "has corners that are not finite"
+    if ids.min() < 0 or ids.max() > last:
+        yield f"has corner {ids.max()}, the board has 0 to {last}: another board?"
+    if len(np.unique(ids)) < len(ids):
+        yield "has the same corner twice"
+    flat = board.points[ids, :2]
+    spread = np.linalg.svd(flat - flat.mean(axis=0), compute_uv=False)
+    if spread[1] < 1e-6 * spread[0]:
+        yield "has all its corners on one line, which fixes no pose"
 
 
 def _times(size: tuple[int, int]) -> str:
