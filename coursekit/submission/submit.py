@@ -166,7 +166,7 @@ def measured(
     return Submission(
         student=NOBODY,
         made=results.now(),
-        versions=results._versions(),
+        versions=results.versions(),
         camera=facts(camera),
         tape_sigma_m=tape_sigma_m,
         caliper_m=caliper_m,
