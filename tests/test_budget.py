@@ -16,7 +16,7 @@ from coursekit.budget import (
     GraspAxes,
     View,
     autocorrelation,
-    effective_frames,
+    independent_frames,
     lesson_budget,
     lesson_view,
     wrist_budget,
@@ -178,11 +178,11 @@ def test_no_draw_exceeds_the_worst_case() -> None:
 
 
 def test_autocorrelation_and_floor() -> None:
-    assert effective_frames(100) == pytest.approx(100)
-    assert math.sqrt(effective_frames(100, 0.5)) == pytest.approx(5.8, abs=0.05)  # claim D8
+    assert independent_frames(100) == pytest.approx(100)
+    assert math.sqrt(independent_frames(100, 0.5)) == pytest.approx(5.8, abs=0.05)  # claim D8
     k = np.arange(1, 30)
     direct = 30 / (1 + 2 * np.sum((1 - k / 30) * 0.7**k))
-    assert effective_frames(30, 0.7) == pytest.approx(direct)
+    assert independent_frames(30, 0.7) == pytest.approx(direct)
 
     term = ErrorTerm("depth noise", "noise", 1e-3, 1e-3, "ray", "test", floor=2e-4)
     one = ErrorBudget((term,), lesson_view())
@@ -193,7 +193,7 @@ def test_autocorrelation_and_floor() -> None:
 
 @pytest.mark.parametrize("rho", [0.0, 0.13, 0.5, 0.98])
 def test_the_autocorrelation_of_frames_comes_back(rho: float) -> None:
-    assert autocorrelation(200, effective_frames(200, rho)) == pytest.approx(rho, abs=1e-9)
+    assert autocorrelation(200, independent_frames(200, rho)) == pytest.approx(rho, abs=1e-9)
 
 
 @pytest.mark.parametrize(("frames", "effective"), [(1, 1.0), (10, 0.9), (10, 10.1), (10, 1.0)])

@@ -14,7 +14,7 @@ from coursekit import results
 from coursekit.budget import (
     HandOver,
     beside,
-    effective_frames,
+    independent_frames,
     hand_over,
     lesson_budget,
     wrist_budget,
@@ -238,7 +238,7 @@ def test_what_notebook_1_and_2_may_have_kept_is_used(folders: tuple[Path, Path])
     per_px = 0.45**2 / (430.0 * 0.055)
     noise = {row.term.name: row.high_m for row in budget.rows}["depth noise"]
     assert noise == pytest.approx(per_px * math.hypot(0.07, 0.05))
-    many = 0.07**2 / effective_frames(400, 0.3) + 0.05**2
+    many = 0.07**2 / independent_frames(400, 0.3) + 0.05**2
     assert budget.at(frames=400).averaged_m["depth noise"] == pytest.approx(
         per_px * math.sqrt(many)
     )
