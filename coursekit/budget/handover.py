@@ -293,8 +293,7 @@ class HandOver:
         factor = np.zeros((len(PARAMETERS), root.shape[1]))
         factor[[PARAMETERS.index(name) for name in known.names]] = root
         rows = tuple(map(tuple, factor.tolist()))
-        sigmas = (0.0, SIGMAS, "intrinsics", whose, True, rows)
-        return ErrorTerm("intrinsics", "bias", *sigmas)
+        return ErrorTerm("intrinsics", "bias", 0.0, SIGMAS, "intrinsics", whose, True, rows)
 
     def _hand_eye(self, part: str, names: tuple[str, ...], along: Along, unit: float) -> ErrorTerm:
         """The root mean square over the three axes: a row knows no frame. What `propagate` takes
