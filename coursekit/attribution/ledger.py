@@ -78,7 +78,8 @@ class Entry:
     @classmethod
     def of(cls, found: Attribution, task: str, camera: str = "", **rest: Any) -> Entry:
         """The row of an attribution, dated now. rest: other fields, such as tolerance_mm."""
-        given = {"trials": found.n, "p_mean": found.p_mean, "p_pose": found.p_pose} | rest
+        seen = found.evidence
+        given = {"trials": seen.n, "p_mean": seen.mean.p_value, "p_pose": seen.p_pose} | rest
         for axis, mean, scatter in zip("xyz", found.mean_m, found.scatter_m, strict=True):
             given[f"mean_{axis}_mm"] = 1e3 * float(mean)
             given[f"scatter_{axis}_mm"] = 1e3 * float(scatter)
@@ -113,8 +114,7 @@ class Ledger:
             rows = [*self.read(), entry]
             text = io.StringIO(newline="")
             writer = csv.writer(text, lineterminator="\n")
-            writer.writerow(LEDGER_HEADER)
-            writer.writerows([_cell(value) for value in astuple(row)] for row in rows)
+            writer.writerows([LEDGER_HEADER, *(map(_cell, astuple(row)) for row in rows)])
             write_bytes(self.path, text.getvalue().encode("utf-8"))
 
     def read(self) -> tuple[Entry, ...]:

@@ -61,19 +61,17 @@ REPEATED_SHARE = 0.5  # of the trials in repeated places, from which a set is on
 
 @dataclass(frozen=True)
 class MeanTest:
-    """p-values of "the mean is zero", T^2 itself (both None where T^2 cannot be had), and both
-    joined. axes: how many the scatter really fills, 1 to 3."""
+    """p_value: of "the mean is zero", by both tests together; p_pooled by one, p_t2 by the other.
 
-    t2: float | None
-    p_t2: float | None
+    t2: Hotelling's, with p_t2 None where it cannot be had: under 4 trials and for scatter in a
+    plane. axes: how many the scatter really fills, 1 to 3.
+    """
+
+    p_value: float
     p_pooled: float
     axes: float
-
-    @property
-    def p_value(self) -> float:
-        """Of both tests together."""
-        p_t2 = 1.0 if self.p_t2 is None else self.p_t2
-        return min(1.0, self.p_pooled / POOLED_SHARE, p_t2 / T2_SHARE)
+    t2: float | None = None
+    p_t2: float | None = None
 
 
 def mean_test(misses: Floats) -> MeanTest:
@@ -90,10 +88,10 @@ def mean_test(misses: Floats) -> MeanTest:
         p_pooled = 0.0 if squares > 0 else 1.0
     values = np.linalg.eigvalsh(S)
     if n < 4 or values[0] <= SINGULAR * values[-1]:
-        return MeanTest(None, None, p_pooled, axes)
+        return MeanTest(min(1.0, p_pooled / POOLED_SHARE), p_pooled, axes)
     t2 = float(n * mean @ np.linalg.solve(S, mean))
     p_t2 = float(f.sf(t2 * (n - 3) / (3 * (n - 1)), 3, n - 3))
-    return MeanTest(t2, p_t2, p_pooled, axes)
+    return MeanTest(min(1.0, p_pooled / POOLED_SHARE, p_t2 / T2_SHARE), p_pooled, axes, t2, p_t2)
 
 
 def effective_axes(S: Floats, n: int) -> float:
@@ -253,37 +251,15 @@ def place_test(misses: Floats, T_base_gripper: Floats, level: float) -> PlaceTes
     Only places with 2 trials or more count. None where they are fewer than 3, or hold less than
     half of the trials: then the set says more about the pose by where it was than by repeats.
     """
+    from scipy.stats import f
+
     place = find_places(T_base_gripper)
     repeated = np.bincount(place)[place] >= FEWEST_REPEATS
     names, first, place = np.unique(place[repeated], return_index=True, return_inverse=True)
     if len(names) < FEWEST_PLACES or np.mean(repeated) < REPEATED_SHARE:
         return None
-    columns = pose_columns(T_base_gripper[repeated][first])
-    return _between_against_within(misses[repeated], place, columns, level)
-
-
-def find_places(T_base_gripper: Floats) -> Integers:
-    """A number, 0 or more, for the place of each pose (n, 4, 4), n >= 2: (n,).
-
-    Any two poses of a place are within 1 cm and 3 degrees (complete linkage), whatever the order.
-    """
-    from scipy.cluster.hierarchy import fcluster, linkage
-    from scipy.spatial.distance import pdist
-
-    turns = T_base_gripper[:, :3, :3].reshape(-1, 9) / np.sqrt(2)  # apart by the angle, if small
-    apart = np.maximum(
-        pdist(T_base_gripper[:, :3, 3]) / SAME_PLACE_M, pdist(turns) / SAME_PLACE_RAD
-    )
-    return np.asarray(fcluster(linkage(apart, "complete"), 1.0, "distance")) - 1
-
-
-def _between_against_within(
-    misses: Floats, place: Integers, columns: Floats, level: float
-) -> PlaceTest:
-    """The one-way comparison of misses (n, 3) in places (n,), at poses with columns (p, 3, 7)."""
-    from scipy.stats import f
-
-    n, places = len(misses), len(columns)
+    misses, columns = misses[repeated], pose_columns(T_base_gripper[repeated][first])
+    n, places = len(misses), len(names)
     inside = n - places
     means = np.stack([misses[place == one].mean(axis=0) for one in range(places)])
     rest = misses - means[place]
@@ -299,3 +275,18 @@ def _between_against_within(
     regression = pose_test(means, columns) if p_value < level else None
     follows = None if regression is None else regression.p_value
     return PlaceTest(p_value, n, means, float(np.sqrt(part)), S, axes, follows)
+
+
+def find_places(T_base_gripper: Floats) -> Integers:
+    """A number, 0 or more, for the place of each pose (n, 4, 4), n >= 2: (n,).
+
+    Any two poses of a place are within 1 cm and 3 degrees (complete linkage), whatever the order.
+    """
+    from scipy.cluster.hierarchy import fcluster, linkage
+    from scipy.spatial.distance import pdist
+
+    turns = T_base_gripper[:, :3, :3].reshape(-1, 9) / np.sqrt(2)  # apart by the angle, if small
+    apart = np.maximum(
+        pdist(T_base_gripper[:, :3, 3]) / SAME_PLACE_M, pdist(turns) / SAME_PLACE_RAD
+    )
+    return np.asarray(fcluster(linkage(apart, "complete"), 1.0, "distance")) - 1

@@ -15,22 +15,13 @@ from coursekit.attribution.verdict import Conclusion
 from coursekit.budget.view import GRIPPER_DOWN
 from coursekit.geometry import make_transform
 
-
-@dataclass(frozen=True)
-class Sizes:
-    """How large each part of a miss is, m: the length of the constant that all trials share, the
-    std of the scatter on one axis, and the rms over the table of what follows the pose."""
-
-    constant_m: float = 0.0
-    scatter_m: float = 0.002
-    by_pose_m: float = 0.0
-
-
-SIZES: dict[Conclusion, Sizes] = {
-    "calibration": Sizes(constant_m=0.003),
-    "perception": Sizes(),
-    "pose_dependent": Sizes(by_pose_m=0.004),  # the lesson's arm is wrong by 2 to 4 mm
-    "cannot_tell_yet": Sizes(5e-4, 0.006),  # 30 trials do not show so small a constant
+# The length of the constant that all trials share, the std of the scatter on one axis, and the rms
+# over the table of what follows the pose
+SIZES_M: dict[Conclusion, tuple[float, float, float]] = {
+    "calibration": (0.003, 0.002, 0.0),
+    "perception": (0.0, 0.002, 0.0),
+    "pose_dependent": (0.0, 0.002, 0.004),  # the lesson's arm is wrong by 2 to 4 mm
+    "cannot_tell_yet": (0.0005, 0.006, 0.0),  # 30 trials do not show so small a constant
 }
 TABLE_GRASPS = 400  # with known joint angles, drawn from
 RADIUS_M, AZIMUTH_RAD, HEIGHT_M = (0.2, 0.42), 1.0, (0.01, 0.1)
@@ -70,15 +61,17 @@ def simulate_misses(kind: Conclusion, n: int, seed: int) -> SimulatedMisses:
     >>> grasps.misses.shape, round(1000 * float(np.linalg.norm(grasps.constant_m)), 1)
     ((5, 3), 3.0)
     """
-    sizes = SIZES[checks.choice("kind", kind, SIZES)]
+    constant_m, scatter_m, by_pose_m = SIZES_M[checks.choice("kind", kind, SIZES_M)]
     checks.whole("n", n)
     rng = np.random.default_rng([seed, zlib.crc32(b"misses")])
     q, poses = _table_grasps()
     chosen = rng.choice(len(q), n, replace=n > len(q))
     direction = rng.standard_normal(3)
-    constant = sizes.constant_m * direction / np.linalg.norm(direction)
-    by_pose = sizes.by_pose_m * slipped_joints(rng.standard_normal(6))[chosen]
-    misses = constant + by_pose + sizes.scatter_m * rng.standard_normal((n, 3))
+    constant = constant_m * direction / np.linalg.norm(direction)
+    ratio, by_pose = rng.standard_normal(6), np.zeros((n, 3))
+    if by_pose_m:
+        by_pose = by_pose_m * slipped_joints(ratio)[chosen]
+    misses = constant + by_pose + scatter_m * rng.standard_normal((n, 3))
     return SimulatedMisses(misses, poses[chosen], q[chosen], kind, constant, by_pose)
 
 

@@ -148,9 +148,9 @@ class Evidence:
         return min(1.0, len(found) * min(found)) if found else None
 
     @property
-    def pose_cause(self) -> Cause | None:
+    def pose_cause(self) -> Cause:
         """What "the pose does not matter" rests on: the repeats; without them, the regression."""
-        return None if self.p_pose is None else self.by_place or self.by_pose
+        return self.by_place or self.by_pose
 
     def pose_may_hide(self, size_m: float, spread: float) -> bool:
         """Whether what follows the pose, at poses spread so, may hide behind a mean of size_m.
@@ -194,7 +194,7 @@ def decide(seen: Evidence, length_m: float, matters_m: float) -> Decision:
     """
     n, of_size = seen.n, f"{1e3 * matters_m:.0f} mm"
     neither = [partial(seen.constant.shows, matters_m)]
-    if seen.pose_cause is not None:
+    if seen.p_pose is not None:
         neither.append(partial(seen.pose_cause.shows, matters_m))
     if n < FEWEST_TRIALS:
         says = f"{n} trials decide nothing, {FEWEST_TRIALS} are the fewest"
@@ -288,78 +288,66 @@ class Attribution:
     sentence. more_trials: how many more would settle it, 0 where it is settled, None where 500
     would not do. remedy: what to do about it.
 
-    n: trials. mean_m (3,), interval_m (3, 2), scatter_m (3,): mean miss along the base's axes, its
-    95 % interval axis by axis, and the std of one trial. p_mean: of "the mean is zero", by
-    Hotelling's T^2 and the pooled test joined (`mean_test` has both). p_pose: of "the pose does not
-    matter", by the regression (`pose_test`) and, where places were repeated, by the places
-    (`place_test`) joined with Bonferroni; each None where it could not be had.
-
-    power_mean, power_pose: how surely a constant, or a part that follows the pose (rms; with
-    repeats, any difference between the places), of matters_m would be found in n such trials.
+    mean_m (3,), interval_m (3, 2), scatter_m (3,): mean miss along the base's axes, its 95 %
+    interval axis by axis, and the std of one trial. evidence: each test, and how surely it would
+    have found what it looks for. matters_m: the size that is worth finding.
     """
 
     verdict: Conclusion
     says: str
     more_trials: int | None
     remedy: str
-    n: int
     mean_m: Floats
     interval_m: Floats
     scatter_m: Floats
-    mean_test: MeanTest
-    pose_test: PoseTest | None
-    place_test: PlaceTest | None
-    p_pose: float | None
-    power_mean: float
-    power_pose: float | None
+    evidence: Evidence
     matters_m: float
 
-    @property
-    def p_mean(self) -> float:
-        """How often misses with a mean of zero look at least this constant."""
-        return self.mean_test.p_value
-
-    @property
-    def evidence(self) -> tuple[str, ...]:
+    def lines(self) -> list[str]:
         """The numbers behind the verdict, a line each, mm."""
+        seen, pose, place = self.evidence, self.evidence.pose, self.evidence.places
         axes = ", ".join(
             f"{axis} {1e3 * mean:+.1f} ({1e3 * low:+.1f} to {1e3 * high:+.1f})"
             for axis, mean, (low, high) in zip("xyz", self.mean_m, self.interval_m, strict=True)
         )
         scatter = ", ".join(f"{1e3 * std:.1f}" for std in self.scatter_m)
-        test, find = self.mean_test, f"power to find {1e3 * self.matters_m:.0f} mm"
-        t2 = "" if test.t2 is None else f"; T² = {test.t2:.1f}, alone {_p(test.p_t2)}"
+        t2 = (
+            "" if seen.mean.t2 is None else f"; T² = {seen.mean.t2:.1f}, alone {_p(seen.mean.p_t2)}"
+        )
+        find = f"; power to find {1e3 * self.matters_m:.0f} mm: "
+        constant = seen.constant.power(self.matters_m, seen.n)
         lines = [
             f"mean miss {axes} mm (95 %)",
             f"scatter of one trial {scatter} mm along x, y, z",
-            f"mean of zero: {_p(self.p_mean)}{t2}; {find}: {self.power_mean:.0%}",
-            "not tested against the pose: an arm error that follows it is not ruled out",
+            f"mean of zero: {_p(seen.mean.p_value)}{t2}{find}{constant:.0%}",
         ]
-        if self.pose_test is not None:
-            shares = [f"{name} {share:.0%}" for name, share in self.pose_test.shares.items()]
-            lines[-1] = (
-                f"pose does not matter: {_p(self.pose_test.p_value)}; the part that follows it "
-                f"{1e3 * self.pose_test.part_m:.1f} mm rms"
-                + f"; of the scatter, alone: {', '.join(shares)}"
-                * bool(shares)
+        if pose is not None:
+            shares = [f"{name} {share:.0%}" for name, share in pose.shares.items()]
+            alone = f"; of the scatter, alone: {', '.join(shares)}" if shares else ""
+            lines.append(
+                f"pose does not matter: {_p(pose.p_value)}; the part that follows it "
+                f"{1e3 * pose.part_m:.1f} mm rms{alone}"
             )
-        if self.place_test is not None:
-            place = self.place_test
-            both = "" if self.pose_test is None else f"; with the line above {_p(self.p_pose)}"
+        else:
+            lines.append(
+                "not tested against the pose: an arm error that follows it is not ruled out"
+            )
+        if place is not None:
+            both = f"; with the line above {_p(seen.p_pose)}" if pose is not None else ""
             lines.append(
                 f"{place.places} places repeated, {place.trials} trials: place does not matter: "
                 f"{_p(place.p_value)}{both}; places differ by {1e3 * place.part_m:.1f} mm rms, "
                 f"repeats in one by {1e3 * place.scatter_m:.1f} mm"
             )
-        if self.power_pose is not None:
-            lines[-1] += f"; {find}: {self.power_pose:.0%}"
-        return tuple(lines)
+        if seen.p_pose is not None:
+            lines[-1] += f"{find}{seen.pose_cause.power(self.matters_m, seen.n):.0%}"
+        return lines
 
     def __repr__(self) -> str:
         name = self.verdict.replace("_", " ").upper()
         lines = [
-            wrapped(f"{name} ({self.n} trials): {self.says}."),
-            *(wrapped(line, first="  ", indent="    ") for line in self.evidence),
+            wrapped(f"{name} ({self.evidence.n} trials): {self.says}."),
+            *(wrapped(line, first="  ", indent="    ") for line in self.lines()),
             wrapped(f"What to do: {self.remedy}."),
         ]
         if self.verdict == "cannot_tell_yet":
@@ -417,20 +405,9 @@ def attribute(
     seen = Evidence.of(rows, poses)
     center, scatter = rows.mean(axis=0), rows.std(axis=0, ddof=1)
     half = float(t.ppf((1 + COVERAGE) / 2, n - 1)) * scatter / np.sqrt(n)
-    return Attribution(
-        *decide(seen, float(np.linalg.norm(center)), matters_m),
-        n=n,
-        mean_m=center,
-        interval_m=np.column_stack([center - half, center + half]),
-        scatter_m=scatter,
-        mean_test=seen.mean,
-        pose_test=seen.pose,
-        place_test=seen.places,
-        p_pose=seen.p_pose,
-        power_mean=seen.constant.power(matters_m, n),
-        power_pose=None if seen.pose_cause is None else seen.pose_cause.power(matters_m, n),
-        matters_m=matters_m,
-    )
+    interval = np.column_stack([center - half, center + half])
+    decision = decide(seen, float(np.linalg.norm(center)), matters_m)
+    return Attribution(*decision, center, interval, scatter, seen, matters_m)
 
 
 def _p(value: float | None) -> str:
