@@ -125,17 +125,13 @@ def published_noise() -> list[PublishedNoise]:
     >>> [(len(series.distances_m), series.camera) for series in published_noise()]
     [(6, 'D435'), (5, 'D435')]
     """
-    series = json.loads((DATA / "published_depth_noise.json").read_text("utf-8"))["series"]
-    return [
-        PublishedNoise(
-            **{
-                key: tuple(entry[key]) if isinstance(entry[key], list) else entry[key]
-                for key in PublishedNoise.__dataclass_fields__
-            }
-        )
-        for entry in series
-        if "std_mm" in entry
-    ]
+    published = []
+    for entry in json.loads((DATA / "published_depth_noise.json").read_text("utf-8"))["series"]:
+        if "std_mm" in entry:
+            known: dict[str, Any] = {key: entry[key] for key in PublishedNoise.__dataclass_fields__}
+            known |= {key: tuple(known[key]) for key in ("distances_m", "std_mm")}
+            published.append(PublishedNoise(**known))
+    return published
 
 
 @cache
