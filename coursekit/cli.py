@@ -138,14 +138,14 @@ def _record(options: argparse.Namespace) -> None:
 
 def _board(options: argparse.Namespace) -> None:
     from coursekit.boards import Board, save_sheet
-    from coursekit.boards.sheet import describe
+    from coursekit.boards.sheet import caption
 
     fields = {"dictionary": options.dictionary} if options.dictionary else {}
     if options.marker_mm is not None:
         fields["marker_m"] = options.marker_mm / 1000
     board = Board(options.kind, options.squares, options.square_mm / 1000, **fields)
     path = save_sheet(board, options.out, options.paper, overwrite=options.overwrite)
-    print(f"Wrote {path}: {describe(board)}.")
+    print(f"Wrote {path}: {caption(board)}.")
     print("Print at 100 %, check that the bar measures 100 mm, and glue it flat to glass.")
     print(f"In Python: {board!r}")
 
