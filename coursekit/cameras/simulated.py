@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from coursekit.boards import Board
-    from coursekit.simulation import View
+    from coursekit.simulation import RigView
     from coursekit.specifications import Unit
 
 FRAMES_PER_S = 30
@@ -131,7 +131,7 @@ class SimulatedCamera(Camera):
         self._given = 0
         self._place_name, self._distance_m = ("60 mm block", 0.45) if scene is None else ("", 0.0)
         self.scene = _scene(self._place_name, self._distance_m) if scene is None else scene
-        self._view: View | None = None
+        self._view: RigView | None = None
         self._shown: tuple[Board, NDArray[np.float64]] | None = None
         self._ambient, self._exposure = ambient, exposure
         self.set(ambient, exposure, depth_scale_m)
@@ -266,7 +266,7 @@ class SimulatedCamera(Camera):
         self._drift_from_s = self._rng.uniform(0.0, 1000.0 * DRIFT_TIME_S)
         self._since_placed_s = 0.0
 
-    def _look(self) -> View:
+    def _look(self) -> RigView:
         if self._view is None:
             self._view = self._rig.look_at(self.scene)
         return self._view
