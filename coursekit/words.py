@@ -52,7 +52,7 @@ def html_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """The same as an HTML table; text is escaped."""
 
     def row(tag: str, cells: Sequence[str]) -> str:
-        texts = (f"<{tag} style='text-align:left'>{html.escape(c)}</{tag}>" for c in cells)
+        texts = (f'<{tag} style="text-align: left">{html.escape(c)}</{tag}>' for c in cells)
         return f"<tr>{''.join(texts)}</tr>"
 
     return f"<table>{row('th', head)}{''.join(row('td', cells) for cells in rows)}</table>"

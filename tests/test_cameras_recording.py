@@ -48,7 +48,7 @@ class RandomCamera(Camera):
         self.baseline_m, self.depth_scale_m, self.n = baseline_m, scale_m, n
         self.infrared = infrared
 
-    def _stream(self):
+    def stream(self):
         rng = np.random.default_rng(11)
         for number in range(1, self.n + 1):
             depth = rng.integers(0, 65536, (self.depth.height, self.depth.width), np.uint16)
@@ -105,7 +105,7 @@ def test_round_trip(rs, tmp_path, color):
             assert played.color is None
             assert played.T_color_depth is None
             assert "no colour" in repr(played)
-    for mine, theirs in zip(camera._stream(), frames, strict=True):
+    for mine, theirs in zip(camera.stream(), frames, strict=True):
         assert theirs.number == mine.number
         assert theirs.time_s == pytest.approx(mine.time_s, abs=1e-8)
         np.testing.assert_array_equal(theirs.depth, mine.depth)
@@ -121,7 +121,7 @@ def test_infrared_round_trip(rs, tmp_path, color):
     camera = RandomCamera(n=12, color=color, infrared=True)
     with open_camera(camera.record(tmp_path / "a.db3", 12, infrared=True)) as played:
         for _ in range(3):
-            for mine, theirs in zip(camera._stream(), played.frames(12), strict=True):
+            for mine, theirs in zip(camera.stream(), played.frames(12), strict=True):
                 assert theirs.number == mine.number
                 np.testing.assert_array_equal(theirs.depth, mine.depth)
                 np.testing.assert_array_equal(theirs.infrared, mine.infrared)
@@ -174,7 +174,7 @@ def test_no_frame_is_lost_by_a_slow_reader(rs, tmp_path):
     path = RandomCamera(n=10).record(tmp_path / "a.db3", 10)
     with open_camera(path) as played:
         numbers = []
-        for frame in played._stream():
+        for frame in played.stream():
             numbers.append(frame.number)
             time.sleep(0.04)  # longer than the recorded pace
     assert numbers == [7 * k for k in range(1, 11)]
@@ -186,7 +186,7 @@ def test_other_streams_in_a_recording_do_not_disturb(rs, tmp_path):
     record_with_infrared(rs, path, camera)
     with open_camera(path) as played:
         frames = played.frames(6)
-    for mine, theirs in zip(camera._stream(), frames, strict=True):
+    for mine, theirs in zip(camera.stream(), frames, strict=True):
         np.testing.assert_array_equal(theirs.depth, mine.depth)
         np.testing.assert_array_equal(theirs.color, mine.color)
 
@@ -195,8 +195,8 @@ def test_memory_does_not_grow_while_recording(rs, tmp_path):
     """300 depth images are 244 MB; without flow control librealsense keeps most of them waiting."""
     resource = pytest.importorskip("resource")
     camera = RandomCamera(n=1, color=False, size=(848, 480))
-    frame = next(camera._stream())
-    camera._stream = lambda: (replace(frame, number=k, time_s=k / 30) for k in range(1, 301))
+    frame = next(camera.stream())
+    camera.stream = lambda: (replace(frame, number=k, time_s=k / 30) for k in range(1, 301))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     camera.record(tmp_path / "long.db3", 300)
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
@@ -208,13 +208,13 @@ def test_memory_does_not_grow_while_recording(rs, tmp_path):
 
 
 def ending_after(camera: Camera, k: int, with_what: BaseException) -> None:
-    stream = camera._stream
+    stream = camera.stream
 
     def shortened():
         yield from itertools.islice(stream(), k)
         raise with_what
 
-    camera._stream = shortened
+    camera.stream = shortened
 
 
 def test_ctrl_c_keeps_what_came(rs, tmp_path, capsys):
@@ -242,7 +242,7 @@ def test_ctrl_c_between_colour_and_depth_leaves_whole_frames(rs, tmp_path, monke
     path = camera.record(tmp_path / "a.db3", 9)
     assert "holds the 2 frames" in capsys.readouterr().out
     with open_camera(path) as played:
-        for mine, theirs in zip(camera._stream(), played.frames(2), strict=False):
+        for mine, theirs in zip(camera.stream(), played.frames(2), strict=False):
             np.testing.assert_array_equal(theirs.color, mine.color)
             np.testing.assert_array_equal(theirs.depth, mine.depth)
 
@@ -553,7 +553,7 @@ def record_raw(rs, path, camera, form, pixels):
         writer = Writer(rs, path, camera)
     finally:
         recording._video_stream = video_stream
-    for frame in camera._stream():
+    for frame in camera.stream():
         writer.add(replace(frame, color=pixels))
     writer.close()
 
@@ -585,7 +585,7 @@ def record_with_infrared(rs, path, camera):
         rs.recorder = recorder
     writer._streams |= streams
     streams.clear()
-    for frame in camera._stream():
+    for frame in camera.stream():
         writer.add(frame)
     writer.close()
     recording._restore_order(path)  # as write_recording does

@@ -14,14 +14,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from coursekit.cameras.guidance import guidance, middle_of, outline
+from coursekit.cameras.live_view import LiveImage
 from scipy.spatial.transform import Rotation
 
 from coursekit.boards import Board, Detection, detect, detect_all
 from coursekit.cameras import Camera, CameraError, Frame, live_view
 from coursekit.cameras import capture as module
 from coursekit.cameras.capture import capture, is_new, is_still
-from coursekit.cameras.guidance import guidance, middle_of, outline
-from coursekit.cameras.live_view import LiveImage
 from coursekit.cameras.simulated import SimulatedCamera
 from coursekit.geometry import Intrinsics, make_transform, project, transform_points
 from coursekit.simulation.board_images import render_board
@@ -64,7 +64,7 @@ class HeldBoard(Camera):
         self.locked = self.streams = 0
         self.shown = []  # what each frame showed: the number of a pose, or None on the way
 
-    def _stream(self):
+    def stream(self):
         self.streams += 1
         for number, T in enumerate(self.poses):
             rng = np.random.default_rng(0)

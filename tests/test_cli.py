@@ -118,7 +118,7 @@ def test_a_camera_that_fails_at_once(error, code, tmp_path, monkeypatch, capsys)
         raise error
         yield
 
-    monkeypatch.setattr(SimulatedCamera, "_stream", fail)
+    monkeypatch.setattr(SimulatedCamera, "stream", fail)
     arguments = ["record", "--out", str(tmp_path / "a.db3"), "--frames", "3"]
     assert cli.main([*arguments, "--camera", "simulated"]) == code
     assert capsys.readouterr().err.startswith("coursekit: ")

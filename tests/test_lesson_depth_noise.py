@@ -11,7 +11,6 @@ import pytest
 from test_lessons import own_results  # noqa: F401
 
 from coursekit import stereo
-from coursekit.lessons.checkpoints import Choice
 from coursekit.lessons.depth_noise import (
     CHECKPOINTS,
     DEPTH_NOISE,
@@ -20,6 +19,7 @@ from coursekit.lessons.depth_noise import (
     OBJECTIVES,
     ROBUST_DEPTH,
 )
+from coursekit.lessons.questions import Choice
 from tools import build_notebooks
 
 BY_NAME = {c.name.partition(".")[2]: c for c in CHECKPOINTS}

@@ -13,12 +13,12 @@ import pytest
 
 from coursekit import lessons
 from coursekit.lessons import progress
-from coursekit.lessons.checkpoints import EXAMPLES, Choice, Number, _panel
 from coursekit.lessons.exercises import Exercise, _as_numbers, _run
-from coursekit.lessons.verdict import Verdict
+from coursekit.lessons.progress import Verdict
+from coursekit.lessons.questions import EXAMPLES, Choice, Number, _panel
 
-EXERCISES = lessons.exercises()
-CHECKPOINTS = lessons.checkpoints()
+EXERCISES = lessons.EXERCISES
+CHECKPOINTS = lessons.CHECKPOINTS
 each_exercise = pytest.mark.parametrize("exercise", EXERCISES.values(), ids=EXERCISES.keys())
 
 

@@ -215,7 +215,7 @@ def test_a_single_recording_says_that_it_cannot_be_rearranged(recorded_set, tmp_
 def test_ctrl_c_keeps_the_scenes_so_far(tmp_path, capsys, monkeypatch):
     real_library()
     with SimulatedCamera() as camera:
-        stream = camera._stream
+        stream = camera.stream
 
         def interrupted_in_the_second_scene():
             for count, frame in enumerate(stream()):
@@ -223,7 +223,7 @@ def test_ctrl_c_keeps_the_scenes_so_far(tmp_path, capsys, monkeypatch):
                     raise KeyboardInterrupt
                 yield frame
 
-        monkeypatch.setattr(camera, "_stream", interrupted_in_the_second_scene)
+        monkeypatch.setattr(camera, "stream", interrupted_in_the_second_scene)
         folder = camera.record_set(tmp_path / "set", BLOCK, [0.30, 0.45, 0.60], 3)
     assert capsys.readouterr().out.endswith(
         "holds the 1 frames so far.\nThe set set holds 60 mm block at 0.300, 0.450 m.\n"

@@ -212,11 +212,11 @@ def test_a_hidden_source_is_collapsed():
 
 def test_every_checkpoint_keeps_its_explanation_closed(pages):
     text = "".join(str(page) for page in pages.values())
-    for name, checkpoint in ck.lessons.checkpoints().items():
+    for name, checkpoint in ck.lessons.CHECKPOINTS.items():
         assert text.count(f'ck.checkpoint("{name}").answer(') == 1, name
         assert checkpoint.explanation().headline.split(":")[0] in text.replace("&amp;", "&")
     closed = [d for p in pages.values() for d in p.select(".output details")]
-    assert len(closed) == len(ck.lessons.checkpoints())
+    assert len(closed) == len(ck.lessons.CHECKPOINTS)
     assert not any(details.has_attr("open") for details in closed)
 
 

@@ -5,8 +5,12 @@ learner who holds it would write, so a wrong function can be compared with each 
 same cases, and with each pair of them. Only an exact match is named: the nearest wrong model
 misleads as soon as there are two mistakes. To add a misconception, write the wrong step:
 
-    @PROJECT.mistake("read", "your p1 and p2 are swapped", "Which of the two multiplies r² + 2x²?")
+    @PROJECT.mistake("read")
     def p1_p2_swapped(k1, k2, p1, p2, k3):
+        '''your p1 and p2 are swapped
+
+        Which of the two multiplies r² + 2x²?
+        '''
         return k1, k2, p2, p1, k3
 """
 
@@ -23,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from coursekit.lessons import progress
-from coursekit.lessons.verdict import Verdict
+from coursekit.lessons.progress import Verdict
 
 Step = Callable[..., Any]
 Model = Callable[..., Any]
@@ -94,12 +98,21 @@ class Exercise:
         return self.name.rpartition(".")[2]
 
     def mistake(
-        self, step: str, says: str, ask: str, name: str | None = None, alone: bool = False
+        self, step: str, same_as: Step | None = None, name: str = "", alone: bool = False
     ) -> Callable[[Step], Step]:
-        """Decorator that adds a misconception, named after the function unless `name` is given."""
+        """Decorator that adds a wrong step, whose name is the misconception's.
+
+        Its docstring is what the student reads: what is wrong, then, after an empty line, a
+        question that leads on. same_as: an earlier wrong step, where this is only another way to
+        write the same misconception; its name and words are taken. name: where the function needs
+        another one.
+        """
 
         def add(wrong: Step) -> Step:
-            self.mistakes.append(Mistake(name or wrong.__name__, step, says, ask, wrong, alone))
+            origin = same_as or wrong
+            says, _, ask = (origin.__doc__ or "").partition("\n\n")
+            texts = (" ".join(text.split()) for text in (says, ask))
+            self.mistakes.append(Mistake(name or origin.__name__, step, *texts, wrong, alone))
             return wrong
 
         return add

@@ -93,7 +93,7 @@ class Handed:
         return "\n".join([self.headline, *(f"- {line}" for line in self.says)])
 
     def _repr_html_(self) -> str:
-        from coursekit.lessons.verdict import Verdict
+        from coursekit.lessons.progress import Verdict
 
         kind = "not attempted" if self.path is None else "wrong" if self.says else "right"
         return Verdict("submit", kind, self.headline, self.says)._repr_html_()  # type: ignore[arg-type]

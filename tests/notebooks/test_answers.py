@@ -11,7 +11,7 @@ import coursekit as ck
 from tools import build_notebooks
 
 PATHS = build_notebooks.find([])
-EXERCISES = ck.lessons.exercises()
+EXERCISES = ck.lessons.EXERCISES
 
 
 def parts_of(path):

@@ -5,10 +5,10 @@ import re
 import pytest
 
 import coursekit as ck
-from coursekit.lessons.checkpoints import Choice, Number
+from coursekit.lessons.questions import Choice, Number
 from tools import build_notebooks
 
-CHECKPOINTS = ck.lessons.checkpoints()
+CHECKPOINTS = ck.lessons.CHECKPOINTS
 CALL = re.compile(r'^ck\.checkpoint\("([\w.]+)"\)$')
 each = pytest.mark.parametrize("checkpoint", CHECKPOINTS.values(), ids=list(CHECKPOINTS))
 
