@@ -136,16 +136,16 @@ def _collect(album: Album, shots: Generator[Shot, None, None], views: int) -> No
 
 
 def _summary(camera: Camera, album: Album, views: int, before: int) -> str:
-    have = len(album.views)
+    have, where = len(album.views), album.folder.name
     if have == before:
         return (
-            f"{before} views of the {camera.name} were in {album.folder.name} already, none was "
+            f"{before} views of the {camera.name} were in {where} already, none was "
             "taken: ask for more, or start again with overwrite=True."
         )
     count = f"{have} views" if have >= views else f"{have} of {views} views"
-    moved = isinstance(camera, SimulatedCamera)
-    how = ": there is no board to hold, so the simulated camera was moved" if moved else ""
-    return f"{count} of the {camera.name} in {album.folder.name}{how}."
+    moved = ": there is no board to hold, so the simulated camera was moved"
+    how = moved if isinstance(camera, SimulatedCamera) else ""
+    return f"{count} of the {camera.name} in {where}{how}."
 
 
 # --- where views come from ---

@@ -169,16 +169,18 @@ class SimulatedCamera(Camera):
         while not self._closed:
             view, color = _view(self._rig, self.scene), self.color_image()
             shot = view.frame(self._rng, self._drift_from_s + self._since_placed_s)
+            scale_m, number, eyes = self.depth_scale_m, self._given, (shot.left, shot.right)
+            depth, time_s = view.depth(shot, scale_m), number / FRAMES_PER_S
             yield Frame(
-                view.depth(shot, self.depth_scale_m),
+                depth,
                 color,
-                self.depth_scale_m,
-                self._given / FRAMES_PER_S,
-                self._given,
+                scale_m,
+                time_s,
+                number,
                 self.depth,
                 self.color,
                 self.T_color_depth,
-                (shot.left, shot.right),
+                eyes,
             )
 
     def color_image(self) -> Image:
@@ -229,15 +231,9 @@ def _hidden_truth(seed: int, unit: Unit) -> HiddenTruth:
     rng = np.random.default_rng([seed, zlib.crc32(b"hidden truth")])
     error = rng.choice([-1.0, 1.0]) * rng.uniform(*BASELINE_ERROR)
     offset_px = OFFSET_PX * rng.standard_normal()
-    return HiddenTruth(
-        unit.baseline_m * (1.0 + error),
-        unit.baseline_m,
-        float(offset_px),
-        DRIFT_PX,
-        DRIFT_TIME_S,
-        _true_lens(seed, unit.color),
-        unit.color,
-    )
+    baselines_m = unit.baseline_m * (1.0 + error), unit.baseline_m
+    lenses = _true_lens(seed, unit.color), unit.color
+    return HiddenTruth(*baselines_m, float(offset_px), DRIFT_PX, DRIFT_TIME_S, *lenses)
 
 
 def _true_lens(seed: int, reported: Intrinsics) -> Intrinsics:
