@@ -123,12 +123,12 @@ class Board:
         """(width, height) of the printed pattern, m, without the white paper around it."""
         return self.squares[0] * self.square_m, self.squares[1] * self.square_m
 
-    @cached_property
+    @property
     def middle(self) -> Floats:
         """The middle of the pattern in the board frame, (3,) m, wherever the origin is."""
-        return _frozen(self.points.mean(axis=0))
+        return self.points.mean(axis=0)
 
-    @cached_property
+    @property
     def T_board_sheet(self) -> Floats:
         """Sheet frame to board frame, (4, 4).
 
@@ -139,14 +139,14 @@ class Board:
         right, down = np.sign(np.diag(image_from_board)[:2])
         offset = self.square_m * (image_from_board[:2, 2] + 0.5)
         turn = np.diag([right, down, right * down])
-        return _frozen(invert_transform(make_transform(turn, (*offset, 0.0))))
+        return invert_transform(make_transform(turn, (*offset, 0.0)))
 
-    @cached_property
+    @property
     def outline(self) -> Floats:
         """The pattern's outer corners in the board frame, (4, 3) m, clockwise from its top left."""
         wide, high = self.size_m
         sheet = [[0.0, 0.0, 0.0], [wide, 0.0, 0.0], [wide, high, 0.0], [0.0, high, 0.0]]
-        return _frozen(transform_points(self.T_board_sheet, sheet))
+        return transform_points(self.T_board_sheet, sheet)
 
     @property
     def text(self) -> str:
