@@ -23,9 +23,9 @@ from scipy.spatial.transform import Rotation
 from coursekit import checks
 from coursekit.arrays import ArrayLike, Floats, Grey, NDArray
 from coursekit.boards import Board
-from coursekit.geometry import Intrinsics, deproject, invert_transform, pixel_grid, transform_points
+from coursekit.geometry import Intrinsics, invert_transform, transform_points
 from coursekit.simulation.raycast import WOOD, texture_factor
-from coursekit.simulation.scenes import MAPLE, TABLE_THICK_M, WALL_PAINT, Box, Scene
+from coursekit.simulation.scenes import MAPLE, TABLE_THICK_M, WALL_PAINT, Box, Scene, corner_rays
 
 # --- kernels, compiled by numba ---
 
@@ -60,7 +60,7 @@ def unroll(poses: Any, bow: Any, rays: Any, out: Any) -> None:
     """Write where the pixels' corners are on the sheet, (n, H + 1, W + 1, 2) m, NaN for nowhere.
 
     poses (n, 1 or H + 1, 12): at n moments of the exposure, of each row of corners where rows are
-    exposed at different times. rays (H + 1, W + 1, 2): of the pixels' corners, at Z = 1.
+    exposed at different times. rays (H + 1, W + 1, 3): of the pixels' corners, at Z = 1.
     """
     for v in prange(rays.shape[0]):
         for moment in range(poses.shape[0]):
@@ -298,13 +298,13 @@ def _poses(
 def _radiance(board: Board, poses: Floats, lens: Intrinsics, bow_m: float) -> Floats:
     """The light (h, w) on the sensor without the lens's blur, 1 for white paper below the lamp."""
     sheet, edges = _sheet(board)
-    rays, pixel = _corner_rays(lens), 1.0 / lens.fx
+    rays, pixel = corner_rays(lens), 1.0 / lens.fx
     lamp = np.array([*board.size_m, 0.0]) / 2 + LAMP_FROM_MIDDLE_M
     texels_per_m = TEXELS_PER_SQUARE / board.square_m
     place = np.array([-MARGIN * board.square_m, texels_per_m, THICK_M, TABLE_LIGHT, *lamp])
     across, down = board.square_m * (np.array(board.corners) - 1)  # z points away from the viewer
     bow = np.array([*np.array(board.size_m) / 2, -bow_m, 4.0 / (across**2 + down**2)])
-    corners = np.empty((len(poses), *rays.shape))
+    corners = np.empty((len(poses), *rays.shape[:2], 2))
     unroll(poses, bow, rays, corners)
     light = np.empty((lens.height, lens.width))
     light_up(poses, rays, corners, sheet, edges, place, pixel, light)
@@ -334,11 +334,3 @@ def _sheet(board: Board) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     flat[:, :-1] &= framed[:, :-1] == framed[:, 1:]
     edges = cv2.distanceTransform(flat, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
     return sheet, np.ascontiguousarray(edges, np.float32)
-
-
-@lru_cache(maxsize=4)
-def _corner_rays(lens: Intrinsics) -> Floats:
-    """Where the rays of the pixels' corners are at Z = 1 m, (h + 1, w + 1, 2), NaN for no ray."""
-    corners = pixel_grid(lens.width + 1, lens.height + 1) - 0.5
-    rays = deproject(corners, np.ones(corners.shape[:2]), lens.K, lens.dist)
-    return np.ascontiguousarray(rays[..., :2])

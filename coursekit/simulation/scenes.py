@@ -8,6 +8,7 @@ and the exact image of it: depth and box at every pixel's centre, and a readable
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -206,14 +207,21 @@ def render(
     color = np.empty((height, width, 3), np.uint8)
     paint = np.array([box.color for box in scene]).reshape(-1, 3)
     textures = np.array([TEXTURES.index(box.texture) for box in scene], np.int64)
-    corners = rays(intrinsics, pixel_grid(width + 1, height + 1) - 0.5)
-    raycast.render_color(boxes, paint, textures, corners, LAMP_M, 1.0 / intrinsics.fx, color)
+    corners, pixel = corner_rays(intrinsics), 1.0 / intrinsics.fx
+    raycast.render_color(boxes, paint, textures, corners, LAMP_M, pixel, color)
     return RenderResult(depth, index, color)
 
 
 def rays(intrinsics: Intrinsics, pixels: Floats) -> Floats:
     """The points at Z = 1 m behind pixels (H, W, 2): (H, W, 3), NaN where there is none."""
     return deproject(pixels, np.ones(pixels.shape[:2]), intrinsics.K, intrinsics.dist)
+
+
+@lru_cache(maxsize=4)
+def corner_rays(intrinsics: Intrinsics) -> Floats:
+    """The points at Z = 1 m behind the pixels' corners, (H + 1, W + 1, 3), NaN for no ray."""
+    width, height = intrinsics.size
+    return rays(intrinsics, pixel_grid(width + 1, height + 1) - 0.5)
 
 
 def box_table(scene: Scene, T_scene_camera: ArrayLike | None) -> Floats:
