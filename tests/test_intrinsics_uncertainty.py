@@ -205,7 +205,7 @@ def test_a_very_distant_point_is_a_direction(result) -> None:
 
 def test_projection_covariance_is_that_of_perturbed_fits(result) -> None:
     """Draws of intrinsics and poses from the joint covariance, projected one by one."""
-    from coursekit.intrinsics.derivatives import moved
+    from coursekit.geometry import moved
     from coursekit.intrinsics.fit import parameter_vector, with_parameters
 
     rng = np.random.default_rng(3)

@@ -62,16 +62,6 @@ def twist_columns(points: Floats, by_point: Floats) -> Floats:
     return np.concatenate([rotation, by_point], axis=-1)
 
 
-def moved(T: Floats, twists: Floats) -> Floats:
-    """exp(xi) T for transforms (n, 4, 4) and twists (n, 6), with R = exp(omega), t = v."""
-    from scipy.spatial.transform import Rotation
-
-    step = np.broadcast_to(np.eye(4), T.shape).copy()
-    step[:, :3, :3] = Rotation.from_rotvec(twists[:, :3]).as_matrix()
-    step[:, :3, 3] = twists[:, 3:]
-    return step @ T
-
-
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
     """J'J of parameters that all views share and six of a pose a view, poses eliminated.
