@@ -29,8 +29,15 @@ from coursekit.arm import ArmErrors, SimulatedArm, widowx
 from coursekit.arrays import Floats, NDArray
 from coursekit.boards import Board, BoardNotFound, Detection, Detections, detect
 from coursekit.boards.detector import SESSION
-from coursekit.geometry import invert_transform, make_transform, project, transform_points
-from coursekit.hand_eye.poses import Mount, camera_board, check_mount, turned
+from coursekit.checks import choice
+from coursekit.geometry import (
+    invert_transform,
+    make_transform,
+    project,
+    transform_points,
+    turned,
+)
+from coursekit.hand_eye.poses import MOUNTS, Mount, camera_board
 from coursekit.hand_eye.session import HandEyeSession
 from coursekit.simulation.arm_poses import (
     BORDER_PX,
@@ -158,7 +165,7 @@ def default_setup(mount: Mount) -> Setup:
     The lens is that of the unit in data/devices.toml.
     """
     arm = widowx()
-    if check_mount(mount) == "eye_in_hand":
+    if choice("mount", mount, MOUNTS) == "eye_in_hand":
         lens, board = device("D405").unit.color, TABLE_BOARD
         return Setup(arm, mount, arm.T_gripper_camera, board_on_table(board), lens, board)
     lens, board = device("D435").unit.color, HELD_BOARD
@@ -225,7 +232,11 @@ def truth_of(folder: str | os.PathLike[str]) -> HandEyeTruth:
     card = json.loads(path.read_text("utf-8"))
     if card.get("source") != SIMULATED:
         raise ValueError(f"folder: {path.parent.name} is no simulated session; nobody knows its X")
-    mount, seed, views = check_mount(card["mount"]), int(card["seed"]), int(card["views"])
+    mount, seed, views = (
+        choice("mount", card["mount"], MOUNTS),
+        int(card["seed"]),
+        int(card["views"]),
+    )
     return _poses(mount, seed, views, ArmErrors(), HandEyeMistakes())[0]
 
 
