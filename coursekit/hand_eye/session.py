@@ -112,7 +112,9 @@ class HandEyeSession:
         checked: dict[str, Any] = {"T_base_gripper": poses, "seen": seen}
         for name, width in (("q", (6,)), ("dq", (6,)), ("times", ())):
             if getattr(self, name) is not None:
-                checked[name] = array(name, getattr(self, name), (n, *width), finite=True)
+                checked[name] = array(name, getattr(self, name), (n, *width))
+                for i, row in enumerate(checked[name]):
+                    want(np.isfinite(row).all(), f"{name}[{i}]", row, "finite numbers")
         want(self.dq is None or self.q is not None, "q", None, "the joint angles of these dq")
         checked["names"] = self.names or tuple(f"view {i:02d}" for i in range(n))
         want(len(checked["names"]) == n, "names", len(checked["names"]), f"{n}, one a view")
