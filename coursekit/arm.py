@@ -69,9 +69,8 @@ class Arm:
 
     joints: their names. origins (6, 4, 4): each joint's frame in its parent's at angle zero, m.
     axes (6, 3): unit vectors in the joint's own frame. limits (6, 2): lower and upper, rad.
-    velocity_rad_s (6,): the largest. T_flange_gripper, T_gripper_camera (4, 4): the gripper in
-    the flange (`link_6`), and the camera's colour optical frame in the gripper. The table is the
-    plane z = 0 of the base.
+    T_flange_gripper, T_gripper_camera (4, 4), m: the gripper in the flange (`link_6`), and the
+    camera's colour optical frame in the gripper. The table is the plane z = 0 of the base.
     """
 
     name: str
@@ -79,10 +78,8 @@ class Arm:
     origins: Floats
     axes: Floats
     limits: Floats
-    velocity_rad_s: Floats
     T_flange_gripper: Floats
     T_gripper_camera: Floats
-    source: str
 
     def forward(self, q: ArrayLike, tool: Tool = "gripper") -> Floats:
         """T_base_gripper (..., 4, 4), or T_base_flange, at joint angles q (..., 6), rad.
@@ -194,7 +191,12 @@ class Arm:
         shape = targets.shape[:-2]
         targets = targets.reshape(-1, 4, 4)
         q, reached = np.zeros((len(targets), 6)), np.zeros(len(targets), bool)
-        starts = [*np.array(IK_STARTS), *self._more_starts()] if elsewhere or start is None else []
+        starts: list[Floats] = []
+        if elsewhere or start is None:
+            low, high = self.limits.T
+            more = np.random.default_rng(0).uniform(low, high, (IK_MORE_STARTS, 6))
+            more *= [0.5, 1.0, 1.0, 1.0, 1.0, 1.0]  # joint_0 roughly towards the target
+            starts += [*np.array(IK_STARTS), *more]
         if start is not None:
             starts.insert(0, np.broadcast_to(_angles(start), (*shape, 6)).reshape(-1, 6))
         towards = np.arctan2(targets[:, 1, 3], targets[:, 0, 3])
@@ -207,11 +209,6 @@ class Arm:
                 q0[:, 0] += towards[open_]
             q[open_], reached[open_] = self._descend(targets[open_], q0)
         return q.reshape(*shape, 6), reached.reshape(shape)
-
-    def _more_starts(self) -> Floats:
-        low, high = self.limits.T
-        starts = np.random.default_rng(0).uniform(low, high, (IK_MORE_STARTS, 6))
-        return starts * [0.5, 1.0, 1.0, 1.0, 1.0, 1.0]  # joint_0 roughly towards the target
 
     def _descend(self, targets: Floats, q: Floats) -> tuple[Floats, Mask]:
         q = self._into_limits(q)
@@ -268,10 +265,8 @@ def widowx() -> Arm:
         np.stack([_chain([joint]) for joint in joints]),
         np.array([joint["axis"] for joint in joints], dtype=np.float64),
         np.array([joint["limit_rad"] for joint in joints], dtype=np.float64),
-        np.array([joint["velocity_rad_s"] for joint in joints], dtype=np.float64),
         T_flange_gripper,
         invert_transform(T_flange_gripper) @ _chain(table["camera"]),
-        table["source"],
     )
     for value in vars(arm).values():
         if isinstance(value, np.ndarray):
@@ -433,18 +428,16 @@ class ArmTruth:
     arm: Arm
 
     def __repr__(self) -> str:
-        def listed(values: Floats, digits: int) -> str:
-            return ", ".join(f"{value:+.{digits}f}" for value in values)
-
-        length = 1e3 * np.linalg.norm(self.link[:, 3:], axis=1)
-        angle = np.degrees(np.linalg.norm(self.link[:, :3], axis=1))
+        length, angle = np.linalg.norm(self.link.reshape(7, 2, 3)[:, ::-1], axis=2).T
+        rows = (
+            ("joint offsets", "+.3f", np.degrees(self.offset_rad), "deg"),
+            ("half gear play", ".3f", np.degrees(self.play_rad), "deg"),
+            ("link errors", ".2f", 1e3 * length, "mm"),
+            ("and", ".2f", np.degrees(angle), "deg"),
+        )
         return "\n".join(
-            [
-                f"joint offsets    {listed(np.degrees(self.offset_rad), 3)} deg",
-                f"half gear play   {', '.join(f'{p:.3f}' for p in np.degrees(self.play_rad))} deg",
-                f"link errors      {', '.join(f'{d:.2f}' for d in length)} mm",
-                f"and              {', '.join(f'{a:.2f}' for a in angle)} deg",
-            ]
+            f"{what:16} {', '.join(f'{value:{form}}' for value in values)} {unit}"
+            for what, form, values, unit in rows
         )
 
 

@@ -18,8 +18,7 @@ from coursekit.arm import ArmErrors, widowx
 from coursekit.boards import Board
 from coursekit.geometry import invert_transform, pose_difference, project, turned
 from coursekit.hand_eye.poses import by_arm_twist, by_X_and_Y, camera_board
-from coursekit.hand_eye.session import board_gap
-from coursekit.hand_eye.views import PixelViews, PoseViews
+from coursekit.hand_eye.views import PixelViews, PoseViews, board_gap
 
 NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 SESSIONS = 1000 if NIGHTLY else 20
@@ -142,7 +141,6 @@ def test_joint_offsets_come_out_where_the_poses_show_them(mount):
     session = replace(session, T_base_gripper=arm.forward(q), q=q)
     result, plain = session.solve(free_offsets=True), session.solve()
     found = np.array([result.value(f"offset_{joint}") for joint in range(6)])
-    np.testing.assert_array_equal(found, result.joint_offsets_rad)
     sigma = np.array([result.sigma(f"offset_{joint}") for joint in range(6)])
     assert (np.abs(found - offsets) < 4 * sigma).all()
     assert sigma[1:5].max() < np.radians(0.05)

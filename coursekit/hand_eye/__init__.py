@@ -23,22 +23,18 @@ from coursekit.hand_eye.closed_form import (
     translation_half,
 )
 from coursekit.hand_eye.diagnosis import diagnose
-from coursekit.hand_eye.planning import HeldOut, NextPose, held_out, next_pose
-from coursekit.hand_eye.poses import MOUNTS, Observability, observability
+from coursekit.hand_eye.planning import held_out, next_pose
+from coursekit.hand_eye.poses import MOUNTS, observability
 from coursekit.hand_eye.session import METHODS, HandEyeResult, HandEyeSession, solve
-from coursekit.hand_eye.views import BoardPose, board_poses
+from coursekit.hand_eye.views import board_poses
 
 __all__ = [
     "CLOSED_FORMS",
     "METHODS",
     "MOUNTS",
-    "BoardPose",
     "HandEyeResult",
     "HandEyeSession",
-    "HeldOut",
-    "NextPose",
     "NotDetermined",
-    "Observability",
     "SolverFailed",
     "StudyPoint",
     "board_poses",

@@ -25,20 +25,14 @@ from coursekit.hand_eye.poses import (
     check_poses,
 )
 from coursekit.hand_eye.refinement import arm_poses_with
-from coursekit.hand_eye.session import (
-    HandEyeResult,
-    HandEyeSession,
-    board_gap,
-    rms_length,
-    view_residuals,
-)
-from coursekit.hand_eye.views import PixelViews
+from coursekit.hand_eye.session import HandEyeResult, HandEyeSession
+from coursekit.hand_eye.views import PixelViews, board_gap, rms_length, view_residuals
 
 CORNER_PX = 0.1  # corner noise where no images have told
 ROOM_PX = 10.0  # that a proposed view leaves between the board and the image's border
 LEAST_FACING = 0.5  # cosine between the board's normal and the line of sight: 60 deg
 NEARER_THAN_EVER, FARTHER_THAN_EVER = 0.6, 1.5  # times the nearest and farthest view so far
-DRAW_RAD, DRAWN, CANDIDATES = 0.35, 4000, 400  # std about known joints; how many, how many stay
+DRAW_RAD, DRAWN, PROPOSALS = 0.35, 4000, 400  # std about known joints; how many, how many stay
 UNKNOWN_POSE = np.repeat([10.0, 10.0], 3)  # prior std, rad and m: keeps what is unknown finite
 
 
@@ -196,7 +190,7 @@ def _drawn(result: HandEyeResult, seed: int) -> Floats:
     drawn = np.concatenate([near, arm.random(rng, DRAWN)])
     drawn = drawn[arm.within_limits(drawn)]
     drawn = drawn[_in_view(result, arm.forward(drawn))]
-    return rng.permutation(drawn[arm.is_free(drawn)])[:CANDIDATES]
+    return rng.permutation(drawn[arm.is_free(drawn)])[:PROPOSALS]
 
 
 def _seen_with(result: HandEyeResult) -> tuple[Board, Intrinsics]:

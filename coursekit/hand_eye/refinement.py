@@ -106,7 +106,7 @@ class Problem:
         )
 
     @cached_property
-    def _shared(self) -> Floats:
+    def shared(self) -> Floats:
         """(n, 6, k): what one standard deviation of each shared error does at each pose."""
         if self.fk is None:
             return np.zeros((len(self.T_base_gripper), 6, 0))
@@ -130,13 +130,8 @@ class Problem:
     @cached_property
     def prior(self) -> Floats:
         """The information (g,) of the priors on the shared unknowns."""
-        free, k = np.zeros(12 + self.free_scale), self._shared.shape[2]
+        free, k = np.zeros(12 + self.free_scale), self.shared.shape[2]
         return np.concatenate([free, self._offset_sigma**-2.0, np.ones(k)])
-
-    def start(self, X: Floats, Y: Floats) -> State:
-        """Where the iteration starts: no offsets, no errors, the board as it says it is."""
-        n, _, k = self._shared.shape
-        return State(X, Y, 1.0, np.zeros(6), np.zeros(k), np.zeros((n, 6)))
 
     def values(self, state: State) -> Floats:
         """The unknowns `names` (g,): rad, m, and 0 for a rotation, which is counted from X or Y."""
@@ -151,7 +146,7 @@ class Problem:
 
     def arm_twists(self, state: State) -> Floats:
         """The estimated errors of the arm's poses, (n, 6)."""
-        shared = self._shared @ state.shared
+        shared = self.shared @ state.shared
         if self.fk is None:
             return shared
         return shared + np.einsum("nij,nj->ni", self._own_root, state.own)
@@ -217,7 +212,7 @@ class Problem:
             # The estimated turn is a vector that grows: exp(a + b) = exp((1 + [a]x / 2) b) exp(a)
             twists = self.arm_twists(state)
             by_arm[..., :3] = by_arm[..., :3] @ (np.eye(3) + cross_matrix(twists[:, :3]) / 2)
-            columns.append(by_arm @ self._shared)
+            columns.append(by_arm @ self.shared)
         by_pose = np.concatenate(columns, axis=2)
         by_scale = np.zeros((n, 1, by_pose.shape[2]))
         by_scale[..., 12 : 12 + self.free_scale] = 1.0
@@ -293,22 +288,24 @@ class Refined:
     """Where the refinement ended.
 
     covariance (g, g): of the shared unknowns `problem.names`. squares: the sum in sigmas that were
-    assumed. noise: by what factor the assumed sigmas were too small, as the residuals say (1 where
-    priors fix the scale). converged: whether another step would change anything.
+    assumed; where no priors fix their scale the covariance is larger by what the residuals say.
+    converged: whether another step would change anything. levels: for poses, how much their
+    "rotation_rad" and "position_m" scatter along one axis.
     """
 
     problem: Problem
     state: State
     covariance: Floats
     squares: float
-    noise: float
     converged: bool
     levels: dict[str, float] = field(default_factory=dict)
 
 
-def refine(problem: Problem, X: Floats, Y: Floats) -> Refined:
+def refine_pixels(problem: Problem, X: Floats, Y: Floats) -> Refined:
     """The most probable state of a problem, from a start X, Y that is roughly right."""
-    state, equations, converged = _minimise(problem, problem.start(X, Y))
+    n, _, k = problem.shared.shape
+    start = State(X, Y, 1.0, np.zeros(6), np.zeros(k), np.zeros((n, 6)))
+    state, equations, converged = _minimise(problem, start)
     noise = 1.0
     if problem.fk is None:  # an error of the arm would count as noise: let the residuals say
         noise = np.sqrt(equations.squares / problem.dof)
@@ -316,7 +313,7 @@ def refine(problem: Problem, X: Floats, Y: Floats) -> Refined:
     if problem.arm is not None:  # priors are absolute, the rest is in units of the noise
         reduced = reduced + (noise**2 - 1) * np.diag(problem.prior)
     covariance = noise**2 * scaled_inverse(reduced)
-    return Refined(problem, state, covariance, equations.squares, float(noise), converged)
+    return Refined(problem, state, covariance, equations.squares, converged)
 
 
 def _minimise(problem: Problem, state: State) -> tuple[State, Equations, bool]:
@@ -337,20 +334,20 @@ def _minimise(problem: Problem, state: State) -> tuple[State, Equations, bool]:
 
 
 def refine_poses(problem: Problem, X: Floats, Y: Floats) -> Refined:
-    """`refine` on poses, estimating how much their rotations and positions scatter.
+    """`refine_pixels` on poses, estimating how much their rotations and positions scatter.
 
     Radians and metres must be weighed against each other. The weights are the scatter itself, one
     standard deviation for the rotations and one for the positions, repeated until they stay.
     Source: variance components, Förstner (1979).
     """
-    poses = problem.views.poses  # type: ignore[attr-defined]
+    poses = problem.views.poses  # type: ignore[union-attr]
     n = len(poses)
     levels = np.array([np.radians(0.1), 0.5e-3])
     half_dof = max(1.0, 3 * n - 6 - problem.free_scale / 2)
     for _ in range(LEVEL_ROUNDS):
         weights = np.diag(np.repeat(levels**-2.0, 3))
         views = PoseViews(poses, np.broadcast_to(weights, (n, 6, 6)))
-        refined = refine(replace(problem, views=views), X, Y)
+        refined = refine_pixels(replace(problem, views=views), X, Y)
         X, Y = refined.state.X, refined.state.Y
         predicted = refined.problem.camera_board(refined.state)
         predicted[:, :3, 3] /= refined.state.scale

@@ -44,6 +44,7 @@ from coursekit.geometry import (
     make_transform,
     pose_difference,
 )
+from coursekit.hand_eye import refinement, views
 from coursekit.hand_eye.closed_form import CLOSED_FORMS, FEWEST_POSES, closed_form
 from coursekit.hand_eye.poses import (
     FRAMES,
@@ -56,8 +57,6 @@ from coursekit.hand_eye.poses import (
     observability,
     stand_board,
 )
-from coursekit.hand_eye.refinement import Problem, Refined, arm_poses_with, refine, refine_poses
-from coursekit.hand_eye.views import BoardPose, PixelViews, PoseViews, Views, board_poses
 from coursekit.results import write_bytes
 from coursekit.words import Estimate, wrapped
 
@@ -66,7 +65,7 @@ POSES = "poses.csv"
 PLACE = ("x", "y", "z")
 TURN = ("qx", "qy", "qz", "qw")
 JOINTS = tuple(f"q{joint}" for joint in range(6))
-SPEEDS = tuple(f"d{name}" for name in JOINTS)
+OPTIONAL = {"times": ("time",), "q": JOINTS, "dq": tuple(f"d{name}" for name in JOINTS)}
 UNIT_TOLERANCE = 1e-3  # of a quaternion's length: four digits
 
 
@@ -110,9 +109,10 @@ class HandEyeSession:
         one_each = f"{n}, one for each arm pose (an image without a board takes its pose with it)"
         want(len(seen) == n, "seen", len(seen), one_each)
         checked: dict[str, Any] = {"T_base_gripper": poses, "seen": seen}
-        for name, width in (("q", (6,)), ("dq", (6,)), ("times", ())):
+        for name, columns in OPTIONAL.items():
             if getattr(self, name) is not None:
-                checked[name] = array(name, getattr(self, name), (n, *width))
+                shape = (n,) if name == "times" else (n, len(columns))
+                checked[name] = array(name, getattr(self, name), shape)
                 for i, row in enumerate(checked[name]):
                     want(np.isfinite(row).all(), f"{name}[{i}]", row, "finite numbers")
         want(self.dq is None or self.q is not None, "q", None, "the joint angles of these dq")
@@ -127,11 +127,11 @@ class HandEyeSession:
         return self.seen if isinstance(self.seen, Detections) else None
 
     @cached_property
-    def board_poses(self) -> tuple[BoardPose, ...]:
+    def board_poses(self) -> tuple[views.BoardPose, ...]:
         """What each image alone says of the board; () where only poses are known."""
         if self.detections is None or self.board is None or self.intrinsics is None:
             return ()
-        return tuple(board_poses(self.detections, self.board, self.intrinsics))
+        return tuple(views.board_poses(self.detections, self.board, self.intrinsics))
 
     @cached_property
     def T_camera_board(self) -> Floats:
@@ -147,11 +147,11 @@ class HandEyeSession:
         squares = sum(c * p.rms_px**2 for c, p in zip(counts, self.board_poses, strict=True))
         return max(math.sqrt(squares / max(1, 2 * counts.sum() - 6 * len(counts))), 1e-6)
 
-    def corners(self, sigma_px: float = 1.0) -> PixelViews:
+    def corners(self, sigma_px: float = 1.0) -> views.PixelViews:
         """The corners as the refinement takes them; ValueError where only poses are known."""
         if self.detections is None or self.board is None or self.intrinsics is None:
             raise ValueError("seen: poses have no residuals in px; want detections")
-        return PixelViews.of(self.detections, self.board, self.intrinsics, sigma_px)
+        return views.PixelViews.of(self.detections, self.board, self.intrinsics, sigma_px)
 
     def __len__(self) -> int:
         """How many pairs of arm pose and image."""
@@ -162,7 +162,7 @@ class HandEyeSession:
         which = np.asarray(which, int)
         rows: dict[str, Any] = {
             name: None if getattr(self, name) is None else getattr(self, name)[which]
-            for name in ("T_base_gripper", "q", "dq", "times")
+            for name in ("T_base_gripper", *OPTIONAL)
         }
         seen = self.seen.pick(which) if isinstance(self.seen, Detections) else self.seen[which]
         names = tuple(self.names[i] for i in which)
@@ -207,29 +207,21 @@ class HandEyeSession:
         board = board or _board(_from_card(card, "board"))
         intrinsics = intrinsics or Intrinsics.from_dict(_from_card(card, "intrinsics"))
         rows, skipped = _table(place)
-        files = [place / row.file for row in rows]
+        files = [place / file for file in rows]
         seen = detect_all(files, board, progress) if files else Detections()
-        found = {view.name: view for view in seen}
-        used = [row for row in rows if row.file in found]
         skipped += seen.skipped
+        found = {view.name: view for view in seen}
+        used = [file for file in rows if file in found]
         if len(used) < FEWEST_POSES:
             raise ValueError(
                 f"folder: {len(used)} usable pairs of arm pose and image in "
                 f"{os.fspath(folder)!r}, want at least {FEWEST_POSES}"
                 + "".join(f"; {skip!r}" for skip in skipped[:3])
             )
-        return cls(
-            mount,
-            np.stack([row.T_base_gripper for row in used]),
-            Detections([found[row.file] for row in used]),
-            board,
-            intrinsics,
-            _all_or_none(row.q for row in used),
-            _all_or_none(row.dq for row in used),
-            _all_or_none(row.time for row in used),
-            tuple(row.file for row in used),
-            tuple(skipped),
-        )
+        T, columns = _stacked(rows[file] for file in used)
+        seen = Detections(found[file] for file in used)
+        names, unused = tuple(used), tuple(skipped)
+        return cls(mount, T, seen, board, intrinsics, names=names, skipped=unused, **columns)
 
     def save(
         self,
@@ -264,10 +256,10 @@ class HandEyeSession:
         turns = Rotation.from_matrix(self.T_base_gripper[:, :3, :3]).as_quat(canonical=True)
         columns = [*PLACE, *TURN]
         blocks = [self.T_base_gripper[:, :3, 3], turns]
-        for names, values in ((("time",), self.times), (JOINTS, self.q), (SPEEDS, self.dq)):
-            if values is not None:
+        for name, names in OPTIONAL.items():
+            if getattr(self, name) is not None:
                 columns += names
-                blocks.append(values.reshape(len(self), -1))
+                blocks.append(getattr(self, name).reshape(len(self), -1))
         lines = [",".join(["file", *columns])]
         for name, row in zip(self.names, np.hstack(blocks), strict=True):
             lines.append(",".join([name, *(f"{value + 0.0:.8g}" for value in row)]))
@@ -275,17 +267,6 @@ class HandEyeSession:
 
 
 # --- reading a folder ---
-
-
-@dataclass(frozen=True, eq=False)
-class _Row:
-    """One usable row of poses.csv."""
-
-    file: str
-    T_base_gripper: Floats
-    q: Floats | None
-    dq: Floats | None
-    time: float | None
 
 
 class _BadRow(Exception):
@@ -318,12 +299,12 @@ def _board(card: dict[str, Any]) -> Board:
         raise ValueError(f"board: {SESSION} does not describe one ({error})") from error
 
 
-def _table(folder: Path) -> tuple[list[_Row], list[Skipped]]:
-    """The usable rows of poses.csv, and what is wrong with the others."""
+def _table(folder: Path) -> tuple[dict[str, dict[str, Any]], list[Skipped]]:
+    """The usable rows of poses.csv by their file, and what is wrong with the others."""
     path = folder / POSES
     if not path.exists():
         raise ValueError(f"folder: has no {POSES}, the table of arm poses")
-    rows: dict[str, _Row] = {}
+    rows: dict[str, dict[str, Any]] = {}
     skipped = []
     with path.open(newline="", encoding="utf-8-sig") as lines:
         table = csv.DictReader(lines, skipinitialspace=True)
@@ -339,7 +320,7 @@ def _table(folder: Path) -> tuple[list[_Row], list[Skipped]]:
             except _BadRow as reason:
                 where = f"{POSES}, line {table.line_num}" + (f" ({file})" if file else "")
                 skipped.append(Skipped(where, str(reason)))
-    return list(rows.values()), skipped
+    return rows, skipped
 
 
 def _check_columns(columns: set[str]) -> None:
@@ -353,25 +334,27 @@ def _check_columns(columns: set[str]) -> None:
         )
 
 
-def _read_row(file: str, cells: Mapping[str, str], columns: set[str], folder: Path) -> _Row:
+def _read_row(
+    file: str, cells: Mapping[str, str], columns: set[str], folder: Path
+) -> dict[str, Any]:
+    """T (4, 4), and of `OPTIONAL` what the table has, None for the rest."""
     if not file:
         raise _BadRow("no file is named")
     if not (folder / file).is_file():
         raise _BadRow("there is no such file in the folder")
-    q, dq, time = (
-        _numbers(cells, names) if columns.issuperset(names) else None
-        for names in (JOINTS, SPEEDS, ("time",))
-    )
-    if columns.issuperset((*PLACE, *TURN)):
-        place, turn = _numbers(cells, PLACE), _numbers(cells, TURN)
-        length = float(np.linalg.norm(turn))
-        if abs(length - 1) > UNIT_TOLERANCE:
-            raise _BadRow(f"the quaternion has length {length:.4g}, want 1")
-        T = make_transform(Rotation.from_quat(turn), place)
-    else:
-        assert q is not None
-        T = widowx().forward(q)
-    return _Row(file, T, q, dq, None if time is None else float(time[0]))
+    row: dict[str, Any] = {
+        name: _numbers(cells, names) if columns.issuperset(names) else None
+        for name, names in OPTIONAL.items()
+    }
+    if row["times"] is not None:
+        row["times"] = row["times"][0]
+    if not columns.issuperset((*PLACE, *TURN)):
+        return row | {"T": widowx().forward(row["q"])}
+    place, turn = _numbers(cells, PLACE), _numbers(cells, TURN)
+    length = float(np.linalg.norm(turn))
+    if abs(length - 1) > UNIT_TOLERANCE:
+        raise _BadRow(f"the quaternion has length {length:.4g}, want 1")
+    return row | {"T": make_transform(Rotation.from_quat(turn), place)}
 
 
 def _numbers(cells: Mapping[str, str], names: Sequence[str]) -> Floats:
@@ -388,9 +371,11 @@ def _numbers(cells: Mapping[str, str], names: Sequence[str]) -> Floats:
     return np.array(values)
 
 
-def _all_or_none(values: Iterable[Any]) -> Floats | None:
-    rows = list(values)
-    return None if any(row is None for row in rows) else np.array(rows)
+def _stacked(rows: Iterable[dict[str, Any]]) -> tuple[Floats, dict[str, Any]]:
+    """T_base_gripper (n, 4, 4), and of `OPTIONAL` what all rows have, None for the rest."""
+    T, *others = zip(*([row[name] for name in ("T", *OPTIONAL)] for row in rows), strict=True)
+    known = (None if any(row is None for row in rows) else np.array(rows) for rows in others)
+    return np.stack(T), dict(zip(OPTIONAL, known, strict=True))
 
 
 # --- where the camera is ---
@@ -446,12 +431,13 @@ def solve(
     X, Y, measured = _first(session, first, None if guess is None else transform("guess", guess))
     if method != "refine":
         return HandEyeResult(X, Y, method, session, measured)
-    views: Views = PoseViews(measured, np.zeros((0, 6, 6)))
-    if session.detections is not None:
-        views = session.corners(session.corner_sigma_px)
     arm, q = (session.arm, session.q) if free_offsets else (None, None)
-    problem = Problem(session.T_base_gripper, session.mount, views, free_scale, arm, q, fk)
-    best = (refine if session.detections is not None else refine_poses)(problem, X, Y)
+    seen: views.Views = views.PoseViews(measured, np.zeros((0, 6, 6)))
+    fit = refinement.refine_poses
+    if session.detections is not None:
+        seen, fit = session.corners(session.corner_sigma_px), refinement.refine_pixels
+    given = session.T_base_gripper, session.mount, seen
+    best = fit(refinement.Problem(*given, free_scale, arm, q, fk), X, Y)
     return HandEyeResult(best.state.X, best.state.Y, method, session, measured, best)
 
 
@@ -502,7 +488,7 @@ class HandEyeResult(Estimate):
     method: str
     session: HandEyeSession
     measured: Floats
-    refined: Refined | None = None
+    refined: refinement.Refined | None = None
 
     @property
     def mount(self) -> Mount:
@@ -512,7 +498,7 @@ class HandEyeResult(Estimate):
     # --- how well X is known ---
 
     @property
-    def _fit(self) -> Refined:
+    def _fit(self) -> refinement.Refined:
         if self.refined is None:
             raise ValueError(f"method: {self.method} gives no covariance; solve with 'refine'")
         return self.refined
@@ -567,11 +553,6 @@ class HandEyeResult(Estimate):
         """Real size of the board over the size it claims; 1 unless it was estimated."""
         return self.refined.state.scale if self.refined else 1.0
 
-    @property
-    def joint_offsets_rad(self) -> Floats:
-        """The estimated joint offsets (6,), to be added to the reported angles; 0 if not asked."""
-        return self.refined.state.offsets if self.refined else np.zeros(6)
-
     # --- what is left over ---
 
     @cached_property
@@ -584,7 +565,9 @@ class HandEyeResult(Estimate):
         if self.refined is None:
             return self.session.T_base_gripper
         problem = self.refined.problem
-        return arm_poses_with(self.refined, problem.T_base_gripper, problem.q, problem.fk)
+        return refinement.arm_poses_with(
+            self.refined, problem.T_base_gripper, problem.q, problem.fk
+        )
 
     @cached_property
     def T_camera_board(self) -> Floats:
@@ -594,12 +577,12 @@ class HandEyeResult(Estimate):
     @cached_property
     def residuals(self) -> tuple[Floats, ...]:
         """Observed - predicted of each view, (N_i, 2) px; ValueError without detections."""
-        return view_residuals(self.session.corners(), self.T_camera_board, self.scale)
+        return views.view_residuals(self.session.corners(), self.T_camera_board, self.scale)
 
     @property
     def rms_px(self) -> float:
         """Root mean square length of the residual vectors, px."""
-        return rms_length(np.concatenate(self.residuals))
+        return views.rms_length(np.concatenate(self.residuals))
 
     @cached_property
     def gap_m(self) -> Floats:
@@ -609,7 +592,9 @@ class HandEyeResult(Estimate):
         square over the corners, or at the origin where no board is known. Along the line of sight
         an image knows least, so this is larger than the residuals in px would say.
         """
-        return board_gap(self.measured, self.T_camera_board, self.session.board, self.scale)[0]
+        return views.board_gap(self.measured, self.T_camera_board, self.session.board, self.scale)[
+            0
+        ]
 
     @property
     def rms_mm(self) -> float:
@@ -622,26 +607,26 @@ class HandEyeResult(Estimate):
 
         Each pose puts the board somewhere on its stand (base or gripper): T X T_camera_board.
         """
-        seen = enlarged(self.measured, self.scale)
+        seen = views.enlarged(self.measured, self.scale)
         places = stand_board(self.T_base_gripper, seen, self.X, self.mount)[:, :3, 3]
-        return 1e3 * rms_length(places - places.mean(axis=0))
+        return 1e3 * views.rms_length(places - places.mean(axis=0))
 
     @property
     def gripper_twists(self) -> Floats:
         """From where the arm says the gripper is to where the camera implies, (n, 6), rad and m."""
-        M = self.X @ enlarged(self.measured, self.scale) @ invert_transform(self.Y)
+        M = self.X @ views.enlarged(self.measured, self.scale) @ invert_transform(self.Y)
         implied = M if self.mount == "eye_to_hand" else invert_transform(M)
         return pose_difference(self.T_base_gripper, implied)
 
     @property
     def spread_gripper_mm(self) -> float:
         """Root mean square distance at the gripper between what arm and camera say, mm."""
-        return 1e3 * rms_length(self.gripper_twists[:, 3:])
+        return 1e3 * views.rms_length(self.gripper_twists[:, 3:])
 
     @property
     def spread_gripper_deg(self) -> float:
         """Root mean square angle at the gripper between what arm and camera say, deg."""
-        return math.degrees(rms_length(self.gripper_twists[:, :3]))
+        return math.degrees(views.rms_length(self.gripper_twists[:, :3]))
 
     @property
     def excess(self) -> float:
@@ -778,41 +763,3 @@ class HandEyeResult(Estimate):
             f"explains: the arm errs, {said}, or a pair is wrong. The intervals are too narrow "
             "then."
         ]
-
-
-# --- distances between what is seen and what is expected ---
-
-
-def rms_length(vectors: Floats) -> float:
-    """Root mean square length of vectors (n, k)."""
-    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
-
-
-def enlarged(T: Floats, scale: float) -> Floats:
-    """Poses (n, 4, 4) of a board whose real size is `scale` times what they were measured with."""
-    T = T.copy()
-    T[:, :3, 3] *= scale
-    return T
-
-
-def view_residuals(corners: PixelViews, T: Floats, scale: float) -> tuple[Floats, ...]:
-    """Observed - predicted of each view, (N_i, 2) px, with the board at poses T (n, 4, 4)."""
-    return tuple(np.split(corners.residuals(T, scale), corners.starts[1:]))
-
-
-def board_gap(
-    seen: Floats, expected: Floats, board: Board | None, scale: float
-) -> tuple[Floats, Floats]:
-    """Distance between two poses (n, 4, 4) of a board, and its part along the line of sight, m.
-
-    Root mean square over the corners, (n,) each; at the board's origin where no board is known.
-    """
-    points = np.zeros((1, 3)) if board is None else scale * board.points
-    at, there = (
-        points @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
-        for T in (enlarged(seen, scale), expected)
-    )
-    sight = there / np.linalg.norm(there, axis=2, keepdims=True)
-    along = np.sum((at - there) * sight, axis=2)
-    gap = np.sum((at - there) ** 2, axis=2)
-    return np.sqrt(np.mean(gap, axis=1)), np.sqrt(np.mean(along**2, axis=1))

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -29,22 +28,6 @@ HOPELESS = 20.0  # times the better start's sum of squares: such a start is not 
 # the better one's variance, is larger by more than this: odds of 1 to 4,000.
 TOLD_APART = 2 * np.log(4000.0)
 ONE_POSE_RAD = np.radians(0.1)  # nearer than this two fits are one pose that was reached twice
-
-
-class Views(Protocol):
-    """What n views say about the poses of the board in them."""
-
-    @property
-    def observations(self) -> int:
-        """How many numbers were observed."""
-
-    def linear(self, T_camera_board: Floats, scale: float) -> tuple[Floats, Floats, Floats]:
-        """At poses (n, 4, 4): squares (n,), gradient (n, 7), information (n, 7, 7); whitened.
-
-        The gradient is J'r and the information J'J of the twist (omega, v) of each pose and of
-        the logarithm of the board's scale. Infinite squares for a board that reaches behind the
-        camera.
-        """
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +83,12 @@ class PixelViews:
         return self.pixels - pixels
 
     def linear(self, T_camera_board: Floats, scale: float) -> tuple[Floats, Floats, Floats]:
-        """See `Views`."""
+        """At poses (n, 4, 4): squares (n,), gradient (n, 7), information (n, 7, 7); whitened.
+
+        The gradient is J'r and the information J'J of the twist (omega, v) of each pose and of
+        the logarithm of the board's scale. Infinite squares for a board that reaches behind the
+        camera.
+        """
         at, arm = self.predicted(T_camera_board, scale)
         behind = np.logical_or.reduceat(at[:, 2] <= 0, self.starts)
         at[behind[self.view], 2] = 1.0
@@ -133,7 +121,10 @@ class PoseViews:
         return 6 * len(self.poses)
 
     def linear(self, T_camera_board: Floats, scale: float) -> tuple[Floats, Floats, Floats]:
-        """See `Views`. A board `scale` times larger than said shrinks all distances by as much."""
+        """As `PixelViews.linear`: at poses (n, 4, 4), and in rad and m where that is in px.
+
+        A board `scale` times larger than said shrinks all distances by as much.
+        """
         predicted = T_camera_board.copy()
         predicted[:, :3, 3] /= scale
         residuals = pose_difference(predicted, self.poses)
@@ -148,6 +139,9 @@ class PoseViews:
             np.einsum("nij,nj->ni", weighted, residuals),
             weighted @ columns,
         )
+
+
+Views = PixelViews | PoseViews
 
 
 # --- the board in one image ---
@@ -253,3 +247,41 @@ def _refined(T: Floats, seen: Detection, board: Board, intrinsics: Intrinsics) -
     refined = np.eye(4)
     refined[:3, :3], refined[:3, 3] = cv2.Rodrigues(rotation)[0], translation.ravel()
     return refined
+
+
+# --- distances between what is seen and what is expected ---
+
+
+def rms_length(vectors: Floats) -> float:
+    """Root mean square length of vectors (n, k)."""
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
+
+
+def enlarged(T: Floats, scale: float) -> Floats:
+    """Poses (n, 4, 4) of a board whose real size is `scale` times what they were measured with."""
+    T = T.copy()
+    T[:, :3, 3] *= scale
+    return T
+
+
+def view_residuals(corners: PixelViews, T: Floats, scale: float) -> tuple[Floats, ...]:
+    """Observed - predicted of each view, (N_i, 2) px, with the board at poses T (n, 4, 4)."""
+    return tuple(np.split(corners.residuals(T, scale), corners.starts[1:]))
+
+
+def board_gap(
+    seen: Floats, expected: Floats, board: Board | None, scale: float
+) -> tuple[Floats, Floats]:
+    """Distance between two poses (n, 4, 4) of a board, and its part along the line of sight, m.
+
+    Root mean square over the corners, (n,) each; at the board's origin where no board is known.
+    """
+    points = np.zeros((1, 3)) if board is None else scale * board.points
+    at, there = (
+        points @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
+        for T in (enlarged(seen, scale), expected)
+    )
+    sight = there / np.linalg.norm(there, axis=2, keepdims=True)
+    along = np.sum((at - there) * sight, axis=2)
+    gap = np.sum((at - there) ** 2, axis=2)
+    return np.sqrt(np.mean(gap, axis=1)), np.sqrt(np.mean(along**2, axis=1))
