@@ -14,8 +14,9 @@ import numpy as np
 from coursekit.arm import FkErrors
 from coursekit.arrays import ArrayLike, Floats, Mask
 from coursekit.boards import Board, Detection
+from coursekit.boards.view import seen
 from coursekit.checks import want
-from coursekit.geometry import Intrinsics, project
+from coursekit.geometry import Intrinsics
 from coursekit.hand_eye.poses import (
     IN_METRES,
     POSITION_M,
@@ -205,14 +206,11 @@ def _in_view(result: HandEyeResult, T_base_gripper: Floats) -> Mask:
     """(m,): whether the camera would see the whole board well from arm poses (m, 4, 4)."""
     board, intrinsics = _seen_with(result)
     C = camera_board(T_base_gripper, result.X, result.Y, result.mount)
-    at = board.points @ np.swapaxes(C[:, :3, :3], 1, 2) + C[:, None, :3, 3]
-    pixels = project(at, intrinsics.K, intrinsics.dist)
-    inside = (pixels > ROOM_PX) & (pixels < np.array(intrinsics.size) - 1 - ROOM_PX)
     facing, away = _facing(C, board)
     facing_so_far, away_so_far = _facing(result.T_camera_board, board)
     side = np.sign(np.median(facing_so_far))  # z may point into the board or out of it
     return (
-        inside.all(axis=(1, 2))
+        seen(board.points, C, intrinsics, ROOM_PX).all(axis=1)
         & (side * facing > LEAST_FACING)
         & (away > NEARER_THAN_EVER * away_so_far.min())
         & (away < FARTHER_THAN_EVER * away_so_far.max())
@@ -221,7 +219,7 @@ def _in_view(result: HandEyeResult, T_base_gripper: Floats) -> Mask:
 
 def _facing(C: Floats, board: Board) -> tuple[Floats, Floats]:
     """Cosine between the board's z axis and the line of sight (n,), and the distance (n,), m."""
-    centre = C[:, :3, :3] @ board.points.mean(axis=0) + C[:, :3, 3]
+    centre = C[:, :3, :3] @ board.middle + C[:, :3, 3]
     away = np.linalg.norm(centre, axis=1)
     return np.einsum("ni,ni->n", C[:, :3, 2], centre) / away, away
 

@@ -35,19 +35,19 @@ from coursekit.boards import Board, Detection, Detections
 from coursekit.geometry import Intrinsics, moved
 from coursekit.intrinsics.derivatives import (
     NormalEquations,
+    parameter_vector,
     project_with_derivatives,
+    selection,
     twist_columns,
+    with_parameters,
 )
 from coursekit.intrinsics.fit import (
     ARRIVED_PX,
     MIN_CORNERS,
     IntrinsicsResult,
-    _selection,
     evaluate,
-    p_text,
-    parameter_vector,
-    with_parameters,
 )
+from coursekit.words import p_text
 
 BOW, FOCUS, SHUTTER, LENS = "bowed_board", "focus_drift", "rolling_shutter", "lens_model"
 OWN = {FOCUS: 1, SHUTTER: 3}  # columns of the causes that each view has of its own
@@ -134,7 +134,7 @@ def begin(result: IntrinsicsResult) -> tuple[Model, Data]:
     n = len(detections)
     centre = points.mean(axis=0)
     half_diagonal = float(np.linalg.norm(points - centre, axis=1).max())
-    estimated = _selection(result.names)
+    estimated = selection(result.names)
     missing = int((~estimated[4:].any(axis=1)).sum())
     model = Model(
         result.intrinsics, estimated, result.T_camera_board, centre, half_diagonal,
@@ -380,7 +380,7 @@ def _bow_step(
     shared, twists = bowed.equations.step()
     before = float(bowed.equations.residuals @ bowed.equations.residuals)
     for scale in 0.5 ** np.arange(HALVINGS):
-        change = result.selection @ (scale * shared[: len(result.names)])
+        change = selection(result.names) @ (scale * shared[: len(result.names)])
         parameters = parameter_vector(bowed.intrinsics) + change
         if (parameters[:2] <= 0).any():
             continue

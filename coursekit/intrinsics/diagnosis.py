@@ -21,7 +21,8 @@ import numpy as np
 
 from coursekit.arrays import ArrayLike, Floats
 from coursekit.boards import Board, Detection, Detections, Skipped
-from coursekit.geometry import check_transform, invert_transform
+from coursekit.checks import transforms
+from coursekit.geometry import invert_transform
 from coursekit.intrinsics import causes
 from coursekit.intrinsics.causes import Search
 from coursekit.intrinsics.comparison import halves
@@ -621,7 +622,7 @@ def _check_poses(
 ) -> Floats | None:
     if T_base_gripper is None:
         return None
-    poses = check_transform("T_base_gripper", T_base_gripper)
+    poses = transforms("T_base_gripper", T_base_gripper)
     if poses.shape != (len(detections), 4, 4):
         raise ValueError(
             f"T_base_gripper: got shape {poses.shape}, want ({len(detections)}, 4, 4), one a view"
