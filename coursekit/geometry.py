@@ -372,6 +372,61 @@ def cross_matrix(vectors: Floats) -> Floats:
     return matrix
 
 
+# --- small motions of a pose ---
+#
+# A twist is (omega, v), a rotation vector in rad and a displacement in m, along the axes of the
+# frame in which the pose is given. There are two ways to apply one, and they differ by omega x t:
+#
+#     turned   R <- exp(omega) R, t <- t + v               about the body's own origin
+#     moved    R <- exp(omega) R, t <- exp(omega) t + v    about the origin of that frame
+#
+# A covariance of the first can be read directly: v is what the body's position is off by. The
+# second is what happens to all points that are given in the frame: p <- exp(omega) p + v.
+
+
+def turned(T: Floats, twists: Floats) -> Floats:
+    """Poses T (..., 4, 4) turned and shifted about their own origins by twists (..., 6).
+
+    R <- exp(omega) R and t <- t + v, rad and m: `pose_difference(T, turned(T, xi))` is xi again.
+
+    >>> turned(np.eye(4), np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.2]))[:3, 3].tolist()
+    [0.1, 0.0, 0.2]
+    """
+    flat = np.broadcast_to(T, (*twists.shape[:-1], 4, 4)).reshape(-1, 4, 4).copy()
+    steps = twists.reshape(-1, 6)
+    flat[:, :3, :3] = Rotation.from_rotvec(steps[:, :3]).as_matrix() @ flat[:, :3, :3]
+    flat[:, :3, 3] += steps[:, 3:]
+    return flat.reshape(*twists.shape[:-1], 4, 4)
+
+
+def pose_difference(T: ArrayLike, to: ArrayLike) -> Floats:
+    """The twists (..., 6) that bring poses T (..., 4, 4) to other poses: the inverse of `turned`.
+
+    R_to = exp(omega) R and t_to = t + v; rad and m, along the axes of the frame of T.
+
+    >>> far = np.eye(4)
+    >>> far[:3, 3] = [0.1, 0.0, 0.2]
+    >>> pose_difference(np.eye(4), far).tolist()
+    [0.0, 0.0, 0.0, 0.1, 0.0, 0.2]
+    """
+    T, to = np.asarray(T, dtype=np.float64), np.asarray(to, dtype=np.float64)
+    turn = to[..., :3, :3] @ np.swapaxes(T[..., :3, :3], -1, -2)
+    omega = Rotation.from_matrix(turn.reshape(-1, 3, 3)).as_rotvec().reshape(*turn.shape[:-2], 3)
+    return np.concatenate([omega, to[..., :3, 3] - T[..., :3, 3]], axis=-1)
+
+
+def moved(T: Floats, twists: Floats) -> Floats:
+    """exp(xi) T: poses (n, 4, 4) carried along as twists (n, 6) move their whole frame.
+
+    exp(xi) has R = exp(omega), rad, and t = v, m; T turns about the frame's origin and not, as in
+    `turned`, about its own.
+    """
+    step = np.broadcast_to(np.eye(4), T.shape).copy()
+    step[:, :3, :3] = Rotation.from_rotvec(twists[:, :3]).as_matrix()
+    step[:, :3, 3] = twists[:, 3:]
+    return step @ T
+
+
 # --- what a camera's numbers must be ---
 
 
