@@ -31,6 +31,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from coursekit import results
+from coursekit.words import counted
 
 Condition = Literal["ok", "note", "problem"]
 
@@ -99,9 +100,8 @@ def run(camera: str = "auto") -> int:
     for line in checks(camera):
         print(line, flush=True)
         found[line.verdict] += 1
-    problems = found["problem"]
-    if problems:
-        print(f"\n{problems} problem{'s' * (problems != 1)}: do what stands there, and ask again.")
+    if problems := found["problem"]:
+        print(f"\n{counted(problems, 'problem')}: do what stands there, and ask again.")
         return 1
     print("\nNothing is in the way. `python3 course.py lab` opens the notebooks.")
     return 0
@@ -312,8 +312,7 @@ def _cameras(which: str) -> Iterator[CheckUp]:
 
     named = os.environ.get(VARIABLE, "auto") if which == "auto" else which
     if named != which:
-        says = f"{VARIABLE} names {named!r}, so nothing else is looked for"
-        yield CheckUp("ok", says)
+        yield CheckUp("ok", f"{VARIABLE} names {named!r}, so nothing else is looked for")
     if named == "simulated" or Path(named).is_dir():  # a set opens its files, and says so
         yield from _tested(named)
         return
@@ -328,10 +327,8 @@ def _cameras(which: str) -> Iterator[CheckUp]:
         return
     version = getattr(rs, "__version__", "")
     yield CheckUp("ok", f"pyrealsense2 {version} loads", check="Driver")
-    if named == "auto" or named.isdecimal():
-        yield from _live(rs, named)
-    else:
-        yield from _tested(named)
+    live = named == "auto" or named.isdecimal()
+    yield from _live(rs, named) if live else _tested(named)
 
 
 def _live(rs: Any, named: str) -> Iterator[CheckUp]:
@@ -368,10 +365,11 @@ def _udev() -> CheckUp:
     """Whether Linux would let this user open a camera once it is plugged in."""
     from coursekit.cameras.librealsense import UDEV_ADVICE
 
-    rules = [rule for folder in UDEV_FOLDERS for rule in folder.glob("*realsense*.rules")]
+    for folder in UDEV_FOLDERS:
+        for rules in folder.glob("*realsense*.rules"):
+            return CheckUp("ok", f"{rules}")
     says = "none for a RealSense: without them only root may use a real camera"
-    advice = f"before you plug one in: {UDEV_ADVICE}"
-    return _ok_if(bool(rules), f"{rules[0]}" if rules else says, advice)
+    return CheckUp("note", says, f"before you plug one in: {UDEV_ADVICE}")
 
 
 def _device(rs: Any, device: Any) -> Iterator[CheckUp]:

@@ -140,7 +140,7 @@ def save(
         camera.source,
         camera.name,
         now(),
-        _versions(),
+        versions(),
         dict(quantities),
         dict(covariances),
     )
@@ -230,7 +230,7 @@ def _path(lesson: str) -> Path:
     return folder() / f"{lesson}.json"
 
 
-def _versions() -> dict[str, str]:
+def versions() -> dict[str, str]:
     found = {"python": platform.python_version()}
     for name in ("coursekit", "numpy", "opencv-python-headless", "pyrealsense2"):
         try:

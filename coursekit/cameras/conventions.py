@@ -50,10 +50,8 @@ class Agreement:
     round_trip_px: float
 
     def __str__(self) -> str:
-        return (
-            f"{self.model:23} {self.coefficients:22} {self.project_px:8.3f} px"
-            f" {self.round_trip_px:8.3f} px"
-        )
+        errors = f"{self.project_px:8.3f} px {self.round_trip_px:8.3f} px"
+        return f"{self.model:23} {self.coefficients:22} {errors}"
 
 
 def measure() -> list[Agreement]:

@@ -20,7 +20,7 @@ import numpy as np
 from coursekit import specifications
 from coursekit.arrays import AnyArray, Image
 from coursekit.cameras.camera import Camera
-from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Frame
+from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Description, Frame
 from coursekit.cameras.librealsense import device_info, load_librealsense, start_problem
 from coursekit.cameras.recording import (
     Index,
@@ -469,8 +469,8 @@ def _decimal(value: float) -> float:
 def specified(name: str) -> specifications.Device | None:
     """The device of data/devices.toml that a camera of this name is, or a variant of, or None.
 
-    >>> specified("Intel RealSense D435i").name
-    'D435'
+    >>> specified("Intel RealSense D435i").nominal.baseline_m
+    0.05
     """
     devices = (d for d in specifications.device_names() if re.search(rf"\b{d}", name))
     found = next(devices, None)
@@ -486,35 +486,26 @@ class RecordedSet(Camera):
     Raises CameraError for a folder without a set, and for recordings that do not open.
     """
 
-    source = "recorded"
     can_place = True
 
     def __init__(self, folder: Path) -> None:
         self._index = Index.read(folder)
-        self._scene = self._index.scenes[0]
-        self._played = RealSense(path=folder / self._scene.file)
-        self._describe()
+        self._turn_to(self._index.scenes[0])
 
-    def _describe(self) -> None:
-        """Say of itself what the recording that is open says."""
-        played = self._played
-        self.name, self.serial = played.name, played.serial
-        self.depth, self.color = played.depth, played.color
-        self.baseline_m, self.depth_scale_m = played.baseline_m, played.depth_scale_m
-        self.T_color_depth = played.T_color_depth
-
-    def _turn_to(self, scene: RecordedScene) -> None:
-        """Open another recording; CameraError, and the one before, if it is of another camera."""
+    def _turn_to(self, scene: RecordedScene, before: RealSense | None = None) -> None:
+        """Open a recording, and say what it says; CameraError if another camera took it."""
         played = RealSense(path=self._index.folder / scene.file)
-        if played.serial != self.serial:
+        if before is not None and played.serial != before.serial:
             played.close()
             raise CameraError(
                 f"{scene.file} was recorded by another camera ({played.serial}, not "
-                f"{self.serial}): record one set with one camera"
+                f"{before.serial}): record one set with one camera"
             )
-        self.close()
+        if before is not None:
+            before.close()
         self._played, self._scene = played, scene
-        self._describe()
+        for name in set(Description.__annotations__) - {"can_place"}:
+            setattr(self, name, getattr(played, name))
 
     def __repr__(self) -> str:
         return (
@@ -531,7 +522,7 @@ class RecordedSet(Camera):
                 f"{self._index}"
             )
         if scene != self._scene:
-            self._turn_to(scene)
+            self._turn_to(scene, before=self._played)
 
     def lock(self) -> str:
         return self._played.lock()

@@ -141,8 +141,7 @@ def write_recording(
 
 def _check_target(path: str | os.PathLike[str], overwrite: bool) -> Path:
     target = Path(path).expanduser()
-    if target.suffix != ".db3":
-        raise ValueError(f"path: got {str(target)!r}, want a name that ends in .db3")
+    checks.want(target.suffix == ".db3", "path", str(target), "a name that ends in .db3")
     if not target.parent.is_dir():
         raise ValueError(f"path: there is no folder {target.parent}: make it first")
     if target.is_dir():

@@ -17,7 +17,7 @@ from coursekit.cameras.camera import Camera, HiddenTruth
 from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Frame
 from coursekit.cameras.recording import check_depth_scale, check_distance
 from coursekit.geometry import Intrinsics, invert_transform
-from coursekit.simulation import Rig, Scene, View, artefact_scene, render, tabletop, wall_scene
+from coursekit.simulation import Rig, RigView, Scene, artefact_scene, render, tabletop, wall_scene
 from coursekit.simulation.board_images import board_scene, check_pose, render_board
 from coursekit.specifications import Unit
 
@@ -169,16 +169,18 @@ class SimulatedCamera(Camera):
         while not self._closed:
             view, color = _view(self._rig, self.scene), self.color_image()
             shot = view.frame(self._rng, self._drift_from_s + self._since_placed_s)
+            scale_m, number, eyes = self.depth_scale_m, self._given, (shot.left, shot.right)
+            depth, time_s = view.depth(shot, scale_m), number / FRAMES_PER_S
             yield Frame(
-                view.depth(shot, self.depth_scale_m),
+                depth,
                 color,
-                self.depth_scale_m,
-                self._given / FRAMES_PER_S,
-                self._given,
+                scale_m,
+                time_s,
+                number,
                 self.depth,
                 self.color,
                 self.T_color_depth,
-                (shot.left, shot.right),
+                eyes,
             )
 
     def color_image(self) -> Image:
@@ -213,7 +215,7 @@ def _scene(name: str, distance_m: float) -> Scene:
 
 
 @lru_cache(maxsize=6)
-def _view(rig: Rig, scene: Scene) -> View:
+def _view(rig: Rig, scene: Scene) -> RigView:
     """The rig before a scene, 8 MB: who goes back to a distance does not wait for it again."""
     return rig.look_at(scene)
 
@@ -229,15 +231,9 @@ def _hidden_truth(seed: int, unit: Unit) -> HiddenTruth:
     rng = np.random.default_rng([seed, zlib.crc32(b"hidden truth")])
     error = rng.choice([-1.0, 1.0]) * rng.uniform(*BASELINE_ERROR)
     offset_px = OFFSET_PX * rng.standard_normal()
-    return HiddenTruth(
-        unit.baseline_m * (1.0 + error),
-        unit.baseline_m,
-        float(offset_px),
-        DRIFT_PX,
-        DRIFT_TIME_S,
-        _true_lens(seed, unit.color),
-        unit.color,
-    )
+    baselines_m = unit.baseline_m * (1.0 + error), unit.baseline_m
+    lenses = _true_lens(seed, unit.color), unit.color
+    return HiddenTruth(*baselines_m, float(offset_px), DRIFT_PX, DRIFT_TIME_S, *lenses)
 
 
 def _true_lens(seed: int, reported: Intrinsics) -> Intrinsics:

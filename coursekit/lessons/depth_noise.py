@@ -1,4 +1,4 @@
-"""Notebook 02: its checkpoints, its two exercises and the mistakes that people make in them."""
+"""Notebook 02: its two exercises and the mistakes that people make in them."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from coursekit import specifications
+from coursekit.arrays import Floats
 from coursekit.lessons.exercises import Exercise, Model, Step
 
-Array = np.ndarray
 Window = tuple[int, int, int, int]  # first row, the one after the last; the same for columns
 
 # --- depth_noise ---
@@ -285,7 +285,7 @@ def negative(sigma: Any) -> Any:
 # --- robust_depth ---
 
 
-def _depth_image() -> Array:
+def _depth_image() -> Floats:
     """A block before a wall, 16x12 px in metres: with zeros, NaN, infinity and flying pixels."""
     rng = np.random.default_rng(2)
     image = np.where(np.arange(16) < 9, 0.45, 0.95) * rng.normal(1.0, 0.01, (12, 16))
@@ -307,7 +307,7 @@ def _column_and_row(u: float, v: float) -> Any:
     return u, v
 
 
-def _no_shortcut(image: Array, row: int, column: int) -> Any:
+def _no_shortcut(image: Floats, row: int, column: int) -> Any:
     return None
 
 
@@ -319,19 +319,19 @@ def _window(row: int, column: int, half: int) -> Window:
     return row - half, row + half + 1, column - half, column + half + 1
 
 
-def _cut(image: Array, top: int, bottom: int, left: int, right: int) -> Array:
+def _cut(image: Floats, top: int, bottom: int, left: int, right: int) -> Floats:
     return image[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)]
 
 
-def _without_zeros(pixels: Array) -> Array:
+def _without_zeros(pixels: Floats) -> Floats:
     return pixels[pixels != 0]
 
 
-def _finite(pixels: Array) -> Array:
+def _finite(pixels: Floats) -> Floats:
     return pixels[np.isfinite(pixels)]
 
 
-def _enough(valid: Array, pixels: Array, min_valid: int) -> bool:
+def _enough(valid: Floats, pixels: Floats, min_valid: int) -> bool:
     return len(valid) >= min_valid
 
 
@@ -340,7 +340,7 @@ def _nan() -> float:
 
 
 def _build_robust_depth(steps: Mapping[str, Step]) -> Model:
-    def robust_depth(depth_m: Array, u: float, v: float, half: int = 2, min_valid: int = 5) -> Any:
+    def robust_depth(depth_m: Floats, u: float, v: float, half: int = 2, min_valid: int = 5) -> Any:
         column, row = (steps["round"](c) for c in steps["read"](u, v))
         alone = steps["shortcut"](depth_m, row, column)
         if alone is not None:
@@ -477,7 +477,7 @@ def half_halved(row: int, column: int, half: int) -> Window:
 
 
 @ROBUST_DEPTH.mistake("shortcut")
-def pixel_alone(image: Array, row: int, column: int) -> Any:
+def pixel_alone(image: Floats, row: int, column: int) -> Any:
     """where the pixel itself has a depth, you return that alone
 
     A flying pixel has a depth, too. Who would notice?
@@ -488,14 +488,14 @@ def pixel_alone(image: Array, row: int, column: int) -> Any:
 
 
 @ROBUST_DEPTH.mistake("shortcut", same_as=pixel_alone)
-def pixel_alone_unless_zero(image: Array, row: int, column: int) -> Any:
+def pixel_alone_unless_zero(image: Floats, row: int, column: int) -> Any:
     height, width = image.shape
     known = -height <= row < height and -width <= column < width  # -9 counts from the far end
     return image[row, column] if known and image[row, column] > 0 else None
 
 
 @ROBUST_DEPTH.mistake("cut")
-def negative_index(image: Array, top: int, bottom: int, left: int, right: int) -> Array:
+def negative_index(image: Floats, top: int, bottom: int, left: int, right: int) -> Floats:
     """near the left or top border an index goes negative, and Python counts that from the far end
 
     Try a list of ten numbers: what is `numbers[-2:3]`, and what is `numbers[-2]`?
@@ -504,23 +504,23 @@ def negative_index(image: Array, top: int, bottom: int, left: int, right: int) -
 
 
 @ROBUST_DEPTH.mistake("cut", same_as=negative_index)
-def negative_row(image: Array, top: int, bottom: int, left: int, right: int) -> Array:
+def negative_row(image: Floats, top: int, bottom: int, left: int, right: int) -> Floats:
     return image[top:bottom, max(left, 0) : max(right, 0)]
 
 
 @ROBUST_DEPTH.mistake("cut", same_as=negative_index)
-def negative_column(image: Array, top: int, bottom: int, left: int, right: int) -> Array:
+def negative_column(image: Floats, top: int, bottom: int, left: int, right: int) -> Floats:
     return image[max(top, 0) : max(bottom, 0), left:right]
 
 
 @ROBUST_DEPTH.mistake("cut", same_as=negative_index)
-def wrapped_pixel_by_pixel(image: Array, top: int, bottom: int, left: int, right: int) -> Array:
+def wrapped_pixel_by_pixel(image: Floats, top: int, bottom: int, left: int, right: int) -> Floats:
     height, width = image.shape
     return image[np.ix_(range(top, min(bottom, height)), range(left, min(right, width)))]
 
 
 @ROBUST_DEPTH.mistake("cut")
-def negative_end(image: Array, top: int, bottom: int, left: int, right: int) -> Array:
+def negative_end(image: Floats, top: int, bottom: int, left: int, right: int) -> Floats:
     """a window left of the image or above it has a negative *end*, and that wraps round, too
 
     You have looked after the first index of each slice. Where is the last one when u = -9?
@@ -529,7 +529,7 @@ def negative_end(image: Array, top: int, bottom: int, left: int, right: int) -> 
 
 
 @ROBUST_DEPTH.mistake("cut")
-def moved_inside(image: Array, top: int, bottom: int, left: int, right: int) -> Array:
+def moved_inside(image: Floats, top: int, bottom: int, left: int, right: int) -> Floats:
     """at the border you move the window into the image instead of cutting it off
 
     Is the pixel that was asked for still in the middle of what is there to see around it?
@@ -540,7 +540,7 @@ def moved_inside(image: Array, top: int, bottom: int, left: int, right: int) -> 
 
 
 @ROBUST_DEPTH.mistake("cut")
-def border_repeated(image: Array, top: int, bottom: int, left: int, right: int) -> Array:
+def border_repeated(image: Floats, top: int, bottom: int, left: int, right: int) -> Floats:
     """you count the pixels of the border more than once
 
     Does a pixel become more certain because the image ends beside it?
@@ -551,7 +551,7 @@ def border_repeated(image: Array, top: int, bottom: int, left: int, right: int) 
 
 
 @ROBUST_DEPTH.mistake("cut")
-def border_lost(image: Array, top: int, bottom: int, left: int, right: int) -> Array:
+def border_lost(image: Floats, top: int, bottom: int, left: int, right: int) -> Floats:
     """the last row or column of the image is lost
 
     In an image of 16 columns the last is number 15. Does a slice that ends at 15 hold it?
@@ -562,14 +562,14 @@ def border_lost(image: Array, top: int, bottom: int, left: int, right: int) -> A
 
 @ROBUST_DEPTH.mistake("cut", same_as=border_lost)
 def border_lost_and_negative_end(
-    image: Array, top: int, bottom: int, left: int, right: int
-) -> Array:
+    image: Floats, top: int, bottom: int, left: int, right: int
+) -> Floats:
     height, width = image.shape
     return image[max(top, 0) : min(bottom, height - 1), max(left, 0) : min(right, width - 1)]
 
 
 @ROBUST_DEPTH.mistake("cut")
-def modulo(image: Array, top: int, bottom: int, left: int, right: int) -> Array:
+def modulo(image: Floats, top: int, bottom: int, left: int, right: int) -> Floats:
     """indices are taken modulo the image's size: at one border you read the opposite one
 
     What is -1 % 16? Is the pixel at the right border a neighbour of the one at the left?
@@ -579,7 +579,7 @@ def modulo(image: Array, top: int, bottom: int, left: int, right: int) -> Array:
 
 
 @ROBUST_DEPTH.mistake("cut")
-def height_width_swapped(image: Array, top: int, bottom: int, left: int, right: int) -> Array:
+def height_width_swapped(image: Floats, top: int, bottom: int, left: int, right: int) -> Floats:
     """height and width of the image are swapped
 
     An image 16 wide and 12 high has the shape (12, 16). Which of the two limits the columns?
@@ -589,7 +589,7 @@ def height_width_swapped(image: Array, top: int, bottom: int, left: int, right: 
 
 
 @ROBUST_DEPTH.mistake("cut")
-def border_refused(image: Array, top: int, bottom: int, left: int, right: int) -> Array:
+def border_refused(image: Floats, top: int, bottom: int, left: int, right: int) -> Floats:
     """you give no answer as soon as the window touches the border
 
     Half of the window is still in the image. What does `min_valid` say about that?
@@ -600,7 +600,7 @@ def border_refused(image: Array, top: int, bottom: int, left: int, right: int) -
 
 
 @ROBUST_DEPTH.mistake("zeros")
-def zeros_counted(pixels: Array) -> Array:
+def zeros_counted(pixels: Floats) -> Floats:
     """zeros are counted as depths
 
     What does a camera of this kind write where it has no answer?
@@ -609,7 +609,7 @@ def zeros_counted(pixels: Array) -> Array:
 
 
 @ROBUST_DEPTH.mistake("finite")
-def nan_counted(pixels: Array) -> Array:
+def nan_counted(pixels: Floats) -> Floats:
     """NaN is counted as a depth
 
     What is the median of 1, 2 and NaN? And is NaN != 0?
@@ -618,7 +618,7 @@ def nan_counted(pixels: Array) -> Array:
 
 
 @ROBUST_DEPTH.mistake("finite")
-def infinity_counted(pixels: Array) -> Array:
+def infinity_counted(pixels: Floats) -> Floats:
     """infinity is counted as a depth
 
     NaN does not pass `> 0`. Does infinity?
@@ -627,7 +627,7 @@ def infinity_counted(pixels: Array) -> Array:
 
 
 @ROBUST_DEPTH.mistake("enough")
-def min_valid_ignored(valid: Array, pixels: Array, min_valid: int) -> bool:
+def min_valid_ignored(valid: Floats, pixels: Floats, min_valid: int) -> bool:
     """`min_valid` is ignored: a window with a single valid pixel is trusted like a full one
 
     Near the edge of an object one pixel may be left, and it may be a flying one. Who looks?
@@ -636,7 +636,7 @@ def min_valid_ignored(valid: Array, pixels: Array, min_valid: int) -> bool:
 
 
 @ROBUST_DEPTH.mistake("enough")
-def min_valid_fixed(valid: Array, pixels: Array, min_valid: int) -> bool:
+def min_valid_fixed(valid: Floats, pixels: Floats, min_valid: int) -> bool:
     """`min_valid` is always 5 in your function
 
     What does it do when somebody passes min_valid = 1?
@@ -645,7 +645,7 @@ def min_valid_fixed(valid: Array, pixels: Array, min_valid: int) -> bool:
 
 
 @ROBUST_DEPTH.mistake("enough")
-def one_too_strict(valid: Array, pixels: Array, min_valid: int) -> bool:
+def one_too_strict(valid: Floats, pixels: Floats, min_valid: int) -> bool:
     """exactly `min_valid` valid pixels are refused
 
     Fewer than min_valid is too few. And min_valid itself?
@@ -654,7 +654,7 @@ def one_too_strict(valid: Array, pixels: Array, min_valid: int) -> bool:
 
 
 @ROBUST_DEPTH.mistake("enough")
-def all_pixels_counted(valid: Array, pixels: Array, min_valid: int) -> bool:
+def all_pixels_counted(valid: Floats, pixels: Floats, min_valid: int) -> bool:
     """`min_valid` is compared with all pixels of the window
 
     How many pixels does your count find in a window in which every pixel is 0?
@@ -672,7 +672,7 @@ def zero_returned() -> float:
 
 
 @ROBUST_DEPTH.mistake("middle")
-def mean(valid: Array) -> float:
+def mean(valid: Floats) -> float:
     """this is the mean, and the median is wanted
 
     One flying pixel 0.2 m behind the other eight: how far does it move your result?
@@ -681,7 +681,7 @@ def mean(valid: Array) -> float:
 
 
 @ROBUST_DEPTH.mistake("middle")
-def one_of_the_middle_two(valid: Array) -> float:
+def one_of_the_middle_two(valid: Floats) -> float:
     """with an even number of valid pixels you take one of the middle two
 
     What is the median of 1, 2, 3 and 4?
@@ -690,5 +690,5 @@ def one_of_the_middle_two(valid: Array) -> float:
 
 
 @ROBUST_DEPTH.mistake("middle", same_as=one_of_the_middle_two)
-def lower_of_the_middle_two(valid: Array) -> float:
+def lower_of_the_middle_two(valid: Floats) -> float:
     return float(np.sort(valid)[(len(valid) - 1) // 2])

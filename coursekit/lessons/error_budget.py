@@ -1,4 +1,4 @@
-"""Notebook 05: its checkpoints, its exercise and the mistakes that people make in it."""
+"""Notebook 05: its exercise and the mistakes that people make in it."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from coursekit.arrays import Floats
 from coursekit.lessons.exercises import Exercise, Model, Step
-
-Array = np.ndarray
 
 # --- sensitivities ---
 
@@ -26,12 +25,12 @@ def _leak(by_u: float, by_Z: float, depth_error: float, Z: float) -> float:
     return by_Z * depth_error
 
 
-def _in_order(by_u: float, by_Z: float, leak: float) -> Array:
+def _in_order(by_u: float, by_Z: float, leak: float) -> Floats:
     return np.array([by_u, by_Z, leak])
 
 
 def _build(steps: Mapping[str, Step]) -> Model:
-    def sensitivities(u: float, Z: float, fx: float, cx: float, depth_error: float) -> Array:
+    def sensitivities(u: float, Z: float, fx: float, cx: float, depth_error: float) -> Floats:
         by_u, by_Z = steps["pixel"](u, Z, fx, cx), steps["depth"](u, Z, fx, cx)
         return steps["order"](by_u, by_Z, steps["leak"](by_u, by_Z, depth_error, Z))
 
@@ -163,7 +162,7 @@ def landing_place(by_u: float, by_Z: float, depth_error: float, Z: float) -> flo
 
 
 @SENSITIVITIES.mistake("order")
-def all_millimetres(by_u: float, by_Z: float, leak: float) -> Array:
+def all_millimetres(by_u: float, by_Z: float, leak: float) -> Floats:
     """all of it is in millimetres, and metres are wanted
 
     Everything goes in in metres and pixels; what is the unit of Z / fx then?
@@ -172,7 +171,7 @@ def all_millimetres(by_u: float, by_Z: float, leak: float) -> Array:
 
 
 @SENSITIVITIES.mistake("order")
-def exchanged(by_u: float, by_Z: float, leak: float) -> Array:
+def exchanged(by_u: float, by_Z: float, leak: float) -> Floats:
     """the two prices are exchanged
 
     The exercise asks for (dX/du, dX/dZ, leak).

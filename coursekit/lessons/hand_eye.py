@@ -1,20 +1,21 @@
-"""Notebook 04: its checkpoints, its two exercises and the mistakes that people make in them."""
+"""Notebook 04: its two exercises and the mistakes that people make in them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from coursekit.arrays import Floats
 from coursekit.geometry import make_transform
 from coursekit.lessons.exercises import Exercise, Model, Step
 
-Array = np.ndarray
-Pair = tuple[Array, Array]
+Pair = tuple[Floats, Floats]
 
 
-def _pose(rng: np.random.Generator, reach_m: float = 0.5) -> Array:
+def _pose(rng: np.random.Generator, reach_m: float = 0.5) -> Floats:
     turn = Rotation.from_rotvec(rng.uniform(-1.2, 1.2, 3))
     return make_transform(turn, rng.uniform(-reach_m, reach_m, 3))
 
@@ -22,30 +23,32 @@ def _pose(rng: np.random.Generator, reach_m: float = 0.5) -> Array:
 # --- motion_pair ---
 
 
-def _inverse(T: Array) -> Array:
+def _inverse(T: Floats) -> Any:
     return np.linalg.inv(T)
 
 
-def _gripper_motion(first: Array, second: Array, inverse: Step) -> Array:
+def _gripper_motion(first: Floats, second: Floats, inverse: Step) -> Floats:
     """The gripper at pose i, as the gripper at pose j sees it."""
     return inverse(second) @ first
 
 
-def _camera_motion(first: Array, second: Array, inverse: Step) -> Array:
+def _camera_motion(first: Floats, second: Floats, inverse: Step) -> Floats:
     """The camera at pose i, as the camera at pose j sees it, by way of the board."""
     return second @ inverse(first)
 
 
-def _stacked(A: Array, B: Array) -> Array:
+def _stacked(A: Floats, B: Floats) -> Floats:
     return np.stack([A, B])
 
 
-def _in_order(i: Array, j: Array) -> Pair:
+def _in_order(i: Floats, j: Floats) -> Pair:
     return i, j
 
 
 def _build_pair(steps: Mapping[str, Step]) -> Model:
-    def motion_pair(gripper_i: Array, gripper_j: Array, board_i: Array, board_j: Array) -> Array:
+    def motion_pair(
+        gripper_i: Floats, gripper_j: Floats, board_i: Floats, board_j: Floats
+    ) -> Floats:
         invert = steps["inverse"]
         A = steps["A"](*steps["A pair"](gripper_i, gripper_j), invert)
         B = steps["B"](*steps["B pair"](board_i, board_j), invert)
@@ -54,7 +57,7 @@ def _build_pair(steps: Mapping[str, Step]) -> Model:
     return motion_pair
 
 
-def _session_pair(seed: int, plain: bool = False) -> tuple[Array, ...]:
+def _session_pair(seed: int, plain: bool = False) -> tuple[Floats, ...]:
     """Two arm poses and the board as the camera saw it at each, of one and the same X."""
     rng = np.random.default_rng(seed)
     X, board = _pose(rng, 0.1), _pose(rng)
@@ -100,7 +103,7 @@ MOTION_PAIR = Exercise(
 
 
 @MOTION_PAIR.mistake("inverse")
-def transposed_pose(T: Array) -> Array:
+def transposed_pose(T: Floats) -> Floats:
     """the inverse of a pose is not its transpose
 
     A rotation's inverse is its transpose. A pose also has a translation: what becomes of it?
@@ -109,7 +112,7 @@ def transposed_pose(T: Array) -> Array:
 
 
 @MOTION_PAIR.mistake("inverse")
-def translation_not_turned(T: Array) -> Array:
+def translation_not_turned(T: Floats) -> Floats:
     """in your inverse the translation only changes its sign
 
     R^T undoes the rotation. In which frame is -t, and in which one is it wanted?
@@ -118,7 +121,7 @@ def translation_not_turned(T: Array) -> Array:
 
 
 @MOTION_PAIR.mistake("inverse")
-def not_inverted(T: Array) -> Array:
+def not_inverted(T: Floats) -> Floats:
     """nothing is inverted
 
     Which of the two poses must be undone so that the base frame cancels?
@@ -127,7 +130,7 @@ def not_inverted(T: Array) -> Array:
 
 
 @MOTION_PAIR.mistake("A")
-def motion_in_base(first: Array, second: Array, inverse: Step) -> Array:
+def motion_in_base(first: Floats, second: Floats, inverse: Step) -> Floats:
     """A is the motion seen from the base: that is the A of a camera that does not ride on the arm
 
     X stands to the right of A, and takes camera coordinates to gripper coordinates. In which frame
@@ -137,7 +140,7 @@ def motion_in_base(first: Array, second: Array, inverse: Step) -> Array:
 
 
 @MOTION_PAIR.mistake("A pair")
-def a_exchanged(i: Array, j: Array) -> Pair:
+def a_exchanged(i: Floats, j: Floats) -> Pair:
     """in A the poses i and j are exchanged, in B they are not
 
     The board is in the same place: T_i X B_i = T_j X B_j. Bring all arm poses to the left.
@@ -146,7 +149,7 @@ def a_exchanged(i: Array, j: Array) -> Pair:
 
 
 @MOTION_PAIR.mistake("B pair")
-def b_exchanged(i: Array, j: Array) -> Pair:
+def b_exchanged(i: Floats, j: Floats) -> Pair:
     """in B the poses i and j are exchanged, in A they are not
 
     The board is in the same place: T_i X B_i = T_j X B_j. Bring all detections to the right.
@@ -155,7 +158,7 @@ def b_exchanged(i: Array, j: Array) -> Pair:
 
 
 @MOTION_PAIR.mistake("B")
-def motion_in_board(first: Array, second: Array, inverse: Step) -> Array:
+def motion_in_board(first: Floats, second: Floats, inverse: Step) -> Floats:
     """B is the motion of the camera seen from the board
 
     X stands to the left of B, and takes camera coordinates in. In which frame must B begin and end?
@@ -164,7 +167,7 @@ def motion_in_board(first: Array, second: Array, inverse: Step) -> Array:
 
 
 @MOTION_PAIR.mistake("order")
-def both_exchanged(A: Array, B: Array) -> Array:
+def both_exchanged(A: Floats, B: Floats) -> Floats:
     """both motions go from j to i: a right equation, but not the one that was asked for
 
     A = inverse(T_j) T_i. And yours?
@@ -173,7 +176,7 @@ def both_exchanged(A: Array, B: Array) -> Array:
 
 
 @MOTION_PAIR.mistake("order")
-def b_first(A: Array, B: Array) -> Array:
+def b_first(A: Floats, B: Floats) -> Floats:
     """A and B are exchanged
 
     Which one comes from the arm?
@@ -184,15 +187,15 @@ def b_first(A: Array, B: Array) -> Array:
 # --- rotation_half ---
 
 
-def _axes(R_A: Array, R_B: Array) -> Pair:
+def _axes(R_A: Floats, R_B: Floats) -> Pair:
     return Rotation.from_matrix(R_A).as_rotvec(), Rotation.from_matrix(R_B).as_rotvec()
 
 
-def _used(a: Array, b: Array) -> Pair:
+def _used(a: Floats, b: Floats) -> Pair:
     return a, b
 
 
-def _turn(a: Array, b: Array) -> Array:
+def _turn(a: Floats, b: Floats) -> Floats:
     """The rotation that takes each b to its a: Kabsch's; the smallest one for a single pair."""
     if len(a) == 1:
         return np.asarray(Rotation.align_vectors(a, b)[0].as_matrix())
@@ -201,7 +204,7 @@ def _turn(a: Array, b: Array) -> Array:
 
 
 def _build_half(steps: Mapping[str, Step]) -> Model:
-    def rotation_half(R_A: Array, R_B: Array) -> Array:
+    def rotation_half(R_A: Floats, R_B: Floats) -> Floats:
         return steps["result"](steps["turn"](*steps["used"](*steps["axes"](R_A, R_B))))
 
     return rotation_half
@@ -240,7 +243,7 @@ ROTATION_HALF = Exercise(
 
 
 @ROTATION_HALF.mistake("result")
-def inverse_of_x(R: Array) -> Array:
+def inverse_of_x(R: Floats) -> Floats:
     """that is the inverse of R_X
 
     R_X takes camera coordinates to gripper coordinates. Which axes did you turn into which?
@@ -249,7 +252,7 @@ def inverse_of_x(R: Array) -> Array:
 
 
 @ROTATION_HALF.mistake("turn")
-def mirror_image(a: Array, b: Array) -> Array:
+def mirror_image(a: Floats, b: Floats) -> Floats:
     """with two motions your result is a mirror image: its determinant is -1
 
     Two axes lie in a plane, and a plane looks the same in a mirror. Print the determinant. What
@@ -263,7 +266,7 @@ def mirror_image(a: Array, b: Array) -> Array:
 
 
 @ROTATION_HALF.mistake("turn")
-def not_a_rotation(a: Array, b: Array) -> Array:
+def not_a_rotation(a: Floats, b: Floats) -> Any:
     """that is the least-squares matrix for the axes, and it is not made a rotation
 
     Multiply your result by its transpose. With two motions, what can a matrix not know?
@@ -272,7 +275,7 @@ def not_a_rotation(a: Array, b: Array) -> Array:
 
 
 @ROTATION_HALF.mistake("used")
-def first_motion_only(a: Array, b: Array) -> Pair:
+def first_motion_only(a: Floats, b: Floats) -> Pair:
     """only the first motion is used
 
     One axis leaves the turn about it free. How many motions fix it?
@@ -281,7 +284,7 @@ def first_motion_only(a: Array, b: Array) -> Pair:
 
 
 @ROTATION_HALF.mistake("result")
-def negative(R: Array) -> Array:
+def negative(R: Floats) -> Floats:
     """its sign is wrong: -R solves the equation as well, and is no rotation
 
     Print the determinant. A null vector has no sign of its own: how do you choose it?
@@ -290,7 +293,7 @@ def negative(R: Array) -> Array:
 
 
 @ROTATION_HALF.mistake("result")
-def not_scaled(R: Array) -> Array:
+def not_scaled(R: Floats) -> Floats:
     """it is a rotation but for a factor
 
     A null vector of length 1 has nine entries, and a rotation matrix has three rows of length 1.
@@ -300,7 +303,7 @@ def not_scaled(R: Array) -> Array:
 
 
 @ROTATION_HALF.mistake("result")
-def not_scaled_and_negative(R: Array) -> Array:
+def not_scaled_and_negative(R: Floats) -> Floats:
     """it is a rotation but for a factor and the sign
 
     A null vector of length 1 has no sign of its own, and nine entries. Print the determinant of

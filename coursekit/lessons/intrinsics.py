@@ -1,4 +1,4 @@
-"""Notebook 03: its checkpoints, its two exercises and the mistakes that people make in them."""
+"""Notebook 03: its two exercises and the mistakes that people make in them."""
 
 from __future__ import annotations
 
@@ -8,35 +8,34 @@ from typing import Any
 
 import numpy as np
 
+from coursekit.arrays import Floats
 from coursekit.lessons.exercises import Exercise, Model, Step
-
-Array = np.ndarray
 
 # --- reprojection_rms ---
 
 
-def _difference(observed: Array, predicted: Array) -> Array:
+def _difference(observed: Floats, predicted: Floats) -> Floats:
     return observed - predicted
 
 
-def _root_mean_square(residuals: Array) -> Array:
+def _root_mean_square(residuals: Floats) -> Floats:
     return np.sqrt(np.mean(residuals**2, axis=0))
 
 
-def _both_axes(residuals: Array, axes: Array) -> float:
+def _both_axes(residuals: Floats, axes: Floats) -> float:
     return float(np.hypot(*axes))
 
 
-def _as_they_are(residuals: Array, axes: Array) -> Array:
+def _as_they_are(residuals: Floats, axes: Floats) -> Floats:
     return axes
 
 
-def _u_v_both(axes: Array, both: float) -> Array:
+def _u_v_both(axes: Floats, both: float) -> Floats:
     return np.array([*axes, both])
 
 
 def _build_rms(steps: Mapping[str, Step]) -> Model:
-    def reprojection_rms(observed: Array, predicted: Array) -> Array:
+    def reprojection_rms(observed: Floats, predicted: Floats) -> Floats:
         residuals = steps["difference"](observed, predicted)
         axes = steps["axis"](residuals)
         both = steps["both"](residuals, axes)
@@ -93,7 +92,7 @@ REPROJECTION_RMS = Exercise(
 def _wrong_axis(wrong: Step) -> Step:
     """A mistake in the numbers of the two axes, whether or not the 2-D number is made of them."""
 
-    def only_shown(residuals: Array, axes: Array) -> Array:
+    def only_shown(residuals: Floats, axes: Floats) -> Floats:
         return np.asarray(wrong(residuals))
 
     REPROJECTION_RMS.mistake("axis")(wrong)
@@ -102,7 +101,7 @@ def _wrong_axis(wrong: Step) -> Step:
 
 
 @_wrong_axis
-def mean_removed(residuals: Array) -> Array:
+def mean_removed(residuals: Floats) -> Floats:
     """that is the standard deviation, which takes the mean away first
 
     All corners 1 px too far right: what does a standard deviation say, and what should an error
@@ -112,7 +111,7 @@ def mean_removed(residuals: Array) -> Array:
 
 
 @_wrong_axis
-def divided_by_n_minus_1(residuals: Array) -> Array:
+def divided_by_n_minus_1(residuals: Floats) -> Floats:
     """the sum of squares is divided by N - 1
 
     N - 1 belongs to a spread about a mean that was itself estimated. Is there such a mean here?
@@ -121,7 +120,7 @@ def divided_by_n_minus_1(residuals: Array) -> Array:
 
 
 @_wrong_axis
-def mean_absolute(residuals: Array) -> Array:
+def mean_absolute(residuals: Floats) -> Floats:
     """that is the mean absolute error
 
     The letters of RMS, from the right: square, mean, root. Which of them does yours lack?
@@ -130,7 +129,7 @@ def mean_absolute(residuals: Array) -> Array:
 
 
 @_wrong_axis
-def signed_mean(residuals: Array) -> Array:
+def signed_mean(residuals: Floats) -> Floats:
     """that is the mean error with its sign: left and right cancel
 
     Two corners, one 1 px too far left, one 1 px too far right: what does yours say?
@@ -139,7 +138,7 @@ def signed_mean(residuals: Array) -> Array:
 
 
 @_wrong_axis
-def no_root(residuals: Array) -> Array:
+def no_root(residuals: Floats) -> Floats:
     """the root is missing: these are px²
 
     What is the unit of your result, and which one is wanted?
@@ -148,7 +147,7 @@ def no_root(residuals: Array) -> Array:
 
 
 @_wrong_axis
-def summed(residuals: Array) -> Array:
+def summed(residuals: Floats) -> Floats:
     """you add the squares up but do not take their mean
 
     Twice as many corners, each as good as before: should the number grow?
@@ -157,7 +156,7 @@ def summed(residuals: Array) -> Array:
 
 
 @_wrong_axis
-def axis_over_2n(residuals: Array) -> Array:
+def axis_over_2n(residuals: Floats) -> Floats:
     """the sum of squares of one axis is divided by 2N
 
     N corners have N errors in u. By how many do you divide their squares?
@@ -166,7 +165,7 @@ def axis_over_2n(residuals: Array) -> Array:
 
 
 @_wrong_axis
-def largest(residuals: Array) -> Array:
+def largest(residuals: Floats) -> Floats:
     """that is the largest error, not the root mean square
 
     What does one bad corner among a thousand do to your number?
@@ -175,7 +174,7 @@ def largest(residuals: Array) -> Array:
 
 
 @REPROJECTION_RMS.mistake("both")
-def both_over_2n(residuals: Array, axes: Array) -> float:
+def both_over_2n(residuals: Floats, axes: Floats) -> float:
     """for the 2-D value you take the mean over 2N coordinates instead of over N corners
 
     One corner, 3 px off in u and 4 px in v: how far off is it? What does yours say?
@@ -184,7 +183,7 @@ def both_over_2n(residuals: Array, axes: Array) -> float:
 
 
 @REPROJECTION_RMS.mistake("both")
-def mean_distance(residuals: Array, axes: Array) -> float:
+def mean_distance(residuals: Floats, axes: Floats) -> float:
     """the 2-D value is a mean of the distances, not their root mean square
 
     You have the distance of each corner. Square, mean, root: in which order did you do them?
@@ -193,7 +192,7 @@ def mean_distance(residuals: Array, axes: Array) -> float:
 
 
 @REPROJECTION_RMS.mistake("both")
-def added(residuals: Array, axes: Array) -> float:
+def added(residuals: Floats, axes: Floats) -> float:
     """the RMS of the two axes are added
 
     3 px to the right and 4 px down: how far is that as the crow flies?
@@ -202,7 +201,7 @@ def added(residuals: Array, axes: Array) -> float:
 
 
 @REPROJECTION_RMS.mistake("both")
-def mean_of_axes(residuals: Array, axes: Array) -> float:
+def mean_of_axes(residuals: Floats, axes: Floats) -> float:
     """the 2-D value is the mean of the two axes
 
     3 px to the right and 4 px down: can the distance be less than either of the two?
@@ -211,7 +210,7 @@ def mean_of_axes(residuals: Array, axes: Array) -> float:
 
 
 @REPROJECTION_RMS.mistake("both")
-def both_without_root(residuals: Array, axes: Array) -> float:
+def both_without_root(residuals: Floats, axes: Floats) -> float:
     """the root is missing in the 2-D value
 
     What is its unit, and what is the unit of the other two?
@@ -220,7 +219,7 @@ def both_without_root(residuals: Array, axes: Array) -> float:
 
 
 @REPROJECTION_RMS.mistake("both")
-def norm_of_everything(residuals: Array, axes: Array) -> float:
+def norm_of_everything(residuals: Floats, axes: Floats) -> float:
     """the 2-D value is that of all corners together: a sum, not a mean
 
     The norm of all residuals grows with every corner that you add. Should it?
@@ -229,7 +228,7 @@ def norm_of_everything(residuals: Array, axes: Array) -> float:
 
 
 @REPROJECTION_RMS.mistake("whole")
-def squares_everywhere(residuals: Array, result: Array) -> Array:
+def squares_everywhere(residuals: Floats, result: Floats) -> Floats:
     """no root is taken: all three are in px²
 
     What is the unit of your result, and which one is wanted?
@@ -238,7 +237,7 @@ def squares_everywhere(residuals: Array, result: Array) -> Array:
 
 
 @REPROJECTION_RMS.mistake("whole")
-def mean_distances_everywhere(residuals: Array, result: Array) -> Array:
+def mean_distances_everywhere(residuals: Floats, result: Floats) -> Floats:
     """these are mean distances, in u, in v and in two dimensions, not root mean squares
 
     The letters of RMS, from the right: square, mean, root. Which of them does yours lack?
@@ -248,7 +247,7 @@ def mean_distances_everywhere(residuals: Array, result: Array) -> Array:
 
 
 @REPROJECTION_RMS.mistake("order")
-def v_before_u(axes: Array, both: float) -> Array:
+def v_before_u(axes: Floats, both: float) -> Floats:
     """u and v are swapped
 
     Columns of the array: which of them is u?
@@ -257,7 +256,7 @@ def v_before_u(axes: Array, both: float) -> Array:
 
 
 @REPROJECTION_RMS.mistake("order")
-def both_first(axes: Array, both: float) -> Array:
+def both_first(axes: Floats, both: float) -> Floats:
     """the 2-D value stands first
 
     The exercise asks for (RMS in u, RMS in v, 2-D RMS).
@@ -268,19 +267,19 @@ def both_first(axes: Array, both: float) -> Array:
 # --- focal_sigma ---
 
 
-def _freedom(J: Array, residuals: Array) -> float:
+def _freedom(J: Floats, residuals: Floats) -> float:
     return float(J.shape[0] - J.shape[1])
 
 
-def _noise_variance(residuals: Array, freedom: float) -> float:
+def _noise_variance(residuals: Floats, freedom: float) -> float:
     return float(residuals @ residuals) / freedom
 
 
-def _information(J: Array) -> Array:
+def _information(J: Floats) -> Floats:
     return J.T @ J
 
 
-def _first_of_inverse(information: Array) -> float:
+def _first_of_inverse(information: Floats) -> float:
     return float(np.linalg.inv(information)[0, 0])
 
 
@@ -289,7 +288,7 @@ def _times(noise: float, first: float) -> float:
 
 
 def _build_sigma(steps: Mapping[str, Step]) -> Model:
-    def focal_sigma(J: Array, residuals: Array) -> Any:
+    def focal_sigma(J: Floats, residuals: Floats) -> Any:
         noise = steps["noise"](residuals, steps["freedom"](J, residuals))
         first = steps["first"](steps["information"](J))
         return steps["root"](steps["scale"](noise, first))
@@ -297,7 +296,7 @@ def _build_sigma(steps: Mapping[str, Step]) -> Model:
     return focal_sigma
 
 
-def _least_squares(seed: int, rows: int, columns: int, sigma: float) -> tuple[Array, Array]:
+def _least_squares(seed: int, rows: int, columns: int, sigma: float) -> tuple[Floats, Floats]:
     """A Jacobian with correlated columns, and residuals that a fit leaves: none along J."""
     rng = np.random.default_rng(seed)
     J = rng.normal(size=(rows, columns)) @ (np.eye(columns) + 0.4 * rng.random((columns, columns)))
@@ -338,7 +337,7 @@ FOCAL_SIGMA = Exercise(
 
 
 @FOCAL_SIGMA.mistake("freedom")
-def nothing_fitted(J: Array, residuals: Array) -> float:
+def nothing_fitted(J: Floats, residuals: Floats) -> float:
     """the sum of squares is divided by the number of residuals, as if nothing had been fitted
 
     Ten residuals and ten fitted parameters: how large are the residuals then, whatever the noise?
@@ -348,7 +347,7 @@ def nothing_fitted(J: Array, residuals: Array) -> float:
 
 
 @FOCAL_SIGMA.mistake("freedom")
-def one_parameter(J: Array, residuals: Array) -> float:
+def one_parameter(J: Floats, residuals: Floats) -> float:
     """one degree of freedom is taken off, not one for each parameter
 
     N - 1 is for a single fitted number, the mean. How many numbers has this fit?
@@ -357,7 +356,7 @@ def one_parameter(J: Array, residuals: Array) -> float:
 
 
 @FOCAL_SIGMA.mistake("freedom")
-def corners_counted(J: Array, residuals: Array) -> float:
+def corners_counted(J: Floats, residuals: Floats) -> float:
     """you count corners where you should count coordinates
 
     Each corner gives two residuals, and J has a row for each. How many rows has J?
@@ -366,7 +365,7 @@ def corners_counted(J: Array, residuals: Array) -> float:
 
 
 @FOCAL_SIGMA.mistake("noise")
-def no_noise(residuals: Array, freedom: float) -> float:
+def no_noise(residuals: Floats, freedom: float) -> float:
     """the noise does not enter: this is sigma for residuals of 1 px
 
     Twice as noisy corners: is your fx then known equally well?
@@ -375,7 +374,7 @@ def no_noise(residuals: Array, freedom: float) -> float:
 
 
 @FOCAL_SIGMA.mistake("noise")
-def noise_not_squared(residuals: Array, freedom: float) -> float:
+def noise_not_squared(residuals: Floats, freedom: float) -> float:
     """the covariance is scaled by the noise's standard deviation instead of its variance
 
     A covariance is in squared units. Which power of the noise has the same?
@@ -384,7 +383,7 @@ def noise_not_squared(residuals: Array, freedom: float) -> float:
 
 
 @FOCAL_SIGMA.mistake("noise")
-def noise_summed(residuals: Array, freedom: float) -> float:
+def noise_summed(residuals: Floats, freedom: float) -> float:
     """the squares are added up but not divided by the degrees of freedom
 
     Twice as many corners: does your sigma fall?
@@ -393,7 +392,7 @@ def noise_summed(residuals: Array, freedom: float) -> float:
 
 
 @FOCAL_SIGMA.mistake("noise")
-def spread_of_residuals(residuals: Array, freedom: float) -> float:
+def spread_of_residuals(residuals: Floats, freedom: float) -> float:
     """the noise is taken as the standard deviation of the residuals: no parameter is counted
 
     Ten residuals and ten fitted parameters: how large is the standard deviation of what is left?
@@ -402,7 +401,7 @@ def spread_of_residuals(residuals: Array, freedom: float) -> float:
 
 
 @FOCAL_SIGMA.mistake("noise")
-def two_dimensional_rms(residuals: Array, freedom: float) -> float:
+def two_dimensional_rms(residuals: Floats, freedom: float) -> float:
     """the noise is the 2-D RMS, and J has a row for each coordinate
 
     A corner that is 0.1 px off in u and in v is 0.14 px off. Which of the two belongs to a row?
@@ -411,7 +410,7 @@ def two_dimensional_rms(residuals: Array, freedom: float) -> float:
 
 
 @FOCAL_SIGMA.mistake("first")
-def others_known(information: Array) -> float:
+def others_known(information: Floats) -> float:
     """that is sigma of fx if all other parameters were known exactly
 
     The first element of the inverse is not the inverse of the first element, unless the matrix is
@@ -421,7 +420,7 @@ def others_known(information: Array) -> float:
 
 
 @FOCAL_SIGMA.mistake("first")
-def not_inverted(information: Array) -> float:
+def not_inverted(information: Floats) -> float:
     """the matrix is not inverted
 
     J^T J is large where the data say a lot. Should sigma be large there?
@@ -430,7 +429,7 @@ def not_inverted(information: Array) -> float:
 
 
 @FOCAL_SIGMA.mistake("first")
-def last_parameter(information: Array) -> float:
+def last_parameter(information: Floats) -> float:
     """that is sigma of the last parameter
 
     Which column of J belongs to fx?

@@ -1,4 +1,4 @@
-"""Notebook 01: its checkpoints, its two exercises and the mistakes that people make in them."""
+"""Notebook 01: its two exercises and the mistakes that people make in them."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from coursekit.arrays import Floats
 from coursekit.lessons.exercises import Core, Exercise, Model, Step
-
-Array = np.ndarray
 
 # --- project ---
 
@@ -24,7 +23,7 @@ MIXED = np.array([-0.27, 0.11, 0.0018, -0.0012, 0.05])
 # The steps of projection. The third of x, y, w is 1 unless somebody treats Z in a way of their own.
 
 
-def _normalise(points: Array) -> Any:
+def _normalise(points: Floats) -> Any:
     return points[:, 0] / points[:, 2], points[:, 1] / points[:, 2], 1.0
 
 
@@ -32,7 +31,7 @@ def _read(k1: float, k2: float, p1: float, p2: float, k3: float) -> Any:
     return k1, k2, p1, p2, k3
 
 
-def _bend(x: Array, y: Array, k1: float, k2: float, p1: float, p2: float, k3: float) -> Any:
+def _bend(x: Floats, y: Floats, k1: float, k2: float, p1: float, p2: float, k3: float) -> Any:
     r2 = x * x + y * y
     radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
     return (
@@ -41,25 +40,25 @@ def _bend(x: Array, y: Array, k1: float, k2: float, p1: float, p2: float, k3: fl
     )
 
 
-def _to_pixels(x: Array, y: Array, w: Any, K: Array) -> Any:
+def _to_pixels(x: Floats, y: Floats, w: Any, K: Floats) -> Any:
     return K[0, 0] * x + K[0, 2] * w, K[1, 1] * y + K[1, 2] * w
 
 
-def _image(points: Array, normalise: Step, bend: Step, to_pixels: Step) -> Any:
+def _image(points: Floats, normalise: Step, bend: Step, to_pixels: Step) -> Any:
     x, y, w = normalise(points)
     return to_pixels(*bend(x, y), w)
 
 
-def _columns(u: Array, v: Array) -> Array:
+def _columns(u: Floats, v: Floats) -> Floats:
     return np.stack([u, v], axis=1)
 
 
 def _build_project(steps: Mapping[str, Step]) -> Model:
-    def project(points: Array, K: Array, dist: Array | None = None) -> Any:
-        def bend(x: Array, y: Array) -> Any:
+    def project(points: Floats, K: Floats, dist: Floats | None = None) -> Any:
+        def bend(x: Floats, y: Floats) -> Any:
             return (x, y) if dist is None else steps["bend"](x, y, *steps["read"](*dist))
 
-        def to_pixels(x: Array, y: Array, w: Any) -> Any:
+        def to_pixels(x: Floats, y: Floats, w: Any) -> Any:
             return steps["to_pixels"](x, y, w, K)
 
         return steps["columns"](*steps["image"](points, steps["normalise"], bend, to_pixels))
@@ -75,7 +74,7 @@ def _short(values: Any) -> str:
     return "(" + ", ".join(f"{v:g}" for v in values) + ")"
 
 
-def _describe_camera(K: Array, dist: Array | None = None) -> str:
+def _describe_camera(K: Floats, dist: Floats | None = None) -> str:
     text = f"K = {_short((K[0, 0], K[1, 1], K[0, 2], K[1, 2]))} px"
     return text if dist is None else f"{text}, coefficients {_short(dist)}"
 
@@ -119,7 +118,7 @@ PROJECT = Exercise(
 
 
 @PROJECT.mistake("normalise")
-def no_division(points: Array) -> Any:
+def no_division(points: Floats) -> Any:
     """nothing is divided by Z
 
     Two points on one ray, one twice as far as the other: do yours land on the same pixel?
@@ -128,12 +127,12 @@ def no_division(points: Array) -> Any:
 
 
 @PROJECT.mistake("normalise", same_as=no_division)
-def homogeneous_without_division(points: Array) -> Any:
+def homogeneous_without_division(points: Floats) -> Any:
     return points[:, 0], points[:, 1], points[:, 2]
 
 
 @PROJECT.mistake("normalise")
-def divided_by_range(points: Array) -> Any:
+def divided_by_range(points: Floats) -> Any:
     """X and Y are divided by the length of the ray instead of by Z
 
     All points of a wall that faces the camera have the same Z. Do yours get the same divisor?
@@ -143,7 +142,7 @@ def divided_by_range(points: Array) -> Any:
 
 
 @PROJECT.mistake("normalise")
-def centre_divided(points: Array) -> Any:
+def centre_divided(points: Floats) -> Any:
     """the principal point is divided by Z as well
 
     Where does a point on the optical axis land, at 0.5 m and at 1 m? And with yours?
@@ -153,7 +152,7 @@ def centre_divided(points: Array) -> Any:
 
 
 @PROJECT.mistake("normalise")
-def upside_down(points: Array) -> Any:
+def upside_down(points: Floats) -> Any:
     """the ratios are upside down: Z is divided by X and by Y
 
     Move a point twice as far to the right. Does yours move farther to the right in the image?
@@ -162,7 +161,7 @@ def upside_down(points: Array) -> Any:
 
 
 @PROJECT.mistake("normalise")
-def y_up(points: Array) -> Any:
+def y_up(points: Floats) -> Any:
     """your y axis points up
 
     In which row is a point below the optical axis?
@@ -172,12 +171,12 @@ def y_up(points: Array) -> Any:
 
 
 @PROJECT.mistake("to_pixels", same_as=y_up)
-def y_up_after_distortion(x: Array, y: Array, w: Any, K: Array) -> Any:
+def y_up_after_distortion(x: Floats, y: Floats, w: Any, K: Floats) -> Any:
     return _to_pixels(x, -y, w, K)
 
 
 @PROJECT.mistake("to_pixels")
-def fx_fy_swapped(x: Array, y: Array, w: Any, K: Array) -> Any:
+def fx_fy_swapped(x: Floats, y: Floats, w: Any, K: Floats) -> Any:
     """your fx and fy are swapped
 
     Which entry of K belongs to the columns of the image?
@@ -186,7 +185,7 @@ def fx_fy_swapped(x: Array, y: Array, w: Any, K: Array) -> Any:
 
 
 @PROJECT.mistake("to_pixels")
-def fx_for_both(x: Array, y: Array, w: Any, K: Array) -> Any:
+def fx_for_both(x: Floats, y: Floats, w: Any, K: Floats) -> Any:
     """fx is used for both axes
 
     K has four numbers in it. Does your function use them all?
@@ -195,7 +194,7 @@ def fx_for_both(x: Array, y: Array, w: Any, K: Array) -> Any:
 
 
 @PROJECT.mistake("to_pixels")
-def centre_before_scale(x: Array, y: Array, w: Any, K: Array) -> Any:
+def centre_before_scale(x: Floats, y: Floats, w: Any, K: Floats) -> Any:
     """the principal point is added before the multiplication by fx and fy
 
     A point on the optical axis has x = y = 0. On which pixel must it land?
@@ -204,7 +203,7 @@ def centre_before_scale(x: Array, y: Array, w: Any, K: Array) -> Any:
 
 
 @PROJECT.mistake("to_pixels")
-def K_transposed(x: Array, y: Array, w: Any, K: Array) -> Any:
+def K_transposed(x: Floats, y: Floats, w: Any, K: Floats) -> Any:
     """K is multiplied from the wrong side
 
     The equation says K times a column. Your points are rows: what has to be transposed?
@@ -214,7 +213,7 @@ def K_transposed(x: Array, y: Array, w: Any, K: Array) -> Any:
 
 
 @PROJECT.mistake("to_pixels")
-def cx_cy_swapped(x: Array, y: Array, w: Any, K: Array) -> Any:
+def cx_cy_swapped(x: Floats, y: Floats, w: Any, K: Floats) -> Any:
     """your cx and cy are swapped
 
     Which of the two is near half the *width* of the image?
@@ -223,7 +222,7 @@ def cx_cy_swapped(x: Array, y: Array, w: Any, K: Array) -> Any:
 
 
 @PROJECT.mistake("to_pixels")
-def principal_point_forgotten(x: Array, y: Array, w: Any, K: Array) -> Any:
+def principal_point_forgotten(x: Floats, y: Floats, w: Any, K: Floats) -> Any:
     """the principal point is forgotten
 
     Where does a point on the optical axis land, and where does yours put it?
@@ -232,7 +231,7 @@ def principal_point_forgotten(x: Array, y: Array, w: Any, K: Array) -> Any:
 
 
 @PROJECT.mistake("to_pixels")
-def principal_point_subtracted(x: Array, y: Array, w: Any, K: Array) -> Any:
+def principal_point_subtracted(x: Floats, y: Floats, w: Any, K: Floats) -> Any:
     """the principal point is subtracted
 
     A point on the optical axis has x = y = 0. On which pixel must it land?
@@ -287,7 +286,7 @@ def _bent(
     cross: of p xy, square: of x² and y².
     """
 
-    def bend(x: Array, y: Array, k1: float, k2: float, p1: float, p2: float, k3: float) -> Any:
+    def bend(x: Floats, y: Floats, k1: float, k2: float, p1: float, p2: float, k3: float) -> Any:
         r2 = x * x + y * y
         radial = 1 + sum(k * r2**power for k, power in zip((k1, k2, k3), powers, strict=True))
         return (
@@ -299,7 +298,7 @@ def _bent(
 
 
 @PROJECT.mistake("bend")
-def factor_2_missing(x: Array, y: Array, *dist: float) -> Any:
+def factor_2_missing(x: Floats, y: Floats, *dist: float) -> Any:
     """a factor 2 is missing in the tangential terms
 
     There are four twos in them: 2 p1 xy, 2x², 2y² and 2 p2 xy. Count yours.
@@ -312,7 +311,9 @@ PROJECT.mistake("bend", same_as=factor_2_missing)(_bent(cross=1, square=1))
 
 
 @PROJECT.mistake("bend")
-def x_overwritten(x: Array, y: Array, k1: float, k2: float, p1: float, p2: float, k3: float) -> Any:
+def x_overwritten(
+    x: Floats, y: Floats, k1: float, k2: float, p1: float, p2: float, k3: float
+) -> Any:
     """x is overwritten before y is computed from it
 
     Your line for y uses x. Is it still the x you started with?
@@ -326,7 +327,7 @@ def x_overwritten(x: Array, y: Array, k1: float, k2: float, p1: float, p2: float
 
 @PROJECT.mistake("bend")
 def tangential_after_radial(
-    x: Array, y: Array, k1: float, k2: float, p1: float, p2: float, k3: float
+    x: Floats, y: Floats, k1: float, k2: float, p1: float, p2: float, k3: float
 ) -> Any:
     """the tangential terms use x and y after the radial factor
 
@@ -342,7 +343,7 @@ def tangential_after_radial(
 
 
 @PROJECT.mistake("bend")
-def one_missing(x: Array, y: Array, *dist: float) -> Any:
+def one_missing(x: Floats, y: Floats, *dist: float) -> Any:
     """the 1 is missing in the radial factor
 
     If all five coefficients are 0, nothing may move. Where do your points land then?
@@ -352,7 +353,7 @@ def one_missing(x: Array, y: Array, *dist: float) -> Any:
 
 
 @PROJECT.mistake("bend")
-def r_for_r2(x: Array, y: Array, *dist: float) -> Any:
+def r_for_r2(x: Floats, y: Floats, *dist: float) -> Any:
     """the radial polynomial runs in r instead of r²
 
     With k1 alone, the displacement grows as the third power of the radius. How does yours?
@@ -364,7 +365,7 @@ PROJECT.mistake("bend", same_as=r_for_r2)(_bent((0.5, 1, 1.5), tangential=0.5))
 
 
 @PROJECT.mistake("bend")
-def r2_for_r(x: Array, y: Array, *dist: float) -> Any:
+def r2_for_r(x: Floats, y: Floats, *dist: float) -> Any:
     """r² is taken for r and raised to the powers 2, 4 and 6
 
     In your code, is the name of x² + y² the name of a radius or of its square?
@@ -377,7 +378,7 @@ PROJECT.mistake("bend", same_as=r2_for_r)(_bent((1, 4, 6)))
 
 
 @PROJECT.mistake("image")
-def bent_before_division(points: Array, normalise: Step, bend: Step, to_pixels: Step) -> Any:
+def bent_before_division(points: Floats, normalise: Step, bend: Step, to_pixels: Step) -> Any:
     """the distortion is applied before the division by Z
 
     r² has no unit. What unit does yours have?
@@ -387,7 +388,7 @@ def bent_before_division(points: Array, normalise: Step, bend: Step, to_pixels: 
 
 
 @PROJECT.mistake("image")
-def distortion_in_pixels(points: Array, normalise: Step, bend: Step, to_pixels: Step) -> Any:
+def distortion_in_pixels(points: Floats, normalise: Step, bend: Step, to_pixels: Step) -> Any:
     """the distortion is applied in pixels
 
     The polynomial wants x = X/Z, which is 1 at 45 degrees off the axis. How large is your r²?
@@ -396,7 +397,7 @@ def distortion_in_pixels(points: Array, normalise: Step, bend: Step, to_pixels: 
 
 
 @PROJECT.mistake("image", same_as=distortion_in_pixels)
-def distortion_of_centred_uv(points: Array, normalise: Step, bend: Step, to_pixels: Step) -> Any:
+def distortion_of_centred_uv(points: Floats, normalise: Step, bend: Step, to_pixels: Step) -> Any:
     cx, cy = to_pixels(0.0, 0.0, 1.0)
     u, v = to_pixels(*normalise(points))
     u, v = bend(u - cx, v - cy)
@@ -404,7 +405,7 @@ def distortion_of_centred_uv(points: Array, normalise: Step, bend: Step, to_pixe
 
 
 @PROJECT.mistake("columns")
-def output_swapped(u: Array, v: Array) -> Array:
+def output_swapped(u: Floats, v: Floats) -> Floats:
     """x and y are swapped in the output
 
     A pixel is (u, v), column first; a NumPy index is [row, column]. Which did you return?
@@ -413,7 +414,7 @@ def output_swapped(u: Array, v: Array) -> Array:
 
 
 @PROJECT.mistake("columns")
-def rounded(u: Array, v: Array) -> Array:
+def rounded(u: Floats, v: Floats) -> Floats:
     """the pixels are rounded to whole numbers
 
     A calibrated corner is known to a tenth of a pixel. What is left of that?
@@ -422,12 +423,12 @@ def rounded(u: Array, v: Array) -> Array:
 
 
 @PROJECT.mistake("columns", same_as=rounded)
-def truncated(u: Array, v: Array) -> Array:
+def truncated(u: Floats, v: Floats) -> Floats:
     return np.trunc(np.stack([u, v], axis=1))
 
 
 @PROJECT.mistake("columns")
-def half_pixel(u: Array, v: Array) -> Array:
+def half_pixel(u: Floats, v: Floats) -> Floats:
     """every pixel is half a pixel off
 
     OpenCV and RealSense give the *centre* of the top-left pixel the coordinates (0, 0). Which of
@@ -437,7 +438,7 @@ def half_pixel(u: Array, v: Array) -> Array:
 
 
 @PROJECT.mistake("columns", same_as=half_pixel)
-def half_pixel_less(u: Array, v: Array) -> Array:
+def half_pixel_less(u: Floats, v: Floats) -> Floats:
     return np.stack([u, v], axis=1) - 0.5
 
 
@@ -446,14 +447,14 @@ def half_pixel_less(u: Array, v: Array) -> Array:
 # The steps back. The third of x, y, w is 1 unless somebody multiplies from the wrong side.
 
 
-def _to_normalised(pixels: Array, K: Array) -> Any:
+def _to_normalised(pixels: Floats, K: Floats) -> Any:
     return (pixels[:, 0] - K[0, 2]) / K[0, 0], (pixels[:, 1] - K[1, 2]) / K[1, 1], 1.0
 
 
 def _iterate(rounds: int) -> Step:
     """The fixed-point iteration, so many rounds of it."""
 
-    def unbend(x: Array, y: Array, bend: Step, *dist: float) -> Any:
+    def unbend(x: Floats, y: Floats, bend: Step, *dist: float) -> Any:
         xd, yd = x, y
         for _ in range(rounds):
             bent_x, bent_y = bend(x, y)
@@ -463,16 +464,16 @@ def _iterate(rounds: int) -> Step:
     return unbend
 
 
-def _scale(x: Array, y: Array, w: Any, depth: Array) -> Any:
+def _scale(x: Floats, y: Floats, w: Any, depth: Floats) -> Any:
     return x * depth, y * depth, w * depth
 
 
-def _points(X: Array, Y: Array, Z: Array) -> Array:
+def _points(X: Floats, Y: Floats, Z: Floats) -> Floats:
     return np.stack([X, Y, Z], axis=1)
 
 
 def _build_deproject(steps: Mapping[str, Step]) -> Model:
-    def deproject(pixels: Array, depth: Array, K: Array, dist: Array | None = None) -> Any:
+    def deproject(pixels: Floats, depth: Floats, K: Floats, dist: Floats | None = None) -> Any:
         x, y, w = steps["to_normalised"](pixels, K)
         if dist is not None:
             read = steps["read"](*dist)
@@ -532,7 +533,7 @@ DEPROJECT = Exercise(
 
 
 @DEPROJECT.mistake("to_normalised")
-def inverse_missing(pixels: Array, K: Array) -> Any:
+def inverse_missing(pixels: Floats, K: Floats) -> Any:
     """K is applied where its inverse is needed
 
     K takes rays to pixels. Which way does this function go?
@@ -541,7 +542,7 @@ def inverse_missing(pixels: Array, K: Array) -> Any:
 
 
 @DEPROJECT.mistake("to_normalised", name="K_transposed")
-def inverse_transposed(pixels: Array, K: Array) -> Any:
+def inverse_transposed(pixels: Floats, K: Floats) -> Any:
     """the inverse of K is multiplied from the wrong side
 
     The equation says K⁻¹ times a column. Your pixels are rows: what has to be transposed?
@@ -551,18 +552,18 @@ def inverse_transposed(pixels: Array, K: Array) -> Any:
 
 
 @DEPROJECT.mistake("to_normalised", same_as=inverse_transposed, name="K_transposed")
-def inverse_transposed_and_divided(pixels: Array, K: Array) -> Any:
+def inverse_transposed_and_divided(pixels: Floats, K: Floats) -> Any:
     x, y, third = inverse_transposed(pixels, K)
     return x / third, y / third, 1.0
 
 
 @DEPROJECT.mistake("to_normalised", same_as=principal_point_forgotten)
-def principal_point_not_subtracted(pixels: Array, K: Array) -> Any:
+def principal_point_not_subtracted(pixels: Floats, K: Floats) -> Any:
     return pixels[:, 0] / K[0, 0], pixels[:, 1] / K[1, 1], 1.0
 
 
 @DEPROJECT.mistake("to_normalised")
-def principal_point_added(pixels: Array, K: Array) -> Any:
+def principal_point_added(pixels: Floats, K: Floats) -> Any:
     """the principal point is added
 
     The pixel at the principal point looks straight ahead. What are your x and y there?
@@ -571,7 +572,7 @@ def principal_point_added(pixels: Array, K: Array) -> Any:
 
 
 @DEPROJECT.mistake("to_normalised")
-def brackets_missing(pixels: Array, K: Array) -> Any:
+def brackets_missing(pixels: Floats, K: Floats) -> Any:
     """only the principal point is divided by fx and fy
 
     In `a - b / c`, what does Python do first?
@@ -580,7 +581,7 @@ def brackets_missing(pixels: Array, K: Array) -> Any:
 
 
 @DEPROJECT.mistake("to_normalised")
-def times_focal_length(pixels: Array, K: Array) -> Any:
+def times_focal_length(pixels: Floats, K: Floats) -> Any:
     """the pixels are multiplied by fx and fy
 
     Pixels from the principal point, and a focal length in pixels: which of × and ÷ gives X/Z?
@@ -589,22 +590,22 @@ def times_focal_length(pixels: Array, K: Array) -> Any:
 
 
 @DEPROJECT.mistake("to_normalised", same_as=fx_fy_swapped)
-def fx_fy_swapped_back(pixels: Array, K: Array) -> Any:
+def fx_fy_swapped_back(pixels: Floats, K: Floats) -> Any:
     return (pixels[:, 0] - K[0, 2]) / K[1, 1], (pixels[:, 1] - K[1, 2]) / K[0, 0], 1.0
 
 
 @DEPROJECT.mistake("to_normalised", same_as=fx_for_both)
-def fx_for_both_back(pixels: Array, K: Array) -> Any:
+def fx_for_both_back(pixels: Floats, K: Floats) -> Any:
     return (pixels[:, 0] - K[0, 2]) / K[0, 0], (pixels[:, 1] - K[1, 2]) / K[0, 0], 1.0
 
 
 @DEPROJECT.mistake("to_normalised", same_as=cx_cy_swapped)
-def cx_cy_swapped_back(pixels: Array, K: Array) -> Any:
+def cx_cy_swapped_back(pixels: Floats, K: Floats) -> Any:
     return (pixels[:, 0] - K[1, 2]) / K[0, 0], (pixels[:, 1] - K[0, 2]) / K[1, 1], 1.0
 
 
 @DEPROJECT.mistake("to_normalised")
-def input_swapped(pixels: Array, K: Array) -> Any:
+def input_swapped(pixels: Floats, K: Floats) -> Any:
     """x and y are swapped in the input
 
     A pixel is (u, v), column first. Which of your lines uses u?
@@ -613,18 +614,18 @@ def input_swapped(pixels: Array, K: Array) -> Any:
 
 
 @DEPROJECT.mistake("to_normalised", same_as=y_up)
-def y_up_back(pixels: Array, K: Array) -> Any:
+def y_up_back(pixels: Floats, K: Floats) -> Any:
     x, y, w = _to_normalised(pixels, K)
     return x, -y, w
 
 
 @DEPROJECT.mistake("to_normalised", same_as=half_pixel)
-def half_pixel_more_back(pixels: Array, K: Array) -> Any:
+def half_pixel_more_back(pixels: Floats, K: Floats) -> Any:
     return _to_normalised(pixels + 0.5, K)
 
 
 @DEPROJECT.mistake("to_normalised", same_as=half_pixel)
-def half_pixel_less_back(pixels: Array, K: Array) -> Any:
+def half_pixel_less_back(pixels: Floats, K: Floats) -> Any:
     return _to_normalised(pixels - 0.5, K)
 
 
@@ -632,7 +633,7 @@ def half_pixel_less_back(pixels: Array, K: Array) -> Any:
 
 
 @DEPROJECT.mistake("scale")
-def depth_along_ray(x: Array, y: Array, w: Any, depth: Array) -> Any:
+def depth_along_ray(x: Floats, y: Floats, w: Any, depth: Floats) -> Any:
     """the depth is taken along the ray instead of along Z
 
     A wall faces the camera. Does your function give all its pixels the same Z?
@@ -641,7 +642,7 @@ def depth_along_ray(x: Array, y: Array, w: Any, depth: Array) -> Any:
 
 
 @DEPROJECT.mistake("scale")
-def millimetres(x: Array, y: Array, w: Any, depth: Array) -> Any:
+def millimetres(x: Floats, y: Floats, w: Any, depth: Floats) -> Any:
     """your points are not in metres
 
     The depth comes in metres and the points leave in metres. What do you multiply it by?
@@ -650,12 +651,12 @@ def millimetres(x: Array, y: Array, w: Any, depth: Array) -> Any:
 
 
 @DEPROJECT.mistake("scale", same_as=millimetres)
-def through_thousand(x: Array, y: Array, w: Any, depth: Array) -> Any:
+def through_thousand(x: Floats, y: Floats, w: Any, depth: Floats) -> Any:
     return _scale(x, y, w, depth / 1000)
 
 
 @DEPROJECT.mistake("scale")
-def not_scaled(x: Array, y: Array, w: Any, depth: Array) -> Any:
+def not_scaled(x: Floats, y: Floats, w: Any, depth: Floats) -> Any:
     """x and y are not multiplied by the depth
 
     Two pixels of one ray at 0.5 m and at 1 m: is X the same for both?
@@ -664,7 +665,7 @@ def not_scaled(x: Array, y: Array, w: Any, depth: Array) -> Any:
 
 
 @DEPROJECT.mistake("scale")
-def divided_by_depth(x: Array, y: Array, w: Any, depth: Array) -> Any:
+def divided_by_depth(x: Floats, y: Floats, w: Any, depth: Floats) -> Any:
     """x and y are divided by the depth
 
     Of two points on one ray, the farther one is also farther from the axis. Is yours?
@@ -673,7 +674,7 @@ def divided_by_depth(x: Array, y: Array, w: Any, depth: Array) -> Any:
 
 
 @DEPROJECT.mistake("scale")
-def depth_forgotten(x: Array, y: Array, w: Any, depth: Array) -> Any:
+def depth_forgotten(x: Floats, y: Floats, w: Any, depth: Floats) -> Any:
     """the depth is forgotten: Z is 1 everywhere
 
     Your points lie on a plane at 1 m. What says how far along its ray each of them is?
@@ -692,7 +693,7 @@ DEPROJECT.mistakes += [
 
 
 @DEPROJECT.mistake("unbend")
-def distorted_again(x: Array, y: Array, bend: Step, *dist: float) -> Any:
+def distorted_again(x: Floats, y: Floats, bend: Step, *dist: float) -> Any:
     """the distortion is applied once more instead of being inverted
 
     Project your answer. Do you come back to the pixel that you started from?
@@ -701,7 +702,7 @@ def distorted_again(x: Array, y: Array, bend: Step, *dist: float) -> Any:
 
 
 @DEPROJECT.mistake("unbend")
-def one_step(x: Array, y: Array, bend: Step, *dist: float) -> Any:
+def one_step(x: Floats, y: Floats, bend: Step, *dist: float) -> Any:
     """the inversion stops after one step (flipping the signs of the coefficients is one, too)
 
     Project your answer: close, but not back. What would a second step do?
@@ -712,7 +713,7 @@ def one_step(x: Array, y: Array, bend: Step, *dist: float) -> Any:
 def _divide(rounds: int) -> Step:
     """OpenCV's iteration: subtract the tangential part, divide by the radial factor."""
 
-    def unbend(x: Array, y: Array, bend: Step, *dist: float) -> Any:
+    def unbend(x: Floats, y: Floats, bend: Step, *dist: float) -> Any:
         k1, k2, p1, p2, k3 = dist
         xd, yd = x, y
         for _ in range(rounds):
@@ -736,7 +737,7 @@ def too_few_rounds() -> None:
 def _overwritten(rounds: int) -> Step:
     """The iteration that compares with its own last guess: xd and x are one array, say."""
 
-    def target_overwritten(x: Array, y: Array, bend: Step, *dist: float) -> Any:
+    def target_overwritten(x: Floats, y: Floats, bend: Step, *dist: float) -> Any:
         """the iteration compares with its own last guess
 
         Compare with `xd`, which must not change, in every round. Does yours? (After `x = xd`,

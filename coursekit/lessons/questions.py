@@ -80,7 +80,7 @@ class Checkpoint:
         raise NotImplementedError
 
     def _repr_mimebundle_(self, **kwargs: Any) -> dict[str, Any]:
-        widget: dict[str, Any] = _panel(self)._repr_mimebundle_(**kwargs)
+        widget: dict[str, Any] = panel(self)._repr_mimebundle_(**kwargs)
         return widget | {"text/plain": repr(self), "text/html": self._without_kernel()}
 
     def _without_kernel(self) -> str:
@@ -94,7 +94,15 @@ class Checkpoint:
 
 @dataclass(frozen=True, repr=False)
 class Choice(Checkpoint):
-    """A question with options A, B, C, ..., exactly one of them right."""
+    """A question with options A, B, C, ..., exactly one of them right.
+
+    >>> near = Option("nearer", "The farther one is smaller.", right=True)
+    >>> choice = Choice("a.b", "Which is larger?", (near, Option("farther", "It looks smaller.")))
+    >>> choice.judge("B")
+    B, farther: not this one.
+    It looks smaller.
+    Think again, and choose another.
+    """
 
     options: tuple[Option, ...]
 
@@ -136,14 +144,18 @@ class Choice(Checkpoint):
 
 @dataclass(frozen=True, repr=False)
 class Number(Checkpoint):
-    """A question whose answer is a number; classic wrong numbers are recognised."""
+    """A question whose answer is a number; classic wrong numbers are recognised.
+
+    value, and those of the classics: in `unit`. why: said with the right answer. hint: said with a
+    wrong one that is no classic. tolerance: relative, of the right one and of each classic.
+    """
 
     value: float
     unit: str
     why: str
     hint: str
     classics: tuple[Classic, ...]
-    tolerance: float = 0.02  # relative
+    tolerance: float = 0.02
 
     def judge(self, given: Any) -> Verdict:
         """The verdict on a number, or on text such as "2.4" or "2,4 mm"."""
@@ -213,7 +225,7 @@ def _readings(given: Any, unit: str) -> list[float]:
     return [number for number in numbers if math.isfinite(number) and factor]
 
 
-def _panel(checkpoint: Checkpoint) -> Any:
+def panel(checkpoint: Checkpoint) -> Any:
     """The widget: input, a button that commits, and the verdict below."""
     import ipywidgets
 
@@ -253,15 +265,12 @@ def load(lesson: str) -> tuple[tuple[Checkpoint, ...], tuple[Objective, ...]]:
     def checkpoint(name: str, asked: dict[str, Any]) -> Checkpoint:
         question = _single_spaced(asked["question"])
         if "right" in asked:
-            options = (
-                Option(*map(_single_spaced, asked[letter]), right=letter == asked["right"])
-                for letter in LETTERS
-                if letter in asked
-            )
+            texts = {k: map(_single_spaced, asked[k]) for k in LETTERS if k in asked}
+            options = (Option(next(t), next(t), k == asked["right"]) for k, t in texts.items())
             return Choice(name, question, tuple(options))
         slips = tuple(Classic(value, _single_spaced(why)) for value, why in asked["slips"])
-        texts = (_single_spaced(asked[key]) for key in ("why", "hint"))
-        return Number(name, question, asked["value"], asked["unit"], *texts, slips)
+        why, hint = _single_spaced(asked["why"]), _single_spaced(asked["hint"])
+        return Number(name, question, asked["value"], asked["unit"], why, hint, slips)
 
     return (
         tuple(

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fake_realsense import real_library
 
 from coursekit.cameras import CameraError, open_camera
-from coursekit.cameras.librealsense import LibraryMissing, load_librealsense
 from coursekit.geometry import deproject
 
 pytestmark = pytest.mark.real
@@ -27,10 +27,7 @@ def folder():
 
 @pytest.fixture(scope="module")
 def rs():
-    try:
-        return load_librealsense()
-    except LibraryMissing as missing:
-        pytest.skip(str(missing))
+    return real_library()
 
 
 @pytest.fixture
