@@ -31,7 +31,6 @@ from coursekit.cameras.capture import (
     guidance,
     is_new,
     is_still,
-    middle_of,
     outline,
 )
 from coursekit.cameras.simulated import SimulatedCamera
@@ -52,7 +51,7 @@ def kind(board):
 
 def pose(angles_deg, at_m, board=BOARD):
     R = Rotation.from_euler("xyz", angles_deg, degrees=True)
-    return make_transform(R, np.array(at_m) - R.apply(middle_of(board)))
+    return make_transform(R, np.array(at_m) - R.apply(board.middle))
 
 
 POSES = (
@@ -412,7 +411,7 @@ def test_flat_views_lack_all_tilts():
 @pytest.mark.parametrize("angles_deg", [(30, 0, 0), (-30, 0, 0), (0, 30, 0), (0, -30, 0)])
 def test_a_tilt_counts_for_the_edge_that_is_farther_away(angles_deg):
     T = pose(angles_deg, (0, 0, 0.45))
-    farthest = BOARD.points[transform_points(T, BOARD.points)[:, 2].argmax()] - middle_of(BOARD)
+    farthest = BOARD.points[transform_points(T, BOARD.points)[:, 2].argmax()] - BOARD.middle
     axis = 0 if angles_deg[1] else 1
     away = (("left", "right"), ("top", "bottom"))[axis][int(farthest[axis] > 0)]
     lacks = guidance(session([T] * 3), BOARD, LENS.size, LENS).missing
@@ -440,7 +439,7 @@ def test_the_words_describe_the_target():
     seen = []
     for _ in range(12):
         guide = guidance(session(seen), BOARD, LENS.size, LENS)
-        middle = transform_points(guide.target, middle_of(BOARD))
+        middle = transform_points(guide.target, BOARD.middle)
         assert f"{middle[2]:.2f} m from the camera" in guide.next
         u, v = project(middle, LENS.K)
         assert ("left" in guide.next.split(",")[0]) == (u < 640 / 3)

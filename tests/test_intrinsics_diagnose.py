@@ -31,7 +31,7 @@ from coursekit.intrinsics.diagnosis import (
 )
 from coursekit.intrinsics.fit import calibrate
 from coursekit.simulation.corner_sessions import Effects, Truth, corner_session
-from coursekit.simulation.diagnosis_power import power
+from tools import make_data
 
 NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 FIRST_SEED = 100_000
@@ -113,16 +113,14 @@ def test_the_stored_power_is_what_is_measured() -> None:
         assert (np.diff(named) >= -10).all()
         assert named[-1] >= 95
         middle = int(np.argmin(np.abs(named - 50)))
-        scale = 100.0 if row["unit"] == "%" else 1000.0 if row["unit"] == "mm" else 1.0
-        share = power(cause, [row["sizes"][middle] / scale], CHARUCO, LENS, range(200, 220))[0]
+        again = make_data.times_named(cause, row["sizes"][middle], range(200, 220))
         low, high = binom.interval(0.999, 20, named[middle] / sessions)
-        assert low - 3 <= 20 * share <= high + 3, cause
+        assert low - 3 <= again <= high + 3, cause
 
 
 def test_power_grows_with_the_effect() -> None:
     seeds = range(FIRST_SEED + 2000, FIRST_SEED + 2004)
-    share = power("bowed_board", [2e-5, 5e-4], CHARUCO, LENS, seeds, views=20)
-    assert share.tolist() == [0.0, 1.0]
+    assert [make_data.times_named("bowed_board", mm, seeds) for mm in (0.02, 0.5)] == [0, 4]
 
 
 def test_two_causes_are_both_named_and_measured() -> None:

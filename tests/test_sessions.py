@@ -40,7 +40,7 @@ def test_the_intervals_of_rendered_sessions_hold_the_hidden_truth(seeds: range) 
     """At least 17 of 20 intervals of each value (nightly); all but one of three otherwise."""
     held = {"scale error": 0, "disparity offset": 0}
     for seed in seeds:
-        fit, camera = session(seed, frames=25)
+        fit, camera = session(seed, frames=25 if NIGHTLY else 8)
         truth = camera.reveal()
         low, high = fit.scale_error_interval
         held["scale error"] += low <= truth.scale_error <= high

@@ -29,13 +29,13 @@ from coursekit import checks, results
 from coursekit.arrays import Bools, Floats, Image
 from coursekit.boards import Board, BoardNotFound, Detection, Detections, Skipped, detect
 from coursekit.boards.detector import FEWEST_CORNERS, SESSION
-from coursekit.boards.find import find
+from coursekit.boards.find import find_corners
+from coursekit.boards.view import in_view, seen
 from coursekit.cameras.camera import Camera
 from coursekit.cameras.frames import CameraError
 from coursekit.cameras.simulated import SimulatedCamera
-from coursekit.geometry import Intrinsics, deproject, invert_transform, make_transform, project
+from coursekit.geometry import Intrinsics, make_transform, project
 from coursekit.geometry import transform_points as through
-from coursekit.simulation.board_images import T_board_sheet
 
 FOLDER = "03_views"
 STILL_FRAMES = 5  # over so many frames in a row ...
@@ -61,7 +61,7 @@ TILTS_DEG = (25.0, 40.0)  # of the views that are proposed; some are flat
 ROLLS_DEG = (0.0, 12.0, -12.0)
 FILLS = (0.80, 0.60, 0.45)  # of the image, by the board: near, middle, far
 PLACES = (0.12, 0.5, 0.88)  # of the width and height: where the board's middle is aimed at
-BORDER_PX = 10.0  # a corner nearer to the image's border is not counted on
+ROOM_PX = 10.0  # a corner nearer to the image's border is not counted on
 PROPOSED_SHARE = 0.75  # of a ChArUco board's corners; a checkerboard must be seen whole
 
 AWAY = ("right", "bottom right", "bottom", "bottom left", "left", "top left", "top", "top right")
@@ -174,12 +174,11 @@ def _moved(
 
 def _by_hand(T_camera_board: Floats, board: Board, rng: np.random.Generator) -> Floats:
     """A pose nearby: nobody holds a board exactly as asked."""
-    middle = middle_of(board)
-    at = through(T_camera_board, middle)
+    at = through(T_camera_board, board.middle)
     turn = Rotation.from_rotvec(np.radians(HAND_DEG) * rng.standard_normal(3))
     R = turn.as_matrix() @ T_camera_board[:3, :3]
     at = at + HAND_SHARE * at[2] * rng.standard_normal(3)
-    return make_transform(R, at - R @ middle)
+    return make_transform(R, at - R @ board.middle)
 
 
 def _held(
@@ -281,7 +280,7 @@ class _Waiting:
 
 def see(image: Image, board: Board) -> Detection | None:
     """The board in a grey image, or None; unlike `detect`, without looking for the reason why."""
-    found = find(image, board)
+    found = find_corners(image, board)
     if found is None or len(found[0]) < FEWEST_CORNERS:
         return None
     try:
@@ -432,14 +431,7 @@ def outline(board: Board, T_camera_board: Floats, lens: Intrinsics) -> Floats:
 
     They are NaN where they are behind the camera.
     """
-    wide, high = board.size_m
-    corners = np.array([[0, 0, 0], [wide, 0, 0], [wide, high, 0], [0, high, 0]], float)
-    return project(through(T_camera_board @ T_board_sheet(board), corners), lens.K, lens.dist)
-
-
-def middle_of(board: Board) -> Floats:
-    """The middle of the pattern, (3,) m, in the board's frame."""
-    return through(T_board_sheet(board), np.array([*board.size_m, 0.0]) / 2)
+    return project(through(T_camera_board, board.outline), lens.K, lens.dist)
 
 
 def _coverage_lack(views: Sequence[_View]) -> str:
@@ -497,7 +489,7 @@ def _most_useful(views: Sequence[_View], proposals: Sequence[_View]) -> _View:
 
 def _fill(view: _View, proposals: Sequence[_View]) -> int:
     """Which of FILLS the view's distance is nearest to."""
-    distances = sorted({proposal.distance_m for proposal in proposals})
+    distances = sorted({round(proposal.distance_m, 6) for proposal in proposals})
     return int(np.argmin(np.abs(np.log(np.array(distances) / view.distance_m))))
 
 
@@ -525,20 +517,19 @@ def _aimed(
     board: Board, lens: Intrinsics, facing: Rotation, distance_m: float, aim_px: Floats
 ) -> _View | None:
     """The view nearest to this aim of the board's middle that shows enough of the board."""
-    T_sheet_board = invert_transform(T_board_sheet(board))
-    middle = np.array([*board.size_m, 0.0]) / 2
     needed = PROPOSED_SHARE if board.kind == "charuco" else 1.0
-    centre = np.array(lens.size) / 2
-    for share in np.linspace(1.0, 0.0, 11):
-        ray = deproject(centre + share * (aim_px - centre), distance_m, lens.K, lens.dist)
-        if not np.isfinite(ray).all():
-            continue
-        T = make_transform(facing, ray - facing.apply(middle)) @ T_sheet_board
-        pixels = project(through(T, board.points), lens.K, lens.dist)
-        room = np.minimum(pixels, np.array(lens.size) - 1 - pixels).min(axis=-1)
-        if np.mean(room > BORDER_PX) >= needed:
-            return _view(T, pixels[room > BORDER_PX], board, lens)
-    return None
+
+    def shown(T: Floats) -> Bools:
+        return seen(board.points, T, lens, ROOM_PX)
+
+    R = facing.as_matrix() @ board.T_board_sheet[:3, :3].T
+    T = in_view(
+        aim_px, distance_m, R, board.middle, lens, lambda T: bool(shown(T).mean() >= needed), 11
+    )
+    if T is None:
+        return None
+    pixels = project(through(T, board.points[shown(T)]), lens.K, lens.dist)
+    return _view(T, pixels, board, lens)
 
 
 def _seen(detection: Detection, board: Board, lens: Intrinsics) -> _View:
@@ -554,10 +545,9 @@ def _view(T: Floats, pixels: Floats, board: Board, lens: Intrinsics) -> _View:
     column, row = (pixels * [across, down] // lens.size).astype(int).T
     cells = np.zeros((down, across), bool)
     cells[np.clip(row, 0, down - 1), np.clip(column, 0, across - 1)] = True
-    T_camera_sheet = T @ T_board_sheet(board)
-    middle = through(T_camera_sheet, np.array([*board.size_m, 0.0]) / 2)
-    seen_at = project(middle, lens.K, lens.dist)
-    return _View(T, cells, T_camera_sheet[:3, 2], float(middle[2]), seen_at)
+    middle = through(T, board.middle)
+    normal = (T @ board.T_board_sheet)[:3, 2]
+    return _View(T, cells, normal, float(middle[2]), project(middle, lens.K, lens.dist))
 
 
 def _in_words(view: _View, size: tuple[int, int]) -> str:

@@ -17,7 +17,7 @@ from coursekit.cameras.camera import Camera, HiddenTruth
 from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Frame
 from coursekit.cameras.recording import check_depth_scale, check_distance
 from coursekit.geometry import Intrinsics, invert_transform
-from coursekit.simulation import Rig, Scene, View, artefact_scene, render, tabletop, wall_scene
+from coursekit.simulation import Rig, RigView, Scene, artefact_scene, render, tabletop, wall_scene
 from coursekit.simulation.board_images import board_scene, check_pose, render_board
 from coursekit.specifications import Unit
 
@@ -215,7 +215,7 @@ def _scene(name: str, distance_m: float) -> Scene:
 
 
 @lru_cache(maxsize=6)
-def _view(rig: Rig, scene: Scene) -> View:
+def _view(rig: Rig, scene: Scene) -> RigView:
     """The rig before a scene, 8 MB: who goes back to a distance does not wait for it again."""
     return rig.look_at(scene)
 
