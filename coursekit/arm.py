@@ -453,7 +453,11 @@ class SimulatedArm:
     ) -> None:
         self.nominal = nominal or widowx()
         self.errors = errors or ArmErrors()
-        self._truth = _hidden(seed, self.errors, self.nominal)
+        rng, size = np.random.default_rng([seed, zlib.crc32(b"arm")]), self.errors
+        offset = size.offset_rad * rng.standard_normal(6)
+        play = size.play_rad * np.abs(rng.standard_normal(6))
+        link = np.repeat([size.link_rad, size.link_m], 3) * rng.standard_normal((7, 6))
+        self._truth = ArmTruth(offset, play, link, with_link_errors(self.nominal, link))
         self._rng = np.random.default_rng([seed, zlib.crc32(b"moves")])
         self._at = np.array(HOME)
         self._last = self._rng.choice([-1.0, 1.0], 6)  # direction of each joint's last move
@@ -487,15 +491,6 @@ class SimulatedArm:
         loaded = load_side(self.nominal, read)
         side = np.where(loaded != 0, loaded, -directions)
         return read + self._truth.offset_rad + side * self._truth.play_rad
-
-
-def _hidden(seed: int, errors: ArmErrors, nominal: Arm) -> ArmTruth:
-    rng = np.random.default_rng([seed, zlib.crc32(b"arm")])
-    offset = errors.offset_rad * rng.standard_normal(6)
-    play = errors.play_rad * np.abs(rng.standard_normal(6))
-    sizes = np.repeat([errors.link_rad, errors.link_m], 3)
-    link = sizes * rng.standard_normal((7, 6))
-    return ArmTruth(offset, play, link, with_link_errors(nominal, link))
 
 
 def with_link_errors(arm: Arm, link: ArrayLike) -> Arm:
