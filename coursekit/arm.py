@@ -113,11 +113,13 @@ class Arm:
         return self._jacobian(frames, self._tool(frames, tool))
 
     def _jacobian(self, frames: Floats, T: Floats) -> Floats:
+        """`jacobian` of a tool at T (..., 4, 4) from the links' frames (..., 7, 4, 4)."""
         axes = (frames[..., 1:, :3, :3] @ self.axes[:, :, None])[..., 0]
         arms = T[..., None, :3, 3] - frames[..., 1:, :3, 3]
         return np.swapaxes(np.concatenate([axes, np.cross(axes, arms)], axis=-1), -1, -2)
 
     def _tool(self, frames: Floats, tool: Tool) -> Floats:
+        """Where the tool is, (..., 4, 4), from the links' frames (..., 7, 4, 4)."""
         choice("tool", tool, get_args(Tool))
         flange = frames[..., 6, :, :]
         return flange @ self.T_flange_gripper if tool == "gripper" else flange
@@ -211,6 +213,7 @@ class Arm:
         return q.reshape(*shape, 6), reached.reshape(shape)
 
     def _descend(self, targets: Floats, q: Floats) -> tuple[Floats, Mask]:
+        """Gauss-Newton from angles q (n, 6) to poses (n, 4, 4): the angles, and which arrived."""
         q = self._into_limits(q)
         reached, open_ = np.zeros(len(q), bool), np.arange(len(q))
         for _ in range(IK_STEPS):
@@ -227,6 +230,7 @@ class Arm:
         return q, reached
 
     def _into_limits(self, q: Floats) -> Floats:
+        """Angles (n, 6), rad, brought back inside their limits."""
         low, high = self.limits.T
         wrapped = low + (q - low) % (2 * np.pi)  # a joint that can turn all the way goes round
         return np.clip(np.where(high - low > 2 * np.pi - 1e-9, wrapped, q), low, high)

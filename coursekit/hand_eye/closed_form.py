@@ -97,7 +97,12 @@ def rotation_by_axes(A: Floats, B: Floats) -> Floats:
 
 
 def translation_half(A: Floats, B: Floats, R_X: Floats) -> Floats:
-    """t_X (..., 3) in m of (R_A - 1) t_X = R_X t_B - t_A, by least squares over p pairs."""
+    """t_X (..., 3) in m of (R_A - 1) t_X = R_X t_B - t_A, by least squares over p pairs.
+
+    A, B (..., p, 4, 4) and R_X (..., 3, 3), which comes first: an error of R_X acts on t_B, so the
+    board's distance decides how much of it ends up in t_X. Raises LinAlgError where the rotations
+    of A have fewer than two axes and the normal matrix is singular.
+    """
     rows = A[..., :3, :3] - np.eye(3)
     right = B[..., :3, 3] @ np.swapaxes(R_X, -1, -2) - A[..., :3, 3]
     normal = np.einsum("...pki,...pkj->...ij", rows, rows)

@@ -88,7 +88,8 @@ def held_out(
 
     T_base_gripper (m, 4, 4), m, and seen as in a session; board and intrinsics are the result's
     unless given. q (m, 6), rad, or fk for these poses apply what the fit has learnt of the arm's
-    own errors; without them the arm is taken at its word. Raises ValueError as a session does.
+    own errors; without them the arm is taken at its word. Compare its rms_px with the result's own:
+    where it is much larger, X fits the noise of its poses. Raises ValueError as a session does.
     """
     given, fit = result.session, result.refined
     board, intrinsics = board or given.board, intrinsics or given.intrinsics
