@@ -16,17 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from coursekit import kernels
 from coursekit.arrays import ArrayLike, Floats, NDArray
-from coursekit.checks import (
-    array,
-    choice,
-    instance,
-    number,
-    positive,
-    transform,
-    transforms,
-    want,
-    whole,
-)
+from coursekit.checks import array, instance, number, positive, transform, transforms, want, whole
 
 DISTORTION_MODELS = ("none", "brown_conrady", "inverse_brown_conrady", "modified_brown_conrady")
 _NEWTON_STEPS = 50
@@ -55,7 +45,8 @@ class Intrinsics:
         lengths = {"width": whole, "height": whole, "fx": positive, "fy": positive}
         for name, check in (lengths | {"cx": number, "cy": number}).items():
             object.__setattr__(self, name, check(name, getattr(self, name)))
-        choice("model", self.model, DISTORTION_MODELS)
+        known = ", ".join(DISTORTION_MODELS)
+        want(self.model in DISTORTION_MODELS, "model", self.model, f"one of {known}")
         coeffs = array("coeffs", self.coeffs, (5,), finite=True)
         object.__setattr__(self, "coeffs", tuple(coeffs.tolist()))
 
@@ -300,25 +291,20 @@ def align_depth_to_color(
     shape = (depth_intrinsics.height, depth_intrinsics.width)
     want(depth.shape == shape, "depth_m", depth.shape, f"{shape} as the intrinsics say")
     T = transform("T_color_depth", T_color_depth)
-    source = _align_sources(depth, depth_intrinsics, color_intrinsics, T)
-    grid = pixel_grid(*depth_intrinsics.size)
-    points = deproject(grid, depth, depth_intrinsics.K, depth_intrinsics.dist)
-    z_color = (points @ T[2, :3] + T[2, 3]).ravel()
-    return np.where(source >= 0, z_color[source], 0.0).astype(np.float32)
-
-
-def _align_sources(depth: Floats, of: Intrinsics, to: Intrinsics, T: Floats) -> NDArray[np.int64]:
-    """For each colour pixel the flat index of the nearest depth pixel that covers it, else -1."""
-
+    of, to = depth_intrinsics, color_intrinsics
     corners = pixel_grid(of.width + 1, of.height + 1) - 0.5
     rays = deproject(corners, np.ones(corners.shape[:2]), of.K, of.dist)
 
     def landing(ray: Floats) -> Floats:
+        """The colour pixels (H, W, 2) in which corners of the depth pixels land."""
         points = ray * np.where(depth > 0, depth, np.nan)[..., None]
         return np.floor(project(transform_points(T, points), to.K, to.dist) + 0.5)
 
     first, last = landing(rays[:-1, :-1]), landing(rays[1:, 1:])
-    return kernels.nearest_footprint(depth, first, last, to.width, to.height)
+    source = kernels.nearest_footprint(depth, first, last, to.width, to.height)
+    points = deproject(pixel_grid(*of.size), depth, of.K, of.dist)
+    z_color = (points @ T[2, :3] + T[2, 3]).ravel()
+    return np.where(source >= 0, z_color[source], 0.0).astype(np.float32)
 
 
 # --- rigid transforms ---

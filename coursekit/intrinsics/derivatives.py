@@ -186,8 +186,23 @@ def scaled_inverse(matrix: Floats) -> Floats:
     A direction that the data do not determine at all (to double precision) gets a variance that
     is huge, not an exception: that it is undetermined is what the reader must learn.
     """
-    scale = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-    scale = np.where(scale > 0, scale, 1.0)
-    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
+    scale, values, vectors = _scaled_parts(matrix)
     values = np.maximum(values, len(values) * np.finfo(float).eps * values[-1])
     return (vectors / values) @ vectors.T / np.outer(scale, scale)
+
+
+def scaled_root(covariance: Floats) -> Floats:
+    """A root (p, m) of a covariance (p, p) with very different units: root root^T is it again.
+
+    m < p where some numbers, or combinations of them, are exact.
+    """
+    scale, values, vectors = _scaled_parts(covariance)
+    kept = values > 1e-12
+    return np.asarray(scale[:, None] * vectors[:, kept] * np.sqrt(values[kept]))
+
+
+def _scaled_parts(matrix: Floats) -> tuple[Floats, Floats, Floats]:
+    """Scale (p,) that makes the diagonal 1, and eigenvalues and vectors of what is left."""
+    scale = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    scale = np.where(scale > 0, scale, 1.0)
+    return scale, *np.linalg.eigh(matrix / np.outer(scale, scale))

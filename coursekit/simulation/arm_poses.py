@@ -257,5 +257,8 @@ def degenerate_poses(mount: Mount, design: str) -> Floats:
     of up to 30 degrees about the vertical, in order; "small_rotations", of up to 3 degrees about
     any axis. The arm is allowed to go there in the course's own rig of this mount, and sees the
     board.
+
+    >>> degenerate_poses("eye_in_hand", "grid").shape
+    (4, 25, 6)
     """
     return np.array(json.loads(DEGENERATE.read_text("utf-8"))[mount][design])

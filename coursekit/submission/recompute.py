@@ -72,6 +72,7 @@ def _check_keys(where: str, found: dict[str, Any], wanted: Collection[str]) -> N
 
 
 def _check_rule(section: str, key: str, value: Any, most: float) -> None:
+    """ValueError unless the value of a key in rubric.toml is a number that can be meant."""
     name, least = f"{section}.{key}", float(key in AT_LEAST_ONE)
     if key == "distances_m":
         want(isinstance(value, list) and value, name, value, "a list of numbers")
@@ -164,6 +165,7 @@ def recompute(submission: Submission) -> Recomputed:
 
 
 def _measured(stack: Stack, scale: float, tape: float) -> Measured:
+    """What one stack says; scale: metres of a count, tape: std of a reading in m."""
     _, height, width = stack.counts.shape
     with np.errstate(all="ignore"):  # depths that no camera gives; what is not finite is dropped
         stats = window_stats(stack.counts, (0, 0, width, height), scale)
@@ -194,6 +196,7 @@ def _invalid(stack: Stack) -> Estimate:
 def _law(
     submission: Submission, at: tuple[Measured, ...], exponent: float | None
 ) -> tuple[NoiseFit | None, str]:
+    """The noise law through the stds with this exponent (None: free), or why there is none."""
     known = [m for m in at if m.std is not None]
     camera = submission.camera
     if not known:
@@ -217,4 +220,5 @@ def _law(
 
 
 def _finite(value: float) -> float | None:
+    """A number, or None in place of NaN and infinity."""
     return float(value) if math.isfinite(value) else None

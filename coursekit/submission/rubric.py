@@ -124,7 +124,11 @@ class _Question(NamedTuple):
 
 
 def grade(submission: Submission) -> Grade:
-    """Compare what a submission claims with what its raw depths say."""
+    """Compare what a submission claims with what its raw depths say.
+
+    Nothing that came with the bundle runs, and the claims are never taken for granted: what is
+    found comes from the raw depths alone. Raises ValueError for a rubric.toml that cannot be.
+    """
     found, prints = recompute(submission), fingerprint(submission)
     flags = data_flags(submission, found, prints)
     return Grade(submission.student, judged(submission, found), flags, found, prints)
@@ -157,6 +161,7 @@ def judged(submission: Submission, found: Recomputed) -> tuple[Item, ...]:
 
 
 def _at_distances(submission: Submission, found: Recomputed) -> Iterator[Item]:
+    """The items at each distance that is asked for, and at others that were measured."""
     points, wanted = grading_rules()["points"], grading_rules()["exercise"]["distances_m"]
     chosen = _chosen(wanted, found.at)
     for z in wanted:
@@ -178,6 +183,7 @@ def _chosen(wanted: Sequence[float], at: Sequence[Measured]) -> dict[float, Meas
 
 
 def _row(submission: Submission, z: float) -> TableRow | None:
+    """The row of the student's table at a distance."""
     near = [r for r in submission.claims.rows if abs(r.distance_m - z) <= SAME_DISTANCE_M]
     return min(near, key=lambda r: abs(r.distance_m - z), default=None)
 
@@ -185,6 +191,7 @@ def _row(submission: Submission, z: float) -> TableRow | None:
 def _one_distance(
     submission: Submission, z: float, m: Measured | None, points: dict[str, float]
 ) -> Iterator[Item]:
+    """Raw depths and the five numbers of the table at z; m: what was measured there."""
     yield _data(_Question("data", points["data"], f" at {z:.2f} m"), z, m)
     row = None if m is None else _row(submission, m.distance_m)
     for topic, (field, judge) in JUDGES.items():
@@ -199,6 +206,7 @@ def _one_distance(
 
 
 def _data(asked: _Question, z: float, m: Measured | None) -> Item:
+    """Whether there are raw depths enough: frames, and a window that is large enough."""
     exercise = grading_rules()["exercise"]
     needed, side = exercise["frames"], exercise["window_px"]
     if m is None:
@@ -221,6 +229,7 @@ def _data(asked: _Question, z: float, m: Measured | None) -> Item:
 
 
 def _bias(asked: _Question, _: Submission, m: Measured, claim: float) -> Item:
+    """Mean depth minus the distance by tape, mm; the sign is the commonest mistake."""
     if m.bias is None:
         return _unknown(asked, claim)
     found, step, z = m.bias.value, 1e3 * m.scale_m, 1e3 * m.distance_m
@@ -240,6 +249,10 @@ def _bias(asked: _Question, _: Submission, m: Measured, claim: float) -> Item:
 
 
 def _bias_se(asked: _Question, submission: Submission, m: Measured, claim: float) -> Item:
+    """The standard error of the bias, mm: of the mean depth, as the frames correlate.
+
+    With the tape's error or without it is right; it is itself known to a part only.
+    """
     if m.bias is None or m.bias_se_mm is None or m.bias_se_apart_mm is None:
         return _unknown(asked, claim)
     both, apart, tape = m.bias_se_mm, m.bias_se_apart_mm, 1e3 * submission.tape_sigma_m
@@ -272,6 +285,7 @@ def _bias_se(asked: _Question, submission: Submission, m: Measured, claim: float
 
 
 def _std(asked: _Question, _: Submission, m: Measured, claim: float) -> Item:
+    """The std of one pixel over time, mm, the pixels' variances averaged."""
     if m.std is None:
         return _unknown(asked, claim)
     found, n, stats = m.std.value, m.stats.n_frames, m.stats
@@ -304,6 +318,7 @@ def _std(asked: _Question, _: Submission, m: Measured, claim: float) -> Item:
 
 
 def _std_se(asked: _Question, _: Submission, m: Measured, claim: float) -> Item:
+    """The standard error of that std, mm: std / sqrt(2 dof), dof the effective ones."""
     if m.std is None:
         return _unknown(asked, claim)
     found, std = m.std.se, m.std.value
@@ -325,6 +340,7 @@ def _std_se(asked: _Question, _: Submission, m: Measured, claim: float) -> Item:
 
 
 def _invalid(asked: _Question, _: Submission, m: Measured, claim: float) -> Item:
+    """The part of all samples (pixels times frames) that have no depth."""
     found, tolerance = m.invalid.value, _tolerance("invalid", m.invalid.se)
 
     def mistakes() -> Iterator[_Mistake]:
@@ -364,6 +380,7 @@ def _other_units(found: float, tolerance: float, step_mm: float) -> Iterator[_Mi
 
 
 def _plot(asked: _Question, submission: Submission, found: Recomputed) -> Item:
+    """The student's figure: measured stds as in the raw depths or the table, and a prediction."""
     plot = submission.plot
     measured = {m.distance_m: m.std for m in found.at if m.std is not None}
     if plot is None or not plot.distances_m:
@@ -461,6 +478,7 @@ def _prediction(asked: _Question, plot: Plot, shows: str, found_mm: Sequence[flo
 
 
 def _sigma_d(asked: _Question, submission: Submission, found: Recomputed) -> Item:
+    """The std of disparity, px, from sigma_Z = Z^2 sigma_d / (fx B) through all distances."""
     claim, law, camera = submission.claims.sigma_d_px, found.law, submission.camera
     if law is None:
         return _no_law(asked, claim, found)
@@ -493,6 +511,7 @@ def _sigma_d(asked: _Question, submission: Submission, found: Recomputed) -> Ite
 
 
 def _sigma_d_interval(asked: _Question, submission: Submission, found: Recomputed) -> Item:
+    """The 95 % interval of sigma_d, px, widened for the scatter about the law."""
     claim, law = submission.claims.sigma_d_interval_px, found.law
     if law is None:
         return _no_law(asked, None if claim is None else claim[0], found)
@@ -502,6 +521,7 @@ def _sigma_d_interval(asked: _Question, submission: Submission, found: Recompute
 
 
 def _exponent(asked: _Question, submission: Submission, found: Recomputed) -> Item:
+    """The exponent of a free fit: none quoted is right, and one with its interval is, too."""
     claims, free = submission.claims, found.free
     claim, interval = claims.exponent, claims.exponent_interval
     if found.law is None:
@@ -665,6 +685,7 @@ def _at_mounting(
 
 
 def _paragraph(asked: _Question, submission: Submission) -> Item:
+    """Whether there is a closing paragraph, by its number of words; a person reads it."""
     words = len(submission.conclusion.paragraph.split())
     if words == 0:
         return asked.missing("three sentences on which error dominates, and why")
@@ -709,6 +730,7 @@ def _kept(item: Item, mistake: str, says: str) -> Item:
 
 
 def _unknown(asked: _Question, claim: float) -> Item:
+    """A claim about what the raw depths do not give."""
     said = _shown(asked.topic, claim)
     says = f"{asked.name}: you say {said}, but your raw depths do not give it."
     return asked.item("wrong", says, claimed=claim)
@@ -721,6 +743,7 @@ def _half_digit(topic: str) -> float:
 
 
 def _tolerance(topic: str, se: float) -> float:
+    """How far a claim may be off: standard errors of what is found, and half a printed digit."""
     return float(grading_rules()["tolerance"]["standard_errors"] * se + _half_digit(topic))
 
 
@@ -736,6 +759,7 @@ def _log_se(law: NoiseFit, i: int, widened: bool = True) -> float:
 
 
 def _shown(topic: str, value: float) -> str:
+    """A value with its unit."""
     return _digits(topic, value) + UNITS.get(topic, " mm")
 
 
@@ -749,4 +773,5 @@ def _digits(topic: str, value: float) -> str:
 
 
 def _accepted(topic: str, tolerance: float) -> str:
+    """The tolerance in words; a fraction is shown in percent."""
     return f"± {100 * tolerance if topic == 'invalid' else tolerance:.2g} is accepted"

@@ -274,6 +274,7 @@ def _row(distance_m: float, quantities: Mapping[str, results.Quantity]) -> Table
     """The line of the table at one distance; what was not measured is left out."""
 
     def found(name: str) -> tuple[float | None, float | None]:
+        """A quantity and its standard error in the table's units; None for what is not there."""
         full = f"{name}_at_{1000 * distance_m:.0f}_mm"
         quantity = quantities.get(full)
         if quantity is None:
