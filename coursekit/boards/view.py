@@ -37,7 +37,7 @@ def seen(
     inside = points @ np.swapaxes(R, -1, -2) + t
     pixels = project(inside, lens.K, lens.dist)
     last = np.array(lens.size) - 1 - border_px
-    found = ((pixels >= border_px) & (pixels <= last)).all(axis=-1)
+    found = np.asarray(((pixels >= border_px) & (pixels <= last)).all(axis=-1))
     if lens.dist is not None:
         with np.errstate(divide="ignore", invalid="ignore"):
             slope = np.hypot(inside[..., 0], inside[..., 1]) / inside[..., 2]
