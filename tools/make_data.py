@@ -31,8 +31,7 @@ from coursekit.results import Quantity, write_bytes, write_json
 from coursekit.simulation.arm_sessions import SIMULATED, rendered_session
 from coursekit.simulation.corner_sessions import Effects, corner_session, view_poses
 from coursekit.specifications import DATA
-from coursekit.submission.bundle import bundle_bytes, write_bundle
-from coursekit.submission.contents import Conclusion, Stack, Submission
+from coursekit.submission.format import Conclusion, Stack, Submission, bundle_bytes, write_bundle
 from coursekit.submission.submit import measured
 from tools import build_notebooks, degenerate_poses
 

@@ -29,8 +29,14 @@ from coursekit.boards import Board, BoardNotFound, Detection, Detections, detect
 from coursekit.boards.detector import FEWEST_CORNERS, SESSION
 from coursekit.boards.view import seen
 from coursekit.checks import choice, number, positive, want, whole
-from coursekit.geometry import invert_transform, make_transform, project, transform_points
-from coursekit.hand_eye.poses import Mount, camera_board, check_mount, turned
+from coursekit.geometry import (
+    invert_transform,
+    make_transform,
+    project,
+    transform_points,
+    turned,
+)
+from coursekit.hand_eye.poses import MOUNTS, Mount, camera_board
 from coursekit.hand_eye.session import HandEyeSession
 from coursekit.simulation.arm_poses import (
     Setup,
@@ -151,7 +157,7 @@ def default_setup(mount: Mount) -> Setup:
     (7, 5)
     """
     arm = widowx()
-    if check_mount(mount) == "eye_in_hand":
+    if choice("mount", mount, MOUNTS) == "eye_in_hand":
         lens, board = device("D405").unit.color, TABLE_BOARD
         return Setup(arm, mount, arm.T_gripper_camera, board_on_table(board), lens, board)
     lens, board = device("D435").unit.color, HELD_BOARD
@@ -224,7 +230,11 @@ def truth_of(folder: str | os.PathLike[str]) -> HandEyeTruth:
     card = json.loads(path.read_text("utf-8"))
     if card.get("source") != SIMULATED:
         raise ValueError(f"folder: {path.parent.name} is no simulated session; nobody knows its X")
-    mount, seed, views = check_mount(card["mount"]), int(card["seed"]), int(card["views"])
+    mount, seed, views = (
+        choice("mount", card["mount"], MOUNTS),
+        int(card["seed"]),
+        int(card["views"]),
+    )
     return _poses(mount, seed, views, ArmErrors(), HandEyeMistakes())[0]
 
 
@@ -250,7 +260,7 @@ def _poses(
     mount: Mount, seed: int, n: int, errors: ArmErrors | None, mistakes: HandEyeMistakes
 ) -> tuple[HandEyeTruth, Floats, Floats]:
     """The truth, and the joint angles and velocities (n, 6) that the encoders read."""
-    rig, q = _placed(check_mount(mount), _stream(seed, b"poses"), n, mistakes.design)
+    rig, q = _placed(choice("mount", mount, MOUNTS), _stream(seed, b"poses"), n, mistakes.design)
     offsets, joint = _joint_zero(seed, mistakes)
     arm = SimulatedArm(seed, errors or ArmErrors(0.0, 0.0, 0.0, 0.0))
     dq = np.zeros_like(q)
