@@ -326,7 +326,7 @@ def test_a_checkerboard_is_whole_and_its_own_or_not_found():
     assert missed == 0
     image = photograph(view(CHECKERBOARD)[0])
     for squares in ((6, 5), (5, 4), (8, 6), (9, 6), (10, 6), (9, 7), (11, 7)):
-        assert find(image, Board("checkerboard", squares, 0.025)) is None
+        assert find_corners(image, Board("checkerboard", squares, 0.025)) is None
 
 
 def test_corners_at_the_rim_of_the_image_are_as_good():

@@ -10,10 +10,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from simulated_hand_eye import holds
 
-from coursekit.arm import ArmErrors, fk_error, pose_difference, widowx
+from coursekit.arm import ArmErrors, widowx
 from coursekit.boards import detect
-from coursekit.geometry import invert_transform
+from coursekit.geometry import invert_transform, pose_difference
 from coursekit.hand_eye import observability
 from coursekit.hand_eye.poses import camera_board
 from coursekit.hand_eye.session import HandEyeSession
@@ -59,20 +60,13 @@ def test_truth_closes_the_loop_and_the_report_is_off_by_what_the_arm_errs(mount)
     expected = camera_board(truth.T_base_gripper, truth.X, truth.setup.Y, mount)
     np.testing.assert_allclose(truth.T_camera_board, expected, atol=1e-12)
     np.testing.assert_allclose(session.T_base_gripper, widowx().forward(session.q), atol=1e-12)
-    shift, _ = fk_error(truth.T_base_gripper, session.T_base_gripper)
-    assert 5e-4 < np.median(shift) < 8e-3
+    off = pose_difference(session.T_base_gripper, truth.T_base_gripper)
+    assert 5e-4 < np.median(np.linalg.norm(off[:, 3:], axis=1)) < 8e-3
     exact, truth = hand_eye_session(mount, 5)
     np.testing.assert_allclose(exact.T_base_gripper, truth.T_base_gripper, atol=1e-12)
-
-
-@pytest.mark.parametrize("mount", MOUNTS)
-def test_solve_finds_X(mount) -> None:
-    session, truth = hand_eye_session(mount, 6)
-    off = pose_difference(truth.X, session.solve().X)
+    off = pose_difference(truth.X, exact.solve().X)
     assert np.abs(off[3:]).max() < 3e-4
     assert np.abs(off[:3]).max() < np.radians(0.05)
-    closed = pose_difference(truth.X, session.solve("park").X)
-    assert np.abs(closed[3:]).max() < 3e-3
 
 
 def test_the_same_seed_gives_the_same_session_and_another_one_another() -> None:
@@ -160,7 +154,7 @@ def test_shifted_by(by: int) -> None:
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_degenerate_designs_leave_free_what_they_should(mount) -> None:
     def free(design: str) -> tuple[str, ...]:
-        session, _ = hand_eye_session(mount, 1, mistakes=HandEyeMistakes(design=design))
+        session, _ = hand_eye_session(mount, 1, n=10, mistakes=HandEyeMistakes(design=design))
         return observability(session.T_base_gripper, mount).free
 
     assert free("careful") == ()
@@ -170,12 +164,13 @@ def test_degenerate_designs_leave_free_what_they_should(mount) -> None:
 
 
 def test_arguments_are_checked() -> None:
-    with pytest.raises(ValueError, match="design: got 'circle'"):
-        HandEyeMistakes(design="circle")
-    with pytest.raises(ValueError, match="square_scale: got 0"):
-        HandEyeMistakes(square_scale=0.0)
-    with pytest.raises(ValueError, match="late_s: got nan"):
-        HandEyeMistakes(late_s=float("nan"))
+    for options, message in (
+        ({"design": "circle"}, "design: got 'circle'"),
+        ({"square_scale": 0.0}, "square_scale: got 0"),
+        ({"late_s": float("nan")}, "late_s: got nan"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            HandEyeMistakes(**options)
     with pytest.raises(ValueError, match="corner_noise_px"):
         hand_eye_session("eye_in_hand", 0, corner_noise_px=-1)
     with pytest.raises(ValueError, match="mount: got 'on_the_ceiling'"):
@@ -183,8 +178,8 @@ def test_arguments_are_checked() -> None:
 
 
 def test_rendered_images_agree_with_the_corners() -> None:
-    session, truth, images = rendered_session("eye_in_hand", 2, n=8)
-    assert len(images) == len(session) == 8
+    session, truth, images = rendered_session("eye_in_hand", 2, n=4)
+    assert len(images) == len(session) == 4
     for i, d in enumerate(session.seen):
         off = d.pixels - seen_by_opencv(truth, i)[d.ids]
         assert np.sqrt(np.mean(off**2)) < 0.15
@@ -195,24 +190,21 @@ def test_rendered_images_agree_with_the_corners() -> None:
 
 def test_a_session_checks_what_belongs_together() -> None:
     session, _ = hand_eye_session("eye_in_hand", 0, n=10)
-    with pytest.raises(ValueError, match="seen: got 9, T_base_gripper has 10"):
-        replace(session, seen=session.seen.pick(range(9)), names=())
-    with pytest.raises(ValueError, match="q: got shape"):
-        replace(session, q=session.q[:5])
-    q = session.q.copy()
+    q, T = session.q.copy(), session.T_base_gripper.copy()
     q[3, 2] = np.nan
-    with pytest.raises(ValueError, match=r"q\[3\]: has NaN"):
-        replace(session, q=q)
-    with pytest.raises(ValueError, match="dq: velocities need"):
-        replace(session, q=None, dq=session.q)
-    with pytest.raises(ValueError, match="board: got None"):
-        replace(session, board=None)
-    T = session.T_base_gripper.copy()
     T[4, :3, 0] *= -1
-    with pytest.raises(ValueError, match=r"T_base_gripper\[4\].*reflection"):
-        replace(session, T_base_gripper=T)
-    with pytest.raises(ValueError, match="mount"):
-        replace(session, mount="eye_on_hand")
+    for changes, message in (
+        ({"seen": session.seen.pick(range(9)), "names": ()}, "seen: got 9, want 10"),
+        ({"names": ("a", "b")}, "names: got 2, want 10"),
+        ({"q": session.q[:5]}, r"q: got shape \(5, 6\), want \(10, 6\)"),
+        ({"q": q}, r"q\[3\]: got .*nan"),
+        ({"q": None, "dq": session.q}, "q: got None, want the joint angles"),
+        ({"board": None}, "board: got None"),
+        ({"T_base_gripper": T}, r"T_base_gripper\[4\].*reflection"),
+        ({"mount": "eye_on_hand"}, "mount"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            replace(session, **changes)
 
 
 def test_pick_and_repr() -> None:
@@ -273,7 +265,7 @@ def test_shipped_sessions_show_the_error_of_the_arm(shipped) -> None:
         truth, result = truth_of(folder), session.solve()
         off = pose_difference(truth.X, result.X)
         assert 3e-4 < np.linalg.norm(off[3:]) < 6e-3
-        outside += int(np.sum(~result.holds(truth.X)))
+        outside += int(np.sum(~holds(result, truth.X)))
         text = (folder / "session.json").read_text("utf-8")
         assert f"{truth.X[0, 3]:.4f}" not in text
     assert outside >= 6  # of 12 numbers, where honest intervals would miss 0.6
@@ -300,7 +292,7 @@ def test_save_and_read_again(small, tmp_path) -> None:
     assert again.board == session.board
     assert again.intrinsics == session.intrinsics
     assert json.loads((folder / "session.json").read_text(encoding="utf-8"))["origin"] == "a test"
-    with pytest.raises(ValueError, match=r"images: no 'view_00.jpg'"):
+    with pytest.raises(ValueError, match=r"images: got \[\], want .* 'view_00.jpg'"):
         session.save(folder, {})
 
 

@@ -11,10 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from coursekit import intrinsics
 from coursekit.boards import Board, Detection, Detections
-from coursekit.geometry import Intrinsics, project
+from coursekit.geometry import Intrinsics, moved, project
 from coursekit.intrinsics.derivatives import (
     PARAMETERS,
-    moved,
     parameter_vector,
     project_with_derivatives,
     scaled_inverse,

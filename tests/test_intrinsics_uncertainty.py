@@ -20,10 +20,11 @@ from coursekit.geometry import (
     deproject,
     invert_transform,
     make_transform,
+    moved,
     project,
     transform_points,
 )
-from coursekit.intrinsics.derivatives import moved, parameter_vector, with_parameters
+from coursekit.intrinsics.derivatives import parameter_vector, with_parameters
 from coursekit.intrinsics.fit import evaluate, image_grid
 from coursekit.simulation.corner_sessions import Effects, corner_session
 

@@ -404,7 +404,7 @@ def test_the_fixed_pattern_does_not_average_away():
 
 @pytest.mark.parametrize("series", [np.zeros(5), np.zeros((9, 4)), np.float64(1.0)])
 def test_averaging_wants_a_series(series):
-    with pytest.raises(ValueError, match=r"^series_m: got shape"):
+    with pytest.raises(ValueError, match=r"^series_m: got"):
         stereo.averaging_curve(series)
 
 
@@ -870,11 +870,11 @@ def test_a_camera_s_frames_bring_their_unit_and_intrinsics():
         ({"depth": np.zeros((3, 480, 848), np.uint16)}, "^depth: no valid pixel near"),
         ({"depth": np.full((3, 480, 848), 5000, np.uint16)}, "^depth: no block's face"),
         ({"depth": np.zeros((0, 480, 848), np.uint16)}, "^depth: got 0 frames"),
-        ({"depth": np.zeros((3, 48, 84), np.uint16)}, "^depth: got images"),
+        ({"depth": np.zeros((3, 48, 84), np.uint16)}, "^depth: got"),
         ({"depth_scale_m": None}, "^depth_scale_m: got None"),
         ({"intrinsics": None}, "^intrinsics: got NoneType"),
         ({"width_m": -1.0}, "^width_m: got"),
-        ({"near": (5000, 5000)}, "^near: a window"),
+        ({"near": (5000, 5000)}, "^near: got"),
     ],
 )
 def test_block_face_names_what_is_wrong(change, match):

@@ -13,14 +13,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-from coursekit.arrays import ArrayLike, Bools, Floats
+from coursekit.arrays import Bools, Floats
 from coursekit.geometry import Intrinsics, deproject, fold_radius, project
 
 BORDER_PX = 6.0  # a corner nearer to the image's border has no room for its refinement window
 
 
 def seen(
-    points: Floats, T_camera_board: Floats, lens: Intrinsics, border_px: ArrayLike = BORDER_PX
+    points: Floats, T_camera_board: Floats, lens: Intrinsics, border_px: float | Floats = BORDER_PX
 ) -> Bools:
     """Which points of a board the camera sees from each pose, (..., N).
 
@@ -37,7 +37,7 @@ def seen(
     inside = points @ np.swapaxes(R, -1, -2) + t
     pixels = project(inside, lens.K, lens.dist)
     last = np.array(lens.size) - 1 - border_px
-    found: Bools = ((pixels >= border_px) & (pixels <= last)).all(axis=-1)
+    found = ((pixels >= border_px) & (pixels <= last)).all(axis=-1)
     if lens.dist is not None:
         with np.errstate(divide="ignore", invalid="ignore"):
             slope = np.hypot(inside[..., 0], inside[..., 1]) / inside[..., 2]

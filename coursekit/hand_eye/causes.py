@@ -22,9 +22,9 @@ import numpy as np
 
 from coursekit.arm import Arm, ArmErrors, fk_covariance
 from coursekit.arrays import Floats, NDArray
+from coursekit.geometry import turned
 from coursekit.hand_eye.pairs import LEAST_M, LEAST_RAD, MEDIAN_3D, Fit, Pairs, robust_fit
-from coursekit.hand_eye.poses import turned
-from coursekit.hand_eye.refinement import by_arm_twist
+from coursekit.hand_eye.poses import by_arm_twist
 
 SCALE, LATE, SLIP, OUTLIER, OFFSET = (
     "wrong_square_size", "late_time_stamps", "slipping_board", "outlier_pose", "arm_error",

@@ -19,7 +19,7 @@ from coursekit.boards import Board, Detection, Detections
 from coursekit.geometry import Intrinsics
 from coursekit.hand_eye import causes, misread
 from coursekit.hand_eye.causes import Accepted, Arms, Search
-from coursekit.hand_eye.closed_form import FEWEST
+from coursekit.hand_eye.closed_form import FEWEST_POSES
 from coursekit.hand_eye.misread import Reading
 from coursekit.hand_eye.pairs import Fit, Pairs, robust_fit
 from coursekit.hand_eye.poses import Mount, camera_board, mean_pose
@@ -249,7 +249,7 @@ def _offset(one: Accepted, state: Search, session: HandEyeSession) -> Finding:
         f"{size:+.2f} ± {half:.2f} deg (95 %) to be added to joint_{joint}. "
         + _sentence(_change(one.before, one.after)),
         "Set the joint's zero with the maker's jig; or estimate the offsets together with X "
-        "(solve(..., arm=..., q=...)) and use them wherever the arm's pose is computed.",
+        "(`solve(free_offsets=True)`) and use them wherever the arm's pose is computed.",
         one.test.p_value,
     )
 
@@ -325,8 +325,8 @@ def diagnose(
     """
     if not isinstance(session, HandEyeSession):
         session = _session(session, seen, mount, board, intrinsics)
-    if len(session) < FEWEST:
-        raise ValueError(f"session: has {len(session)} pairs, want at least {FEWEST}")
+    if len(session) < FEWEST_POSES:
+        raise ValueError(f"session: has {len(session)} pairs, want at least {FEWEST_POSES}")
     case = _Case(session, arm or widowx(), errors, Pairs.of(session))
     case.units()
     case.joints_in_degrees()

@@ -32,10 +32,9 @@ import numpy as np
 
 from coursekit.arrays import Floats, Interval, Mask, NDArray
 from coursekit.boards import Board, Detection, Detections
-from coursekit.geometry import Intrinsics
+from coursekit.geometry import Intrinsics, moved
 from coursekit.intrinsics.derivatives import (
     NormalEquations,
-    moved,
     parameter_vector,
     project_with_derivatives,
     selection,

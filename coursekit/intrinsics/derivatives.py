@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from coursekit.arrays import Floats
 from coursekit.geometry import Intrinsics, distort, distortion_jacobian
@@ -91,14 +90,6 @@ def twist_columns(points: Floats, by_point: Floats) -> Floats:
     # d (omega x p) / d omega = -[p]x, and -(row . [p]x) = (p x row)
     rotation = np.cross(points[:, None, :], by_point)
     return np.concatenate([rotation, by_point], axis=-1)
-
-
-def moved(T: Floats, twists: Floats) -> Floats:
-    """exp(xi) T for transforms (n, 4, 4) and twists (n, 6), with R = exp(omega), t = v."""
-    step = np.broadcast_to(np.eye(4), T.shape).copy()
-    step[:, :3, :3] = Rotation.from_rotvec(twists[:, :3]).as_matrix()
-    step[:, :3, 3] = twists[:, 3:]
-    return step @ T
 
 
 # --- least squares ---

@@ -37,6 +37,7 @@ from pebble import ProcessExpired, ProcessPool
 from tqdm.auto import tqdm
 
 from coursekit import results
+from coursekit.checks import positive, want
 from coursekit.submission.format import slug
 from coursekit.submission.recompute import grading_rules
 from coursekit.submission.report import (
@@ -113,13 +114,12 @@ class Summary:
 
     def __str__(self) -> str:
         n = self.graded + self.refused + self.failed
-        parts = [f"{self.graded} graded"]
-        if self.refused:
-            parts.append(f"{self.refused} refused")
-        if self.failed:
-            parts.append(f"{self.failed} not graded (time, memory or a crash)")
-        if self.flagged:
-            parts.append(f"{self.flagged} flagged")
+        others = {
+            "refused": self.refused,
+            "not graded (time, memory or a crash)": self.failed,
+            "flagged": self.flagged,
+        }
+        parts = [f"{self.graded} graded", *(f"{k} {what}" for what, k in others.items() if k)]
         lines = [f"{counted(n, 'bundle')} in {self.seconds:.0f} s: {', '.join(parts)}."]
         if self.kept:
             lines.append(f"{self.kept} of them had been graded before and have not changed.")
@@ -158,8 +158,7 @@ def grade_folder(
         free = getattr(os, "sched_getaffinity", None)  # what this process may use
         workers = len(free(0)) if free else os.cpu_count() or 1
     for name, value in (("workers", workers), ("timeout_s", timeout_s), ("memory", memory_bytes)):
-        if not value > 0:
-            raise ValueError(f"{name}: got {value!r}, want more than 0")
+        positive(name, value)
     _check_out(out, overwrite)
     paths, left_out = find_bundles(folder, out)
     for part in (out / STUDENTS, out / ROWS):
@@ -237,8 +236,7 @@ def find_bundles(folder: Path, out: Path) -> tuple[list[Path], tuple[str, ...]]:
     """
     if not folder.is_dir():
         raise ValueError(f"{folder}: there is no such folder; want the one with the bundles in it")
-    if out.resolve() == folder.resolve():
-        raise ValueError(f"out: got {out}, the folder of the bundles; want another one")
+    want(out.resolve() != folder.resolve(), "out", str(out), "another folder than that of bundles")
     found: list[Path] = []
     others: list[Path] = []
     for parent, folders, names in os.walk(folder):
@@ -453,26 +451,13 @@ def _warm_up(memory_bytes: int) -> None:
 
 def limit_memory(more_bytes: int) -> None:
     """Let this process have so much more address space than it has now; where there is a way."""
-    try:
-        import resource
-    except ImportError:  # Windows
-        return
-    resting = _address_space()
-    with contextlib.suppress(OSError, ValueError):
+    with contextlib.suppress(ImportError, OSError, ValueError, AttributeError):
+        import resource  # not on Windows
+
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        if resting is not None:
-            _, hard = resource.getrlimit(resource.RLIMIT_AS)
-            want = resting + more_bytes
-            resource.setrlimit(resource.RLIMIT_AS, (want, hard))
-
-
-def _address_space() -> int | None:
-    """The address space of this process in bytes, None where the system does not say."""
-    try:
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-        return pages * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, ValueError, AttributeError):
-        return None
+        most = pages * os.sysconf("SC_PAGE_SIZE") + more_bytes
+        resource.setrlimit(resource.RLIMIT_AS, (most, resource.getrlimit(resource.RLIMIT_AS)[1]))
 
 
 # ---- the report's folder ------------------------------------------------------------------------
