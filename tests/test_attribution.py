@@ -571,7 +571,7 @@ def test_a_negative_number_stays_a_number(tmp_path):
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (b"", "is empty"),
+        (b"", "line 1: the header is 'nothing'"),
         (b"a,b,c\n1,2,3\n", "line 1: the header"),
         ((",".join(LEDGER_HEADER) + "\n2026,cube,half a r").encode(), "line 2: has 3 fields"),
         (
