@@ -32,7 +32,7 @@ from coursekit.attribution.significance import (
     place_test,
     pose_columns,
     pose_test,
-    power,
+    power_of_test,
 )
 
 NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
@@ -447,17 +447,21 @@ def test_the_stated_power_is_the_share_found(scatter):
     bias *= size / np.linalg.norm(bias, axis=2, keepdims=True)
     rows = bias + 1e-3 * rng.standard_normal((MANY, n, 3)) * scatter
     found = np.mean([mean_test(row).p_pooled < LEVEL * POOLED_SHARE for row in rows])
-    stated = power(size, 1e-6 * S, axes, n, 3, 0, LEVEL * POOLED_SHARE)
+    stated = power_of_test(size, 1e-6 * S, axes, n, 3, 0, LEVEL * POOLED_SHARE)
     assert stated == pytest.approx(found, abs=0.06)
 
 
 def test_the_power_for_even_scatter_is_the_noncentral_f():
     S = 4e-6 * np.eye(3)
     limit = f.isf(LEVEL, 3, 27)
-    assert power(0.003, S, 3.0, 10, 3, 0, LEVEL) == pytest.approx(ncf.sf(limit, 3, 27, 22.5))
+    assert power_of_test(0.003, S, 3.0, 10, 3, 0, LEVEL) == pytest.approx(
+        ncf.sf(limit, 3, 27, 22.5)
+    )
     limit = f.isf(LEVEL, 7, 20)
-    assert power(0.003, S, 3.0, 10, 7, 3, LEVEL) == pytest.approx(ncf.sf(limit, 7, 20, 22.5))
-    assert power(0.003, S, 3.0, 3, 7, 3, LEVEL) == 0.0
+    assert power_of_test(0.003, S, 3.0, 10, 7, 3, LEVEL) == pytest.approx(
+        ncf.sf(limit, 7, 20, 22.5)
+    )
+    assert power_of_test(0.003, S, 3.0, 3, 7, 3, LEVEL) == 0.0
 
 
 def test_the_number_of_axes_is_that_of_the_covariance():
@@ -567,7 +571,7 @@ def test_a_negative_number_stays_a_number(tmp_path):
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (b"", "is empty"),
+        (b"", "line 1: the header is 'nothing'"),
         (b"a,b,c\n1,2,3\n", "line 1: the header"),
         ((",".join(LEDGER_HEADER) + "\n2026,cube,half a r").encode(), "line 2: has 3 fields"),
         (

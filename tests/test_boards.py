@@ -245,13 +245,7 @@ def test_noise_levels_measures_noise_and_not_edges():
 @pytest.mark.parametrize("board", [CHECKERBOARD, CHARUCO], ids=["checker", "charuco"])
 @pytest.mark.parametrize(
     ("blur_px", "motion_px"),
-    [
-        (0.5, (0, 0)),
-        (1.2, (0, 0)),
-        (0.6, (3, 0)),
-        (0.6, (0, 3)),
-        (0.6, (2.1, -2.1)),
-    ],
+    [(0.5, (0, 0)), (1.2, (0, 0)), (0.6, (3, 0)), (0.6, (0, 3)), (0.6, (2.1, -2.1))],
 )
 def test_the_blur_has_its_size_and_direction(board, blur_px, motion_px):
     """A uniform motion of length L has the variance L^2 / 12, a pixel that of its width.

@@ -16,14 +16,13 @@ from coursekit.budget import (
     Covariances,
     View,
     check_first_order,
-    jacobian,
     lesson_view,
     looking_down,
     monte_carlo,
     propagate,
 )
 from coursekit.budget.handover import LESSON_CAMERA
-from coursekit.budget.propagation import displacements
+from coursekit.budget.propagation import displacements, jacobian
 from coursekit.geometry import Intrinsics, deproject, invert_transform, transform_points, undistort
 from coursekit.intrinsics.derivatives import PARAMETERS, scaled_root
 

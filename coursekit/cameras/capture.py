@@ -30,7 +30,7 @@ from coursekit.arrays import Bools, Floats, Image
 from coursekit.boards import Board, BoardNotFound, Detection, Detections, Skipped, detect
 from coursekit.boards.detector import FEWEST_CORNERS, SESSION
 from coursekit.boards.find import find_corners
-from coursekit.boards.view import in_view, seen
+from coursekit.boards.view import seen, slide_into_view
 from coursekit.cameras.camera import Camera
 from coursekit.cameras.frames import CameraError
 from coursekit.cameras.simulated import SimulatedCamera
@@ -523,7 +523,7 @@ def _aimed(
         return seen(board.points, T, lens, ROOM_PX)
 
     R = facing.as_matrix() @ board.T_board_sheet[:3, :3].T
-    T = in_view(
+    T = slide_into_view(
         aim_px, distance_m, R, board.middle, lens, lambda T: bool(shown(T).mean() >= needed), 11
     )
     if T is None:
