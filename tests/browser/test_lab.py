@@ -24,11 +24,6 @@ pytestmark = pytest.mark.browser
 
 NAMES = [f"{number:02d}_{lesson}" for number, lesson in enumerate(ck.lessons.LESSONS, start=1)]
 SCREENSHOTS = build_notebooks.ROOT / "build" / "screenshots"
-CHROMIUM = next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-)
-QUIET = "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-sync"
-NO_NEWS = "--disable-background-networking --disable-component-update"
 SETTINGS = {
     "@jupyterlab/apputils-extension:notification": {"fetchNews": "false", "checkForUpdates": False},
     "@jupyterlab/notebook-extension:tracker": {"windowingMode": "none"},  # all cells are in the DOM
@@ -44,12 +39,8 @@ def name(request):
 
 
 @pytest.fixture(scope="module")
-def server_at(tmp_path_factory):
+def server_at(browser, tmp_path_factory):
     """Where a JupyterLab of its own serves copies of the notebooks; {} is the notebook's name."""
-    if CHROMIUM is None and os.environ.get("CI") == "true":
-        pytest.fail("no Chromium, and CI must run this test")
-    if CHROMIUM is None:
-        pytest.skip("not run: no Chromium")
     home = tmp_path_factory.mktemp("home")
     served = tmp_path_factory.mktemp("served")
     (home / "overrides.json").write_text(json.dumps(SETTINGS), encoding="utf-8")
@@ -87,17 +78,6 @@ def wait_for(url, server, log):
         except OSError:  # not listening yet
             time.sleep(0.2)
     raise RuntimeError(f"JupyterLab did not start: {log.read_text('utf-8')[-2000:]}")
-
-
-@pytest.fixture(scope="module")
-def browser():
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        arguments = f"{QUIET} {NO_NEWS}".split()
-        launched = playwright.chromium.launch(executable_path=CHROMIUM, args=arguments)
-        yield launched
-        launched.close()
 
 
 @pytest.fixture(scope="module")

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -25,18 +22,11 @@ PUBLISHED_PER_VIEW_PX = [
 
 
 @pytest.fixture(scope="module")
-def folder():
-    if not os.environ.get("COURSEKIT_REAL_DATA"):
-        pytest.skip("COURSEKIT_REAL_DATA is not set: it names the folder of real data")
-    return Path(os.environ["COURSEKIT_REAL_DATA"])
-
-
-@pytest.fixture(scope="module")
-def published_corners(folder) -> Detections:
+def published_corners(real_data) -> Detections:
     """Corners as OpenCV's sample finds them: an 11 px half window for cornerSubPix."""
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 0.1)
     views = []
-    for path in sorted((folder / "opencv_chessboard").glob("left*.jpg")):
+    for path in sorted((real_data / "opencv_chessboard").glob("left*.jpg")):
         image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         found, corners = cv2.findChessboardCorners(image, CHESSBOARD.corners)
         assert found
@@ -51,13 +41,13 @@ def published(published_corners) -> intrinsics.IntrinsicsResult:
 
 
 @pytest.fixture(scope="module")
-def charuco_views(folder) -> Detections:
-    return boards.detect_all(folder / "opencv_charuco", CHARUCO, progress=False)
+def charuco_views(real_data) -> Detections:
+    return boards.detect_all(real_data / "opencv_charuco", CHARUCO, progress=False)
 
 
 @pytest.fixture(scope="module")
-def own_corners(folder) -> Detections:
-    return boards.detect_all(folder / "opencv_chessboard", CHESSBOARD, progress=False)
+def own_corners(real_data) -> Detections:
+    return boards.detect_all(real_data / "opencv_chessboard", CHESSBOARD, progress=False)
 
 
 def test_the_published_fit_comes_out_with_the_published_settings(published):
