@@ -20,6 +20,7 @@ import coursekit as ck
 from coursekit.lessons.questions import Choice
 from tools import build_notebooks
 
+sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright")
 pytestmark = pytest.mark.browser
 
 NAMES = [f"{number:02d}_{lesson}" for number, lesson in enumerate(ck.lessons.LESSONS, start=1)]
@@ -28,8 +29,7 @@ SETTINGS = {
     "@jupyterlab/apputils-extension:notification": {"fetchNews": "false", "checkForUpdates": False},
     "@jupyterlab/notebook-extension:tracker": {"windowingMode": "none"},  # all cells are in the DOM
 }
-STARTUP_S = 60
-NOTEBOOK_MS = 180_000
+PATIENCE_MS = 1_800_000  # so that a hang ends; no page takes minutes
 
 
 @pytest.fixture(scope="module", params=NAMES)
@@ -60,7 +60,7 @@ def server_at(browser, tmp_path_factory):
         yield f"http://127.0.0.1:{port}/lab/workspaces/{{0}}/tree/{{0}}.ipynb?token={token}"
     finally:
         server.terminate()
-        server.wait(20)
+        server.wait()
 
 
 def free_port():
@@ -70,10 +70,9 @@ def free_port():
 
 
 def wait_for(url, server, log):
-    deadline = time.monotonic() + STARTUP_S
-    while time.monotonic() < deadline and server.poll() is None:
+    while server.poll() is None:
         try:
-            urllib.request.urlopen(url, timeout=5).close()
+            urllib.request.urlopen(url).close()
             return
         except OSError:  # not listening yet
             time.sleep(0.2)
@@ -84,9 +83,9 @@ def wait_for(url, server, log):
 def opened(server_at, browser, name):
     """The page with the notebook as it opens, before anything has run."""
     page = browser.new_page(viewport={"width": 1280, "height": 900})
-    page.set_default_timeout(20_000)
+    page.set_default_timeout(PATIENCE_MS)
     page.goto(server_at.format(name))
-    page.locator(".jp-CodeCell").last.wait_for(state="attached", timeout=NOTEBOOK_MS)
+    page.locator(".jp-CodeCell").last.wait_for(state="attached")
     page.locator(".jp-KernelName", has_text="Python 3").wait_for()  # idle until then, too
     page.locator(".jp-Notebook-ExecutionIndicator[data-status=idle]").wait_for()
     yield page
@@ -104,13 +103,11 @@ def stop_kernel(page):
 @pytest.fixture(scope="module")
 def page(opened, name):
     """The page after Run All Cells."""
-    from playwright.sync_api import expect
-
     opened.get_by_role("menuitem", name="Run", exact=True).click()
     opened.locator("[data-command='runmenu:run-all']").click()
     prompt = opened.locator(".jp-CodeCell .jp-InputArea-prompt").last
-    expect(prompt).to_have_text("[*]:")
-    expect(prompt).to_have_text(re.compile(r"\[\d+\]:"), timeout=NOTEBOOK_MS)
+    sync_api.expect(prompt).to_have_text("[*]:")
+    sync_api.expect(prompt).to_have_text(re.compile(r"\[\d+\]:"), timeout=PATIENCE_MS)
     yield opened
     if os.environ.get("CI") != "true":  # nobody looks at them there
         photograph(opened, name)
@@ -154,13 +151,11 @@ def checkpoints(name):
 
 
 def test_answers_are_collapsed_on_load(opened, name):
-    from playwright.sync_api import expect
-
     bars, count = answers(opened, name)
     assert count > 0
-    expect(bars).to_have_count(count)
+    sync_api.expect(bars).to_have_count(count)
     for bar in bars.all():
-        expect(bar).to_contain_text("# An answer")
+        sync_api.expect(bar).to_contain_text("# An answer")
 
 
 def test_run_all_shows_no_error_and_no_answer(page, name):
@@ -181,14 +176,12 @@ def test_each_checkpoint_and_figure_becomes_a_widget(page, name):
 
 
 def test_every_checkpoint_explains_wrong_and_right_answers(page, name):
-    from playwright.sync_api import expect
-
     for checkpoint in checkpoints(name):
         cell = cell_with(page, f'"{checkpoint.name}"')
         for give, said in attempts(checkpoint):
             give(cell)
             cell.get_by_role("button", name="Commit").click()
-            expect(cell.locator(".widget-html-content").last).to_contain_text(plain(said))
+            sync_api.expect(cell.locator(".widget-html-content").last).to_contain_text(plain(said))
 
 
 def attempts(checkpoint):
@@ -217,10 +210,10 @@ def test_each_slider_redraws_its_figure(page):
             handle.focus()
             handle.press("ArrowRight")
             handle.press("ArrowRight")
-            deadline = time.monotonic() + 20
-            while shown(image) == before and time.monotonic() < deadline:
+            deadline = time.monotonic() + PATIENCE_MS / 1000
+            while shown(image) == before:
+                assert time.monotonic() < deadline, handle
                 page.wait_for_timeout(50)
-            assert shown(image) != before, handle
 
 
 def shown(image):
