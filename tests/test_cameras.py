@@ -27,6 +27,7 @@ from coursekit.geometry import (
 from coursekit.simulation import wall_scene
 
 CALIBRATION_TOLERANCE = 1e-6  # the recorder writes extrinsics with six decimals
+NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 SIGMA_D_PX = 0.08  # temporal std of one pixel's disparity, the planning value
 
 
@@ -216,7 +217,7 @@ def test_two_views_of_one_recording_do_not_disturb_each_other(tabletop):
 # --- the simulated camera ---
 
 
-@pytest.mark.parametrize(("seed", "distance_m"), [(7, 0.45), (1, 0.6)])
+@pytest.mark.parametrize(("seed", "distance_m"), [(7, 0.45), *([(1, 0.6)] if NIGHTLY else [])])
 def test_noise_on_the_face_has_the_size_that_the_matcher_gives_it(seed, distance_m):
     """Temporal std of a pixel about sigma_d Z^2 / (f B), and the mean where the truth puts it."""
     with SimulatedCamera(seed=seed, depth_scale_m=1e-4) as camera:
@@ -371,7 +372,7 @@ def test_a_board_that_faces_away_is_refused_and_changes_nothing():
 @pytest.mark.parametrize("device", ["D405", "D415", "D455"])
 def test_every_device_sees_the_block(device):
     with SimulatedCamera(device=device, depth_scale_m=1e-4) as camera:
-        frames = camera.frames(3)
+        frames = camera.frames(1)
         truth_mm = 1000 * expected_m(camera, 0.45)
     window = middle_mm(frames, half=15)
     sigma_mm = SIGMA_D_PX * truth_mm**2 / (camera.depth.fx * 1000 * camera.baseline_m)

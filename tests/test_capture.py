@@ -97,7 +97,7 @@ class HeldBoard(Camera):
     depth, color = Intrinsics(848, 480, 431.0, 431.0, 436.0, 242.0), LENS
     baseline_m, depth_scale_m, T_color_depth = 0.05, 0.001, np.eye(4)
 
-    def __init__(self, poses, held=8, then=None, color=True):
+    def __init__(self, poses, held=module.STILL_FRAMES + 1, then=None, color=True):
         self.poses, self.held, self.then, self.has_color = poses, held, then, color
         self.locked = self.streams = 0
         self.shown = []  # what each frame showed: the number of a pose, or None on the way
