@@ -18,19 +18,22 @@ from coursekit.hand_eye.poses import Mount, camera_board, carrier_stand, mean_po
 from coursekit.hand_eye.refinement import by_X_and_Y
 from coursekit.hand_eye.session import HandEyeSession
 
-STEPS = 15
-ARRIVED = 1e-7  # m and rad
-BEYOND = 3.0  # times the usual residual: from there on a pair counts less and less
+ROBUST_STEPS, SMALLEST_STEP = 15, 1e-7  # m and rad
+CAUCHY_WIDTH = 3.0  # times the usual residual: from there on a pair counts less and less
 # Below this nobody's residuals are, whatever the arm: 0.005 deg and 0.02 mm.
 LEAST_RAD, LEAST_M = np.radians(0.005), 2e-5
 MEDIAN_3D = 1.5382  # the median length of three independent standard normal numbers
 
 
 @dataclass(frozen=True, eq=False)
-class Pairs:
-    """T_base_gripper and T_camera_board (n, 4, 4); image (n, 6, 6): the covariance of the latter's
-    twist as the image says, 0 where only poses are known; segment (n,): pairs with the same number
-    share one Y; view, row (n,): the numbers of the image and of the arm pose in the session."""
+class PosePairs:
+    """Arm poses and board poses that belong together.
+
+    T_base_gripper, T_camera_board (n, 4, 4), m. image (n, 6, 6): the covariance of the latter's
+    twist as the image says, rad and m, 0 where only poses are known. segment (n,): pairs with the
+    same number share one Y. view, row (n,): the numbers of the image and of the arm pose in the
+    session.
+    """
 
     T_base_gripper: Floats
     T_camera_board: Floats
@@ -41,28 +44,26 @@ class Pairs:
     row: NDArray[np.intp]
 
     @classmethod
-    def of(cls, session: HandEyeSession) -> Pairs:
+    def of(cls, session: HandEyeSession) -> PosePairs:
         """The pairs of a session as they were given."""
         n = len(session)
         image = np.zeros((n, 6, 6))
         if session.board_poses:
             image = np.stack([pose.covariance for pose in session.board_poses])
-        return cls(
-            session.T_base_gripper, session.T_camera_board.copy(), session.mount, image,
-            np.zeros(n, int), np.arange(n), np.arange(n),
-        )  # fmt: skip
+        arm, seen, order = session.T_base_gripper, session.T_camera_board.copy(), np.arange(n)
+        return cls(arm, seen, session.mount, image, np.zeros(n, int), order, order)
 
     def __len__(self) -> int:
         return len(self.view)
 
-    def keep(self, mask: NDArray[np.bool_]) -> Pairs:
+    def keep(self, mask: NDArray[np.bool_]) -> PosePairs:
         """The pairs where mask (n,) is true."""
-        return Pairs(
-            self.T_base_gripper[mask], self.T_camera_board[mask], self.mount, self.image[mask],
-            self.segment[mask], self.view[mask], self.row[mask],
-        )  # fmt: skip
+        return replace(
+            self,
+            **{name: value[mask] for name, value in vars(self).items() if name != "mount"},
+        )
 
-    def scaled(self, factor: float) -> Pairs:
+    def scaled(self, factor: float) -> PosePairs:
         """With a board that is `factor` times as large as it was taken for."""
         T, image = self.T_camera_board.copy(), self.image.copy()
         T[:, :3, 3] *= factor
@@ -70,20 +71,20 @@ class Pairs:
         image[:, :, 3:] *= factor
         return replace(self, T_camera_board=T, image=image)
 
-    def arm_scaled(self, factor: float) -> Pairs:
+    def arm_scaled(self, factor: float) -> PosePairs:
         """With the arm's translations times `factor`."""
         T = self.T_base_gripper.copy()
         T[:, :3, 3] *= factor
         return replace(self, T_base_gripper=T)
 
-    def exchanged(self) -> Pairs:
+    def exchanged(self) -> PosePairs:
         """Camera and arm with their parts exchanged, as eye-to-hand: C Y^-1 = X^-1 M."""
         M = carrier_stand(self.T_base_gripper, self.mount)
         return replace(
             self, T_base_gripper=self.T_camera_board, T_camera_board=M, mount="eye_to_hand"
         )
 
-    def shifted(self, by: int) -> Pairs:
+    def shifted(self, by: int) -> PosePairs:
         """Each image with the arm pose `by` places further on; the ends fall off."""
         n = len(self)
         images = np.arange(max(0, -by), min(n, n - by))
@@ -94,9 +95,12 @@ class Pairs:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """X (4, 4), Y (k, 4, 4) of the segments, and the residual twists (n, 6)."""
+    """X and Y of pairs, and what they leave over.
 
-    pairs: Pairs
+    X (4, 4), Y (k, 4, 4) of the segments, m. twists (n, 6): the residuals, rad and m.
+    """
+
+    pairs: PosePairs
     X: Floats
     Y: Floats
     twists: Floats
@@ -123,7 +127,7 @@ class Fit:
         return columns
 
     def says(self) -> str:
-        """Its typical residual in words."""
+        """Its typical residual in words: "0.4 mm and 0.05 deg"."""
         return f"{1e3 * self.shift_m:.1f} mm and {np.degrees(self.turn_rad):.2f} deg"
 
     def better_than(self, other: Fit) -> float:
@@ -133,41 +137,36 @@ class Fit:
         return float(np.sqrt(turn * shift))
 
 
-def robust_fit(pairs: Pairs, start: tuple[Floats, Floats] | None = None) -> Fit:
+def robust_fit(pairs: PosePairs, start: tuple[Floats, Floats] | None = None) -> Fit:
     """X and Y by least squares with Cauchy weights, from the closed form or a start (X, Y).
 
-    The residuals' usual size, one for rotations and one for positions, comes from their medians.
+    start: X (4, 4) and Y (k, 4, 4) of the segments. The residuals' usual size, one for rotations
+    and one for positions, comes from their medians. Poses that leave X free get some X.
     Source: Holland and Welsch, "Robust regression using iteratively reweighted least squares"
-    (1977). Poses that leave X free get some X.
+    (1977).
     """
     X, Y = start or _closed_form(pairs)
     fit = _at(pairs, X, Y)
-    for _ in range(STEPS):
-        rows, right = _weighted(fit)
-        step: Floats = np.asarray(np.linalg.lstsq(rows, right, rcond=1e-10)[0], np.float64)
+    for _ in range(ROBUST_STEPS):
+        usual = [fit.turn_rad / MEDIAN_3D + LEAST_RAD, fit.shift_m / MEDIAN_3D + LEAST_M]
+        scale = 1.0 / np.repeat(usual, 3)
+        far = ((fit.twists * scale) ** 2).sum(axis=1) / 6.0
+        weight = scale / np.sqrt(1.0 + far / CAUCHY_WIDTH**2)[:, None]
+        rows, right = fit.columns * weight[..., None], fit.twists * weight
+        step = np.linalg.lstsq(rows.reshape(right.size, -1), right.ravel(), rcond=1e-10)[0]
         X, Y = turned(fit.X, step[:6]), turned(fit.Y, step[6:].reshape(-1, 6))
         fit = _at(pairs, X, Y)
-        if np.abs(step).max() < ARRIVED:
+        if np.abs(step).max() < SMALLEST_STEP:
             break
     return fit
 
 
-def _weighted(fit: Fit) -> tuple[Floats, Floats]:
-    """The whitened, weighted columns (6 n, 6 + 6 k) and residuals (6 n,)."""
-    usual = np.repeat([fit.turn_rad / MEDIAN_3D + LEAST_RAD, fit.shift_m / MEDIAN_3D + LEAST_M], 3)
-    whitened = fit.twists / usual
-    far = (whitened**2).sum(axis=1) / 6.0
-    weight = np.sqrt(1.0 / (1.0 + far / BEYOND**2))
-    rows = fit.columns / usual[:, None] * weight[:, None, None]
-    return rows.reshape(len(whitened) * 6, -1), (whitened * weight[:, None]).ravel()
-
-
-def _at(pairs: Pairs, X: Floats, Y: Floats) -> Fit:
+def _at(pairs: PosePairs, X: Floats, Y: Floats) -> Fit:
     predicted = camera_board(pairs.T_base_gripper, X, Y[pairs.segment], pairs.mount)
     return Fit(pairs, X, Y, pose_difference(predicted, pairs.T_camera_board))
 
 
-def _closed_form(pairs: Pairs) -> tuple[Floats, Floats]:
+def _closed_form(pairs: PosePairs) -> tuple[Floats, Floats]:
     """X from the pairs of the largest segment, Y of each segment."""
     largest = np.bincount(pairs.segment).argmax()
     main = pairs.keep(pairs.segment == largest)
