@@ -122,7 +122,7 @@ class MendedPairs:
         pairs, arms, at, size = self.fit.pairs, self.arms, test.at, float(test.coefficients[0])
         if test.cause == OUTLIER:
             left = pairs.keep(np.arange(len(pairs)) != at)
-            return replace(self, fit=robust_fit(left), odd=self.odd + 1)
+            return replace(self, fit=left.fit, odd=self.odd + 1)
         if test.cause == SLIP:
             segment, Y = pairs.segment.copy(), self.fit.Y
             moved = turned(Y[segment[at]], test.coefficients)
@@ -141,7 +141,7 @@ class MendedPairs:
             change = size * np.eye(6)[at]
             pairs = _moved(pairs, self._jacobian() @ change)
             after = replace(after, offsets=self.offsets + change)
-        fit = robust_fit(pairs)
+        fit = pairs.fit
         return replace(after, fit=fit) if fit.better_than(self.fit) > 1.0 else None
 
     @cached_property
@@ -214,7 +214,7 @@ class MendedPairs:
 
 def search(pairs: PosePairs, arms: Arms) -> CauseSearch[MendedPairs]:
     """The causes that the residuals of pairs speak for, the strongest first."""
-    return search_causes(MendedPairs(arms, robust_fit(pairs)), CHANCE_LEVEL)
+    return search_causes(MendedPairs(arms, pairs.fit), CHANCE_LEVEL)
 
 
 def turn_and_shift(test: Tested) -> tuple[float, float]:

@@ -20,7 +20,7 @@ from coursekit.checks import want
 from coursekit.hand_eye import causes, misread
 from coursekit.hand_eye.causes import Arms, MendedPairs
 from coursekit.hand_eye.closed_form import FEWEST
-from coursekit.hand_eye.pairs import Fit, PosePairs, robust_fit
+from coursekit.hand_eye.pairs import Fit, PosePairs
 from coursekit.hand_eye.poses import camera_board, mean_pose
 from coursekit.hand_eye.session import HandEyeSession
 from coursekit.words import Finding, Findings
@@ -95,7 +95,7 @@ class _Case:
 
     def units(self) -> None:
         """Millimetres, by size alone: neither an arm nor a camera reaches 10 m."""
-        given, sides, evidence = robust_fit(self.pairs), [], []
+        given, sides, evidence = self.pairs.fit, [], []
         for side, what, T in (
             ("arm", "the gripper is", self.pairs.T_base_gripper),
             ("camera", "the board is seen", self.pairs.T_camera_board),
@@ -110,19 +110,19 @@ class _Case:
         if sides:
             whose, text = " and ".join(sides), "; ".join(evidence)
             words = {"whose": whose, "Whose": _first_upper(whose), "evidence": text}
-            self.add("millimetres", given, robust_fit(self.pairs), **words)
+            self.add("millimetres", given, self.pairs.fit, **words)
 
     def joints_in_degrees(self) -> None:
         """Degrees in q, by size alone; and the arm poses that were computed from them."""
         if self.q is None or np.abs(self.q).max() <= 2 * np.pi:
             return
-        given = robust_fit(self.pairs)
+        given = self.pairs.fit
         largest, computed = float(np.abs(self.q).max()), self.arm.forward(self.q)
         self.q = np.radians(self.q)
         mended = given
         if np.abs(computed - self.pairs.T_base_gripper).max() < AS_COMPUTED_M:
             self.pairs = replace(self.pairs, T_base_gripper=self.arm.forward(self.q))
-            mended = robust_fit(self.pairs)
+            mended = self.pairs.fit
         most = f"no joint turns by more than {2 * np.pi:.1f}"
         evidence = f"joint angles up to {largest:.0f}, where {most}"
         self.add("degrees", given, mended, evidence=evidence, how="")
@@ -151,7 +151,7 @@ class _Case:
 
     def readings(self) -> None:
         """Another pairing, convention or unit of angles with which arm and camera agree."""
-        given = robust_fit(self.pairs)
+        given = self.pairs.fit
         other = misread.other_pairing(self.pairs)
         better = misread.better_readings(given, other, misread.PAIRING_SHIFT_LEFT)
         if better:
@@ -185,7 +185,7 @@ class _Case:
             places = misread.places(pairs)
             if not places.agree:
                 continue
-            fit = robust_fit(pairs)
+            fit = pairs.fit
             other = misread.other_rotations(pairs)
             better = misread.better_readings(fit, other, misread.ROTATION_SHIFT_LEFT)
             reading = better[0] if better else misread.undo_degrees(fit, places.expected)
@@ -219,7 +219,7 @@ class _Case:
         boards = self.session.board_poses
         if not any(pose.ambiguous for pose in boards):
             return
-        fit = robust_fit(self.pairs)
+        fit = self.pairs.fit
         expected = camera_board(self.pairs.T_base_gripper, fit.X, fit.Y[0], self.pairs.mount)
         chosen = self.pairs.T_camera_board.copy()
         for row, view in enumerate(self.pairs.view):

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from coursekit.arrays import Floats
 from coursekit.geometry import invert_transform
-from coursekit.hand_eye.pairs import LEAST_M, Fit, PosePairs, robust_fit
+from coursekit.hand_eye.pairs import LEAST_M, Fit, PosePairs
 from coursekit.hand_eye.poses import Mount, nearest_rotation
 from coursekit.hand_eye.session import HandEyeSession
 
@@ -73,7 +73,7 @@ def better_readings(
     most_shift: how large the displacements left over may be, in units of those as given; a wrong
     reading may mend the rotations alone.
     """
-    fits = [Reading(name, says, robust_fit(pairs)) for name, says, pairs in readings]
+    fits = [Reading(name, says, pairs.fit) for name, says, pairs in readings]
     left = most_shift * given.shift_m + LEAST_M
     clear = [r for r in fits if r.fit.better_than(given) > CLEARLY_BETTER and r.fit.shift_m < left]
     return sorted(clear, key=lambda reading: -reading.fit.better_than(given))
@@ -182,10 +182,10 @@ def undo_degrees(given: Fit, expected: Floats) -> Reading | None:
         R = _decoded(given.pairs.T_base_gripper[:, :3, :3], expected, kind)
         if R is None:
             continue
-        fit = robust_fit(with_rotations(given.pairs, R))
+        fit = with_rotations(given.pairs, R).fit
         # `expected` leans on positions alone; with X and Y a pose's neighbours are told apart
         R = _nearest(given.pairs.T_base_gripper[:, :3, :3], _arm_rotations(fit), kind)
-        fit = robust_fit(with_rotations(given.pairs, R))
+        fit = with_rotations(given.pairs, R).fit
         if fit.better_than(given) > CLEARLY_BETTER:
             what = kind if kind not in EULER else f"Euler angles ({kind})"
             return Reading("degrees", f"the {what} read as degrees", fit)

@@ -7,6 +7,7 @@ it does, rad and m, in the camera's axes.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -58,10 +59,14 @@ class PosePairs:
 
     def keep(self, mask: NDArray[np.bool_]) -> PosePairs:
         """The pairs where mask (n,) is true."""
-        return replace(
-            self,
-            **{name: value[mask] for name, value in vars(self).items() if name != "mount"},
-        )
+        arm, seen, image = (a[mask] for a in (self.T_base_gripper, self.T_camera_board, self.image))
+        segment, view, row = (a[mask] for a in (self.segment, self.view, self.row))
+        return PosePairs(arm, seen, self.mount, image, segment, view, row)
+
+    @cached_property
+    def fit(self) -> Fit:
+        """`robust_fit` of these pairs."""
+        return robust_fit(self)
 
     def scaled(self, factor: float) -> PosePairs:
         """With a board that is `factor` times as large as it was taken for."""
