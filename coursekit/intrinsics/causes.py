@@ -57,7 +57,7 @@ TYPICAL = {BOW: 5e-4, FOCUS: 0.01, SHUTTER: 1e-3, LENS: 0.5, VIEW: 1.0, CORNERS:
 CHANCE_LEVEL = 3e-4
 BOW_LEVEL = 0.01  # a bow less likely than this by chance is one
 PRIOR_PX = 0.1  # corner noise against which a cause's size is weighed in a refit
-REFIT_STEPS, SMALL_DECREASE, BOW_DECREASE = 40, 1e-7, 1e-11
+REFIT_STEPS, SMALL_DECREASE = 40, 1e-7  # a step that saves less of the squares is the last
 LEAST_DAMPING, MOST_DAMPING = 1e-12, 1.0  # of the columns' own squares
 SPOILED_RATIO = 3.0  # a view's rms over the others' median; blurred or far views reach 2
 SPOILED_PX = 0.2  # and at least this: what is a good corner's noise in a poor image
@@ -362,10 +362,9 @@ def linearise(model: Calibration) -> Linear:
     )
 
 
-def refit(model: Calibration, small_decrease: float = SMALL_DECREASE) -> Calibration:
+def refit(model: Calibration) -> Calibration:
     """Levenberg-Marquardt over the camera, the poses and the causes of the model.
 
-    small_decrease: the share of the squares that a step must save, or it is the last.
     Views without tilt leave a direction open in which an undamped step runs away.
     """
     squares, damping = _squares(model), LEAST_DAMPING
@@ -377,7 +376,7 @@ def refit(model: Calibration, small_decrease: float = SMALL_DECREASE) -> Calibra
             if damping > MOST_DAMPING:
                 break
             continue
-        small = squares - now <= small_decrease * squares
+        small = squares - now <= SMALL_DECREASE * squares
         model, squares, damping = trial, now, max(damping / 10.0, LEAST_DAMPING)
         if small:
             break
@@ -486,7 +485,7 @@ def fit_bow(result: IntrinsicsResult) -> Bow:
     """
     from scipy.stats import f
 
-    model = refit(replace(Calibration.of(result), sizes={BOW: TYPICAL[BOW]}), BOW_DECREASE)
+    model = refit(replace(Calibration.of(result), sizes={BOW: TYPICAL[BOW]}))
     shape = bow_shape(model, result.points) * model.half_diagonal**2
     coefficients = model.values[BOW] / model.half_diagonal**2
     bowed = evaluate(
