@@ -32,7 +32,8 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from coursekit.arrays import ArrayLike, Floats, Mask
-from coursekit.geometry import check_transform, cross_matrix, invert_transform, make_transform
+from coursekit.checks import transforms
+from coursekit.geometry import cross_matrix, invert_transform, make_transform
 from coursekit.specifications import DATA
 
 Tool = Literal["gripper", "flange"]
@@ -186,7 +187,7 @@ class Arm:
         has several solutions and the first one found is returned; some close to a joint's limit
         are missed (the mask says so).
         """
-        targets = check_transform("T_base_gripper", T_base_gripper)
+        targets = transforms("T_base_gripper", T_base_gripper)
         shape = targets.shape[:-2]
         targets = targets.reshape(-1, 4, 4)
         q, reached = np.zeros((len(targets), 6)), np.zeros(len(targets), bool)

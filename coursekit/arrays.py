@@ -10,6 +10,7 @@ Integers = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 Mask = Bools
 Grey = NDArray[np.uint8]  # a grey image (H, W)
+Image = NDArray[np.uint8]  # grey (H, W) or BGR (H, W, 3)
 AnyArray = NDArray[Any]
 Interval = tuple[float, float]  # low and high end, mostly of 95 %
 Window = tuple[int, int, int, int]  # left, top, width, height, px
@@ -19,6 +20,7 @@ __all__ = [
     "Bools",
     "Floats",
     "Grey",
+    "Image",
     "Integers",
     "Interval",
     "Mask",

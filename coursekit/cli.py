@@ -1,14 +1,21 @@
-"""The command `coursekit`."""
+"""The command `coursekit`.
+
+It calls what a notebook would, by the same names: `ck` loads a room when it is first used, so that
+`coursekit --help` does not wait for all of them.
+"""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from coursekit.cameras import CameraError, open_camera
+import coursekit as ck
+from coursekit import doctor
+
+CAMERAS = "auto (default), simulated, a serial number or a recording"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -21,7 +28,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         return options.run(options) or 0
-    except (CameraError, OSError, ValueError) as error:
+    except (ck.cameras.CameraError, OSError, ValueError) as error:
         said = str(error).replace("overwrite=True", "--overwrite")  # which is Python's way
         print(f"coursekit: {said}", file=sys.stderr)
         return 1
@@ -33,92 +40,57 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="coursekit", description="The course's tools.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    record = commands.add_parser("record", help="record a camera to a .db3 file")
-    record.add_argument("--out", required=True, metavar="FILE", help="the .db3 file to write")
-    record.add_argument("--frames", required=True, type=int, metavar="N", help="how many frames")
-    record.add_argument(
-        "--camera",
-        default="auto",
-        metavar="WHICH",
-        help="auto (default), simulated, a serial number or a recording",
-    )
-    record.add_argument("--overwrite", action="store_true", help="replace an existing file")
-    record.set_defaults(run=_record)
-    _add_board(commands)
-    _add_submit(commands)
-    _add_grade(commands)
-    _add_doctor(commands)
-    return parser
 
+    def command(name: str, run: Callable[..., Any], says: str, **more: Any) -> Any:
+        added = commands.add_parser(name, help=says, **more)
+        added.set_defaults(run=run)
+        return added
 
-def _add_doctor(commands: Any) -> None:
-    doctor = commands.add_parser(
-        "doctor", help="say what works here, and what to do about the rest"
-    )
-    which = "auto (default), simulated, a serial number or a recording"
-    doctor.add_argument("--camera", default="auto", metavar="WHICH", help=which)
-    doctor.set_defaults(run=_doctor)
+    the = command("record", _record, "record a camera to a .db3 file")
+    the.add_argument("--out", required=True, metavar="FILE", help="the .db3 file to write")
+    the.add_argument("--frames", required=True, type=int, metavar="N", help="how many frames")
+    the.add_argument("--camera", default="auto", metavar="WHICH", help=CAMERAS)
+    the.add_argument("--overwrite", action="store_true", help="replace an existing file")
 
+    the = command("board", _board, "print a calibration board to true scale")
+    the.add_argument("--kind", choices=("checkerboard", "charuco"), default="charuco")
+    squares = "columns x rows of squares (inner corners are one fewer each way)"
+    the.add_argument("--squares", required=True, type=_squares, metavar="9x6", help=squares)
+    the.add_argument("--square-mm", required=True, type=float, metavar="MM")
+    the.add_argument("--marker-mm", type=float, metavar="MM", help="default: 0.75 of a square")
+    the.add_argument("--dictionary", metavar="NAME", help="of a ChArUco board's markers")
+    the.add_argument("--paper", default="A4", metavar="NAME", help="A4 (default) to A0, Letter")
+    the.add_argument("--out", required=True, metavar="FILE", help="a .pdf or .png file to write")
+    the.add_argument("--overwrite", action="store_true", help="replace an existing file")
 
-def _doctor(options: argparse.Namespace) -> int:
-    from coursekit.doctor import run
-
-    return run(options.camera)
-
-
-def _add_board(commands: Any) -> None:
-    board = commands.add_parser("board", help="print a calibration board to true scale")
-    board.add_argument("--kind", choices=("checkerboard", "charuco"), default="charuco")
-    board.add_argument(
-        "--squares",
-        required=True,
-        type=_squares,
-        metavar="9x6",
-        help="columns x rows of squares (inner corners are one fewer each way)",
-    )
-    board.add_argument("--square-mm", required=True, type=float, metavar="MM")
-    board.add_argument("--marker-mm", type=float, metavar="MM", help="default: 0.75 of a square")
-    board.add_argument("--dictionary", metavar="NAME", help="of a ChArUco board's markers")
-    board.add_argument("--paper", default="A4", metavar="NAME", help="A4 (default) to A0, Letter")
-    board.add_argument("--out", required=True, metavar="FILE", help="a .pdf or .png file to write")
-    board.add_argument("--overwrite", action="store_true", help="replace an existing file")
-    board.set_defaults(run=_board)
-
-
-def _add_submit(commands: Any) -> None:
-    submit = commands.add_parser("submit", help="pack the studio exercise to hand it in")
-    submit.add_argument("--student", required=True, metavar="NAME", help="as your course knows it")
-    submit.add_argument("--distance", type=float, metavar="M", help="where the camera will be, m")
-    submit.add_argument("--frames", type=int, default=1, metavar="N", help="averaged there")
+    the = command("submit", _submit, "pack the studio exercise to hand it in")
+    the.add_argument("--student", required=True, metavar="NAME", help="as your course knows it")
+    the.add_argument("--distance", type=float, metavar="M", help="where the camera will be, m")
+    the.add_argument("--frames", type=int, default=1, metavar="N", help="averaged there")
     choices = ("bias", "noise")
-    submit.add_argument("--dominates", type=str.lower, choices=choices, help="which error, there")
-    words = submit.add_mutually_exclusive_group()
+    the.add_argument("--dominates", type=str.lower, choices=choices, help="which error, there")
+    words = the.add_mutually_exclusive_group()
     words.add_argument("--paragraph", default="", metavar="TEXT", help="three sentences: why")
     words.add_argument("--paragraph-file", metavar="FILE", help="a text file that holds them")
-    submit.add_argument("--folder", metavar="DIR", help="where to write, default: results/")
-    submit.add_argument("--overwrite", action="store_true", help="replace an existing bundle")
-    submit.set_defaults(run=_submit)
+    the.add_argument("--folder", metavar="DIR", help="where to write, default: results/")
+    the.add_argument("--overwrite", action="store_true", help="replace an existing bundle")
 
+    more = (
+        "Grade every bundle (.zip) in a folder and below it. Stopped with Ctrl-C, the same command "
+        "goes on from there. Nothing that a student wrote is run or unpacked."
+    )
+    the = command("grade", _grade, "grade a folder of bundles", description=more)
+    the.add_argument("folder", metavar="FOLDER", help="what students handed in")
+    the.add_argument("--out", required=True, metavar="DIR", help="the report: a new folder")
+    the.add_argument("--workers", type=int, metavar="N", help="processes, default: one a core")
+    timeout = "seconds a bundle, default: 10"
+    the.add_argument("--timeout", type=float, default=10.0, metavar="S", help=timeout)
+    finished = "replace a finished report; only what has changed is graded"
+    the.add_argument("--overwrite", action="store_true", help=finished)
 
-def _add_grade(commands: Any) -> None:
-    grade = commands.add_parser(
-        "grade",
-        help="grade a folder of bundles",
-        description="Grade every bundle (.zip) in a folder and below it. Stopped with Ctrl-C, the "
-        "same command goes on from there. Nothing that a student wrote is run or unpacked.",
-    )
-    grade.add_argument("folder", metavar="FOLDER", help="what students handed in")
-    grade.add_argument("--out", required=True, metavar="DIR", help="the report: a new folder")
-    grade.add_argument("--workers", type=int, metavar="N", help="processes, default: one a core")
-    grade.add_argument(
-        "--timeout", type=float, default=10.0, metavar="S", help="seconds a bundle, default: 10"
-    )
-    grade.add_argument(
-        "--overwrite",
-        action="store_true",
-        help="replace a finished report; only what has changed is graded",
-    )
-    grade.set_defaults(run=_grade)
+    the = command("doctor", _doctor, "say what works here, and what to do about the rest")
+    the.add_argument("--camera", default="auto", metavar="WHICH", help=CAMERAS)
+    return parser
 
 
 def _squares(text: str) -> tuple[int, int]:
@@ -130,29 +102,24 @@ def _squares(text: str) -> tuple[int, int]:
 
 
 def _record(options: argparse.Namespace) -> None:
-    with open_camera(options.camera) as camera:
+    with ck.open_camera(options.camera) as camera:
         print(camera)
         path = camera.record(options.out, options.frames, overwrite=options.overwrite)
     print(f"Wrote {path}. Play it with ck.open_camera({str(path)!r}).")
 
 
 def _board(options: argparse.Namespace) -> None:
-    from coursekit.boards import Board, save_sheet
-    from coursekit.boards.sheet import describe
-
     fields = {"dictionary": options.dictionary} if options.dictionary else {}
     if options.marker_mm is not None:
         fields["marker_m"] = options.marker_mm / 1000
-    board = Board(options.kind, options.squares, options.square_mm / 1000, **fields)
-    path = save_sheet(board, options.out, options.paper, overwrite=options.overwrite)
-    print(f"Wrote {path}: {describe(board)}.")
+    board = ck.boards.Board(options.kind, options.squares, options.square_mm / 1000, **fields)
+    path = ck.boards.save_sheet(board, options.out, options.paper, overwrite=options.overwrite)
+    print(f"Wrote {path}: {ck.boards.sheet.caption(board)}.")
     print("Print at 100 %, check that the bar measures 100 mm, and glue it flat to glass.")
     print(f"In Python: {board!r}")
 
 
 def _submit(options: argparse.Namespace) -> None:
-    from coursekit.submission.submit import submit
-
     paragraph = options.paragraph
     if options.paragraph_file:
         try:
@@ -162,32 +129,23 @@ def _submit(options: argparse.Namespace) -> None:
                 f"{options.paragraph_file}: is no plain text in UTF-8; save it as that (in Word or "
                 "Notepad: plain text, encoding UTF-8) and try again"
             ) from None
-    handed = submit(
-        options.student,
-        options.distance,
-        options.dominates,
-        paragraph,
-        options.frames,
-        options.folder,
-        options.overwrite,
-    )
+    claims = options.distance, options.dominates, paragraph, options.frames
+    handed = ck.submit(options.student, *claims, options.folder, options.overwrite)
     if handed.path is None:
         raise ValueError(str(handed))
     print(handed)
 
 
 def _grade(options: argparse.Namespace) -> None:
+    # No notebook needs it, so it has no short name.
     from coursekit.submission.batch import grade_folder
 
-    print(
-        grade_folder(
-            options.folder,
-            options.out,
-            options.workers,
-            options.timeout,
-            overwrite=options.overwrite,
-        )
-    )
+    where = options.folder, options.out
+    print(grade_folder(*where, options.workers, options.timeout, overwrite=options.overwrite))
+
+
+def _doctor(options: argparse.Namespace) -> int:
+    return doctor.run(options.camera)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,11 @@
 """`coursekit doctor`: what works on this computer, and what to do about the rest.
 
-Nothing but the standard library is imported before a check needs it, so that a broken installation
-gets its line too: where `coursekit` itself does not start, `python -m coursekit.doctor` does.
+Nothing but the standard library is imported before a check needs it, rooms of the course included,
+so that a broken installation gets its line too: where `coursekit` itself does not start,
+`python -m coursekit.doctor` does.
+
+A check is a function that yields what it found: a verdict, a sentence, and a remedy. The tables
+COMPUTER and FIGURES, at the end of their sections, give each its name and its turn.
 """
 
 from __future__ import annotations
@@ -20,37 +24,16 @@ import textwrap
 import time
 import webbrowser
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from coursekit import results
+from coursekit.words import counted
 
-if TYPE_CHECKING:
-    from coursekit.cameras import Camera, Frame, Frames
-    from coursekit.geometry import Intrinsics
-    from coursekit.specifications import Device
-    from coursekit.stereo import WindowStats
-
-Verdict = Literal["ok", "note", "problem"]
-
-# What a broken environment can make a check raise. Anything else is a mistake of this module.
-CONTAINED = (
-    ArithmeticError,
-    AttributeError,
-    EOFError,
-    ImportError,
-    LookupError,
-    MemoryError,
-    OSError,
-    RuntimeError,  # CameraError, and what librealsense raises
-    SyntaxError,
-    TypeError,
-    ValueError,
-)
+Condition = Literal["ok", "note", "problem"]
 
 OLDEST, NEWEST_TESTED = (3, 11), (3, 13)
 PINS = results.ROOT / "requirements.txt"
@@ -59,8 +42,8 @@ UDEV_FOLDERS = tuple(map(Path, ("/etc/udev/rules.d", "/usr/lib/udev/rules.d", "/
 LEAST_FREE_BYTES = 100_000_000  # results, recordings, bundles
 WIDTH = 100
 
-TEST_FRAMES, LONGEST_TEST_S = 30, 3.0  # a second of a camera that gives 30 frames a second
-FRAMES_PER_S = 30
+TEST_FRAMES, FRAMES_PER_S = 30, 30
+LONGEST_TEST_S = 3.0  # on the camera's clock
 WINDOW_PX = 40  # the side of the window in the middle
 LEAST_FRAMES_FOR_NOISE = 5
 USUAL_VALID, HARDLY_VALID = 0.60, 0.05
@@ -81,13 +64,16 @@ LIGHTEN = (
 
 
 @dataclass(frozen=True)
-class Line:
-    """What one check found: a note is worth knowing, a problem is in the way."""
+class CheckUp:
+    """What one check found: a note is worth knowing, a problem is in the way.
 
-    check: str
-    verdict: Verdict
+    check: the name of the check, which `checks` fills in; as text it is what is printed.
+    """
+
+    verdict: Condition
     says: str
     remedy: str = ""
+    check: str = ""
 
     def __str__(self) -> str:
         head = f"{self.verdict:8} {self.check:12} "
@@ -100,6 +86,9 @@ class Line:
         )
 
 
+Check = Callable[..., CheckUp | Iterable[CheckUp] | None]
+
+
 def run(camera: str = "auto") -> int:
     """Print a line for each check as it is made; 0 when nothing is a problem, 1 otherwise.
 
@@ -107,74 +96,62 @@ def run(camera: str = "auto") -> int:
     """
     if isinstance(sys.stdout, io.TextIOWrapper):  # a pipe on Windows cannot show every letter
         sys.stdout.reconfigure(errors="replace")
-    found = Counter[Verdict]()
+    found = Counter[Condition]()
     for line in checks(camera):
         print(line, flush=True)
         found[line.verdict] += 1
-    problems = found["problem"]
-    if problems:
-        print(f"\n{problems} problem{'s' * (problems != 1)}: do what stands there, and ask again.")
+    if problems := found["problem"]:
+        print(f"\n{counted(problems, 'problem')}: do what stands there, and ask again.")
         return 1
     print("\nNothing is in the way. `python3 course.py lab` opens the notebooks.")
     return 0
 
 
-def examine(camera: str = "auto") -> list[Line]:
-    """All the lines of `run`, without printing them."""
-    return list(checks(camera))
-
-
-def checks(camera: str = "auto") -> Iterator[Line]:
+def checks(camera: str = "auto") -> Iterator[CheckUp]:
     """The lines one by one; a check that fails gives a line, never an exception."""
-    for name, check in (
-        ("Python", _python),
-        ("Packages", _packages),
-        ("Loading", _loading),
-        ("Kernel", _kernel),
-        ("Browser", _browser),
-        ("results/", _results),
-        ("Camera", partial(_cameras, camera)),
-    ):
-        yield from _contained(name, check)
+    for name, check in COMPUTER:
+        yield from _named(name, check)
+    yield from _named("Camera", _cameras, camera)
 
 
-def _contained(name: str, check: Callable[[], Iterable[Line]]) -> Iterator[Line]:
-    """The lines of a check, and one more when it fails on the way."""
+def _named(name: str, check: Check, *about: Any) -> Iterator[CheckUp]:
+    """What a check finds, under its name, and one more line when it fails on the way."""
     try:
-        yield from check()
-    except CONTAINED as error:
-        yield Line(
-            name,
-            "problem",
-            f"could not be checked ({type(error).__name__}: {error})",
-            f"mend the problems above first, if there are any; else {INSTALL}",
-        )
+        found = check(*about)
+        for line in [found] if isinstance(found, CheckUp) else found or ():
+            yield replace(line, check=line.check or name)
+    except Exception as error:  # whatever a broken environment makes it raise
+        says = f"could not be checked ({type(error).__name__}: {error})"
+        remedy = f"mend the problems above first, if there are any; else {INSTALL}"
+        yield CheckUp("problem", says, remedy, name)
+
+
+def _ok_if(good: bool, says: str, remedy: str, otherwise: Condition = "note") -> CheckUp:
+    return CheckUp("ok", says) if good else CheckUp(otherwise, says, remedy)
 
 
 # ---- the computer -------------------------------------------------------------------------------
 
 
-def _python() -> Iterator[Line]:
+def _python() -> CheckUp:
     version = ".".join(map(str, sys.version_info[:3]))
-    system = f"{platform.system()} {platform.machine()}"
-    says = f"{version} on {system}, in {sys.prefix}"
+    says = f"{version} on {platform.system()} {platform.machine()}, in {sys.prefix}"
     install = f"install Python {'.'.join(map(str, NEWEST_TESTED))} for 64 bits and begin again"
     if sys.version_info < OLDEST:
         wanted = ".".join(map(str, OLDEST))
-        yield Line("Python", "problem", f"{says}: too old, want {wanted} or newer", install)
+        return CheckUp("problem", f"{says}: too old, want {wanted} or newer", install)
     elif sys.maxsize < 2**32:
-        yield Line("Python", "problem", f"{says}: a 32-bit Python, it lacks the packages", install)
+        return CheckUp("problem", f"{says}: a 32-bit Python, it lacks the packages", install)
     elif (sys.platform, platform.machine()) == ("darwin", "x86_64"):
-        yield Line(
-            "Python",
+        return CheckUp(
             "problem",
             f"{says}: some packages no longer exist for Intel processors under macOS",
             "on an Apple-silicon Mac take the arm64 Python; else use another computer or a hub",
         )
     elif sys.version_info[:2] > NEWEST_TESTED:
-        yield Line("Python", "note", f"{says}: newer than what the course was tested with", install)
+        return CheckUp("note", f"{says}: newer than what the course was tested with", install)
     else:
-        yield Line("Python", "ok", says)
+        return CheckUp("ok", says)
 
 
 class Pin(NamedTuple):
@@ -192,26 +169,29 @@ def pins(path: Path) -> list[Pin]:
     return [Pin(m[1], m[2], m[3] or "") for m in matches if m]
 
 
-def _packages() -> Iterator[Line]:
+def _packages() -> Iterator[CheckUp]:
     from packaging.markers import Marker
 
     if not PINS.exists():
-        yield Line("Packages", "note", f"no {PINS.name} beside the course: nothing to compare with")
+        yield CheckUp("note", f"no {PINS.name} beside the course: nothing to compare with")
         return
     wanted = [pin for pin in pins(PINS) if not pin.marker or Marker(pin.marker).evaluate()]
     found = {pin.name: _version(pin.name) for pin in wanted}
     missing = [pin.name for pin in wanted if not found[pin.name]]
-    other = [pin for pin in wanted if found[pin.name] not in (pin.version, "")]
+    others = [
+        f"{pin.name} {found[pin.name]} (tested with {pin.version})"
+        for pin in wanted
+        if found[pin.name] not in (pin.version, "")
+    ]
+    broken = _out_of_range()
     if missing:
-        yield Line("Packages", "problem", f"not installed: {_some(missing)}", INSTALL)
-    if broken := _out_of_range():
-        yield Line("Packages", "problem", f"do not suit the course: {_some(broken)}", INSTALL)
-    if other:
-        named = [f"{p.name} {found[p.name]} (tested with {p.version})" for p in other]
-        says = f"other versions than the tested ones: {_some(named)}"
-        yield Line("Packages", "note", says, INSTALL)
-    if not missing and not broken and not other:
-        yield Line("Packages", "ok", f"all {len(wanted)} as pinned in {PINS.name}")
+        yield CheckUp("problem", f"not installed: {_some(missing)}", INSTALL)
+    if broken:
+        yield CheckUp("problem", f"do not suit the course: {_some(broken)}", INSTALL)
+    if others:
+        yield CheckUp("note", f"other versions than the tested ones: {_some(others)}", INSTALL)
+    if not missing and not broken and not others:
+        yield CheckUp("ok", f"all {len(wanted)} as pinned in {PINS.name}")
 
 
 def _version(name: str) -> str:
@@ -242,105 +222,97 @@ def _out_of_range() -> list[str]:
     ]
 
 
-def _loading() -> Iterator[Line]:
+def _loading() -> CheckUp:
     """Whether the packages with compiled parts load: a wheel can be damaged or lack a library."""
-    failed = {}
+    failed = []
     for name in LOADED:
         try:
             importlib.import_module(name)
-        except CONTAINED as error:
-            failed[name] = str(error).splitlines()[0] if str(error) else type(error).__name__
-    if failed:
-        says = "; ".join(f"{name} does not load ({why})" for name, why in failed.items())
-        yield Line("Loading", "problem", says, INSTALL)
-    else:
-        yield Line("Loading", "ok", f"{', '.join(LOADED)} load")
+        except Exception as error:
+            why = str(error).splitlines()[0] if str(error) else type(error).__name__
+            failed.append(f"{name} does not load ({why})")
+    says = "; ".join(failed) or f"{', '.join(LOADED)} load"
+    return _ok_if(not failed, says, INSTALL, "problem")
 
 
-def _kernel() -> Iterator[Line]:
+def _kernel() -> CheckUp:
     """Whether the notebooks' kernel is this environment's; it is not started."""
     from jupyter_client.kernelspec import KernelSpecManager, NoSuchKernel
 
     try:
         spec = KernelSpecManager().get_kernel_spec("python3")
     except NoSuchKernel:
-        yield Line("Kernel", "problem", "there is no kernel python3 for the notebooks", INSTALL)
-        return
+        return CheckUp("problem", "there is no kernel python3 for the notebooks", INSTALL)
     command = Path(spec.argv[0])
     if command.name == spec.argv[0] and command.stem.startswith("python"):
-        yield Line("Kernel", "ok", "python3 is the Python that JupyterLab runs with")
-    elif _same_folder(command, Path(sys.executable)):
-        yield Line("Kernel", "ok", "python3 is this environment's Python")
-    else:
-        yield Line(
-            "Kernel",
-            "problem",
-            f"the kernel python3 in {spec.resource_dir} starts another Python, {command}",
-            "`jupyter kernelspec remove python3` takes it away; or open the notebooks with "
-            "`python3 course.py lab`, which takes its own first",
-        )
+        return CheckUp("ok", "python3 is the Python that JupyterLab runs with")
+    with contextlib.suppress(OSError):  # in one folder: a resolved link would lead out of a .venv
+        if command.parent.samefile(Path(sys.executable).parent):
+            return CheckUp("ok", "python3 is this environment's Python")
+    return CheckUp(
+        "problem",
+        f"the kernel python3 in {spec.resource_dir} starts another Python, {command}",
+        "`jupyter kernelspec remove python3` takes it away; or open the notebooks with "
+        "`python3 course.py lab`, which takes its own first",
+    )
 
 
-def _same_folder(one: Path, other: Path) -> bool:
-    """Whether two programs lie in one folder (a resolved link would lead out of a .venv)."""
-    with contextlib.suppress(OSError):
-        return one.parent.samefile(other.parent)
-    return False
-
-
-def _browser() -> Iterator[Line]:
-    if "JUPYTERHUB_SERVICE_PREFIX" in os.environ:
-        yield Line("Browser", "ok", "a hub serves the notebooks to the browser that you have open")
-        return
+def _browser() -> CheckUp:
     elsewhere = (
         "`python3 course.py lab` prints an address: open it in a browser on this computer, or from "
         "another one through `ssh -L 8888:localhost:8888 ...`"
     )
+    if "JUPYTERHUB_SERVICE_PREFIX" in os.environ:
+        return CheckUp("ok", "a hub serves the notebooks to the browser that you have open")
     if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
-        yield Line("Browser", "note", "this computer has no screen to show one on", elsewhere)
-        return
+        return CheckUp("note", "this computer has no screen to show one on", elsewhere)
     try:
         name = getattr(webbrowser.get(), "name", "") or "the system's own"
     except webbrowser.Error:
-        yield Line("Browser", "note", "none was found", elsewhere)
-        return
-    yield Line("Browser", "ok", f"{name} opens the notebooks")
+        return CheckUp("note", "none was found", elsewhere)
+    return CheckUp("ok", f"{name} opens the notebooks")
 
 
-def _results() -> Iterator[Line]:
+def _results() -> CheckUp:
     """Whether results can be saved; nothing is left behind."""
     folder = results.folder()
     there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     try:
         with tempfile.TemporaryFile(dir=there):
-            pass
-        free = shutil.disk_usage(there).free
+            free = shutil.disk_usage(there).free
     except OSError as error:
-        yield Line(
-            "results/",
+        return CheckUp(
             "problem",
             f"nothing can be saved in {folder} ({error.strerror or error})",
             "make the folder writable, copy the course into your home folder, or let the "
             "environment variable COURSEKIT_RESULTS name a folder of your own",
         )
-        return
     if free < LEAST_FREE_BYTES:
         says = f"only {free / 1e6:.0f} MB are free on the disk of {folder}"
-        yield Line("results/", "problem", says, "delete something")
-    else:
-        yield Line("results/", "ok", f"{folder} can be written, {free / 1e9:.1f} GB free")
+        return CheckUp("problem", says, "delete something")
+    return CheckUp("ok", f"{folder} can be written, {free / 1e9:.1f} GB free")
+
+
+COMPUTER = (
+    ("Python", _python),
+    ("Packages", _packages),
+    ("Loading", _loading),
+    ("Kernel", _kernel),
+    ("Browser", _browser),
+    ("results/", _results),
+)
 
 
 # ---- the camera ---------------------------------------------------------------------------------
 
 
-def _cameras(which: str) -> Iterator[Line]:
+def _cameras(which: str) -> Iterator[CheckUp]:
     from coursekit.cameras import VARIABLE
     from coursekit.cameras.librealsense import LibraryMissing, load_librealsense
 
     named = os.environ.get(VARIABLE, "auto") if which == "auto" else which
     if named != which:
-        yield Line("Camera", "ok", f"{VARIABLE} names {named!r}, so nothing else is looked for")
+        yield CheckUp("ok", f"{VARIABLE} names {named!r}, so nothing else is looked for")
     if named == "simulated" or Path(named).is_dir():  # a set opens its files, and says so
         yield from _tested(named)
         return
@@ -348,19 +320,18 @@ def _cameras(which: str) -> Iterator[Line]:
         rs = load_librealsense()
     except LibraryMissing as missing:
         broken = missing.__cause__ is not None  # installed, and does not load
-        verdict: Verdict = "problem" if broken or named != "auto" else "note"
-        yield Line("Driver", verdict, str(missing))
+        verdict: Condition = "problem" if broken or named != "auto" else "note"
+        yield CheckUp(verdict, str(missing), check="Driver")
         if named == "auto":
             yield from _stand_in()
         return
-    yield Line("Driver", "ok", f"pyrealsense2 {getattr(rs, '__version__', '')} loads")
-    if named == "auto" or named.isdecimal():
-        yield from _live(rs, named)
-    else:
-        yield from _tested(named)
+    version = getattr(rs, "__version__", "")
+    yield CheckUp("ok", f"pyrealsense2 {version} loads", check="Driver")
+    live = named == "auto" or named.isdecimal()
+    yield from _live(rs, named) if live else _tested(named)
 
 
-def _live(rs: Any, named: str) -> Iterator[Line]:
+def _live(rs: Any, named: str) -> Iterator[CheckUp]:
     """The cameras on USB, and a test of the first or the named one; without any, the stand-in."""
     from coursekit.cameras import CameraError
     from coursekit.cameras.librealsense import connected_realsenses
@@ -368,257 +339,213 @@ def _live(rs: Any, named: str) -> Iterator[Line]:
     try:
         serials = connected_realsenses()
     except CameraError as error:
-        yield Line("USB", "problem", str(error))
+        yield CheckUp("problem", str(error), check="USB")
         return
     if named not in ("auto", *serials):
         yield from _tested(named)  # says which there are
-        return
-    if not serials:
-        yield Line(
-            "USB",
-            "note",
-            "no RealSense is plugged in",
-            "to use one: plug it into a USB 3 port with its own cable, and wait a few seconds",
-        )
-        yield from _udev()
+    elif serials:
+        for device in rs.context().query_devices():
+            yield from _named("USB", _device, rs, device)
+        yield from _tested(min(serials) if named == "auto" else named)
+    else:
+        remedy = "to use one: plug it into a USB 3 port with its own cable, and wait a few seconds"
+        yield CheckUp("note", "no RealSense is plugged in", remedy, "USB")
+        if sys.platform == "linux":
+            yield from _named("udev rules", _udev)
         yield from _stand_in()
-        return
-    for device in rs.context().query_devices():
-        yield from _contained("USB", partial(_device, rs, device))
-    yield from _tested(min(serials) if named == "auto" else named)
 
 
-def _stand_in() -> Iterator[Line]:
+def _stand_in() -> Iterator[CheckUp]:
     says = "the simulated camera stands in, which is fine: all of the course works with it"
-    yield Line("Camera", "note", says)
+    yield CheckUp("note", says)
     yield from _tested("simulated")
 
 
-def _udev() -> Iterator[Line]:
+def _udev() -> CheckUp:
     """Whether Linux would let this user open a camera once it is plugged in."""
     from coursekit.cameras.librealsense import UDEV_ADVICE
 
-    if sys.platform != "linux":
-        return
-    rules = [rule for folder in UDEV_FOLDERS for rule in folder.glob("*realsense*.rules")]
-    if rules:
-        yield Line("udev rules", "ok", f"{rules[0]}")
-    else:
-        says = "none for a RealSense: without them only root may use a real camera"
-        yield Line("udev rules", "note", says, f"before you plug one in: {UDEV_ADVICE}")
+    for folder in UDEV_FOLDERS:
+        for rules in folder.glob("*realsense*.rules"):
+            return CheckUp("ok", f"{rules}")
+    says = "none for a RealSense: without them only root may use a real camera"
+    return CheckUp("note", says, f"before you plug one in: {UDEV_ADVICE}")
 
 
-def _device(rs: Any, device: Any) -> Iterator[Line]:
+def _device(rs: Any, device: Any) -> Iterator[CheckUp]:
     """What a plugged-in camera says of itself before it is started."""
     from coursekit.cameras.librealsense import device_info
 
-    info = partial(device_info, rs, device)
-    yield Line("USB", "ok", f"{info('name') or 'RealSense'}, serial {info('serial_number')}")
-    yield from _contained("USB link", partial(_link, info("usb_type_descriptor")))
-    versions = info("firmware_version"), info("recommended_firmware_version")
-    yield from _contained("Firmware", partial(_firmware, *versions))
+    def told(name: str) -> str:
+        return device_info(rs, device, name)
+
+    yield CheckUp("ok", f"{told('name') or 'RealSense'}, serial {told('serial_number')}")
+    yield from _named("USB link", _link, told("usb_type_descriptor"))
+    versions = told("firmware_version"), told("recommended_firmware_version")
+    yield from _named("Firmware", _firmware, *versions)
 
 
-def _link(usb: str) -> Iterator[Line]:
-    if usb.startswith("3"):
-        yield Line("USB link", "ok", f"USB {usb}")
-    elif usb:
-        yield Line(
-            "USB link",
-            "problem",
-            f"USB {usb}: too slow for depth and colour together at 30 frames a second",
-            "use a USB 3 port (blue, or marked SS) of the computer itself, not of a hub, and a USB "
-            "3 cable, best its own; push the plug in fast, or turn a USB-C plug over",
-        )
+def _link(usb: str) -> CheckUp | None:
+    if not usb or usb.startswith("3"):
+        return CheckUp("ok", f"USB {usb}") if usb else None
+    return CheckUp(
+        "problem",
+        f"USB {usb}: too slow for depth and colour together at 30 frames a second",
+        "use a USB 3 port (blue, or marked SS) of the computer itself, not of a hub, and a USB "
+        "3 cable, best its own; push the plug in fast, or turn a USB-C plug over",
+    )
 
 
-def _firmware(own: str, recommended: str) -> Iterator[Line]:
+def _firmware(own: str, recommended: str) -> CheckUp | None:
     if not own or not recommended:
-        return
-    if _numbers(own) < _numbers(recommended):
+        return None
+    numbers, wanted = (tuple(map(int, re.findall(r"\d+", v))) for v in (own, recommended))
+    if numbers < wanted:
         says = f"{own}, older than {recommended}, which this version of librealsense wants"
-        yield Line("Firmware", "note", says, "update it in the RealSense Viewer (More, Update)")
-    else:
-        yield Line("Firmware", "ok", f"{own}, recommended is {recommended}")
+        return CheckUp("note", says, "update it in the RealSense Viewer (More, Update)")
+    return CheckUp("ok", f"{own}, recommended is {recommended}")
 
 
-def _numbers(version: str) -> tuple[int, ...]:
-    return tuple(map(int, re.findall(r"\d+", version)))
+# ---- what a camera reports ----------------------------------------------------------------------
 
 
-# ---- what a camera reports, and what it measures ------------------------------------------------
-
-
-def _tested(which: str) -> Iterator[Line]:
+def _tested(which: str) -> Iterator[CheckUp]:
     """A camera or recording, opened: its figures beside what is usual, and its depth."""
     from coursekit.cameras import CameraError, open_camera
 
     try:
         camera = open_camera(which)
     except (CameraError, ValueError) as error:
-        yield Line("Camera", "problem", str(error))
+        yield CheckUp("problem", str(error))
         return
     with camera:
-        yield Line("Camera", "ok", repr(camera).splitlines()[0])
-        for name, check in (
-            ("Depth unit", _depth_unit),
-            ("Baseline", _baseline),
-            ("K of depth", _depth_matrix),
-            ("K of colour", _color_matrix),
-            ("Depth test", _depth_test),
-        ):
-            yield from _contained(name, partial(check, camera))
+        yield CheckUp("ok", repr(camera).splitlines()[0])
+        for name, check in FIGURES:
+            yield from _named(name, check, camera)
+        yield from _named("Depth test", _depth_test, camera)
 
 
-def _specified(camera: Camera) -> Device | None:
-    """The device of data/devices.toml that a camera is, by its name."""
-    from coursekit import specifications
+def _depth_unit(camera: Any) -> CheckUp:
+    from coursekit.cameras.realsense import specified
 
-    for name in specifications.device_names():
-        if re.search(rf"\b{name}", camera.name):  # also D435i
-            return specifications.device(name)
-    return None
-
-
-def _depth_unit(camera: Camera) -> Iterator[Line]:
-    says = f"{1e3 * camera.depth_scale_m:g} mm a count"
-    device = _specified(camera)
+    says, device = f"{1e3 * camera.depth_scale_m:g} mm a count", specified(camera.name)
     if device is None:
-        yield Line("Depth unit", "ok", f"{says} (usual: 1 mm, of a D405 0.1 mm)")
-        return
+        return CheckUp("ok", f"{says} (usual: 1 mm, of a D405 0.1 mm)")
     usual = device.nominal.depth_scale_m
-    says += f" (usual: {1e3 * usual:g} mm)"
-    if abs(camera.depth_scale_m / usual - 1) < 1e-3:
-        yield Line("Depth unit", "ok", says)
-    else:
-        remedy = f"if nobody meant it: camera.set(depth_scale_m={usual:g})"
-        yield Line("Depth unit", "note", says, remedy)
+    good = abs(camera.depth_scale_m / usual - 1) < 1e-3
+    remedy = f"if nobody meant it: camera.set(depth_scale_m={usual:g})"
+    return _ok_if(good, f"{says} (usual: {1e3 * usual:g} mm)", remedy)
 
 
-def _baseline(camera: Camera) -> Iterator[Line]:
+def _baseline(camera: Any) -> CheckUp:
+    from coursekit.cameras.realsense import specified
+
     if camera.baseline_m is None:
         says = "not recorded: disparity and the noise law need it"
-        yield Line("Baseline", "note", says, "record anew with `coursekit record`, which keeps it")
-        return
-    says, device = f"{1e3 * camera.baseline_m:.2f} mm", _specified(camera)
+        return CheckUp("note", says, "record anew with `coursekit record`, which keeps it")
+    says, device = f"{1e3 * camera.baseline_m:.2f} mm", specified(camera.name)
     if device is None:
-        yield Line("Baseline", "ok", f"{says} (usual: 18 to 95 mm)")
-        return
+        return CheckUp("ok", f"{says} (usual: 18 to 95 mm)")
     nominal = device.nominal.baseline_m
-    says += f" (usual: {1e3 * nominal:g} mm to 2 %)"
     good = abs(camera.baseline_m / nominal - 1) < 0.02
-    yield Line("Baseline", "ok" if good else "note", says, "" if good else FACTORY)
+    return _ok_if(good, f"{says} (usual: {1e3 * nominal:g} mm to 2 %)", FACTORY)
 
 
-def _depth_matrix(camera: Camera) -> Iterator[Line]:
-    yield _matrix("K of depth", camera.depth)
-
-
-def _color_matrix(camera: Camera) -> Iterator[Line]:
-    if camera.color is None:
+def _matrix(k: Any) -> CheckUp:
+    """The factory's K, of an `Intrinsics`, beside what is usual: square pixels, a centred axis."""
+    if k is None:
         says = "there is no colour stream: notebooks 3 and 4 need it"
-        yield Line("K of colour", "note", says, "record depth and colour together")
-    else:
-        yield _matrix("K of colour", camera.color)
-
-
-def _matrix(name: str, k: Intrinsics) -> Line:
-    """The factory's K beside what is usual: square pixels, a centred axis."""
+        return CheckUp("note", says, "record depth and colour together")
     says = (
         f"fx {k.fx:.2f}, fy {k.fy:.2f}, cx {k.cx:.2f}, cy {k.cy:.2f} px at {k.width}x{k.height}, "
         f"{k.model} (usual: fx = fy to 1 %, the centre within 5 % of the width)"
     )
     off = max(abs(k.cx - (k.width - 1) / 2), abs(k.cy - (k.height - 1) / 2))
-    good = abs(k.fx / k.fy - 1) < 0.01 and off < 0.05 * k.width
-    return Line(name, "ok" if good else "note", says, "" if good else FACTORY)
+    return _ok_if(abs(k.fx / k.fy - 1) < 0.01 and off < 0.05 * k.width, says, FACTORY)
 
 
-def _depth_test(camera: Camera) -> Iterator[Line]:
+FIGURES: tuple[tuple[str, Check], ...] = (
+    ("Depth unit", _depth_unit),
+    ("Baseline", _baseline),
+    ("K of depth", lambda camera: _matrix(camera.depth)),
+    ("K of colour", lambda camera: _matrix(camera.color)),
+)
+
+
+# ---- what a camera measures ---------------------------------------------------------------------
+
+
+def _depth_test(camera: Any) -> Iterator[CheckUp]:
     """A second of depth: how many frames come, how much of them is depth, how noisy it is."""
-    from coursekit.cameras import CameraError
-    from coursekit.stereo import window_stats
+    from coursekit.cameras import CameraError, Frames
 
+    taken: list[Any] = []
     try:
-        frames, seconds = _second_of(camera)
+        with contextlib.closing(camera.stream()) as stream:
+            for frame in itertools.islice(stream, TEST_FRAMES):
+                if not taken:  # which may have waited for a compiler
+                    started = time.monotonic()
+                taken.append(frame)
+                if frame.time_s - taken[0].time_s > LONGEST_TEST_S:
+                    break
     except CameraError as error:
-        yield Line("Frames", "problem", str(error))
+        yield CheckUp("problem", str(error), check="Frames")
         return
-    yield _arrival([frame.number for frame in frames], seconds, camera.source == "live")
-    counts = frames.depth
-    height, width = counts.shape[1:]
-    yield _filled(float((counts > 0).mean()))
-    side = min(WINDOW_PX, height, width)
-    window = ((width - side) // 2, (height - side) // 2, side, side)
-    yield _noise(window_stats(frames, window), camera)
+    if camera.source == "live":
+        yield from _named("Frames", _arrival, taken)
+    else:
+        says = f"{len(taken)} read in {time.monotonic() - started:.1f} s"
+        yield CheckUp("ok", says, check="Frames")
+    frames = Frames(taken)
+    yield from _named("Filled", _filled, float((frames.depth > 0).mean()))
+    yield from _named("Noise", _noise, frames, camera)
 
 
-def _second_of(camera: Camera) -> tuple[Frames, float]:
-    """TEST_FRAMES frames, or those of LONGEST_TEST_S seconds, or what a recording has.
-
-    And the seconds between the first and the last; the first may wait for a compiler.
-    """
-    from coursekit.cameras import Frames
-
-    taken: list[Frame] = []
-    seconds = 0.0
-    with contextlib.closing(camera._stream()) as stream:
-        for frame in itertools.islice(stream, TEST_FRAMES):
-            if not taken:
-                started = time.monotonic()
-            taken.append(frame)
-            seconds = time.monotonic() - started
-            if seconds > LONGEST_TEST_S:
-                break
-    return Frames(taken), seconds
-
-
-def _arrival(numbers: list[int], seconds: float, live: bool) -> Line:
-    """numbers: of the frames that came; seconds: from the first to the last."""
-    count = len(numbers)
-    lost = numbers[-1] - numbers[0] + 1 - count
-    if not live:
-        return Line("Frames", "ok", f"{count} read in {seconds:.1f} s")
+def _arrival(frames: Sequence[Any]) -> CheckUp:
+    """Whether a live camera's frames come in time, on its own clock, so that none is missing."""
+    count = len(frames)
+    seconds = frames[-1].time_s - frames[0].time_s
+    lost = frames[-1].number - frames[0].number + 1 - count
     says = (
         f"{count} in {seconds:.2f} s, {lost} lost between them "
         f"(usual: {FRAMES_PER_S} a second, none lost)"
     )
     rate = (count - 1) / max(seconds, 1e-3)
-    if rate >= 0.8 * FRAMES_PER_S and lost <= 0.1 * count:
-        return Line("Frames", "ok", says)
-    return Line(
-        "Frames",
-        "note",
+    return _ok_if(
+        rate >= 0.8 * FRAMES_PER_S and lost <= 0.1 * count,
         says,
         "close what keeps the computer or its USB busy, plug the camera in directly, and do not "
         "run it beside another camera on one hub",
     )
 
 
-def _filled(valid: float) -> Line:
+def _filled(valid: float) -> CheckUp:
     says = f"{valid:.0%} of the pixels have depth (usual: more than {USUAL_VALID:.0%} indoors)"
-    if valid >= USUAL_VALID:
-        return Line("Filled", "ok", says)
-    return Line("Filled", "note" if valid > HARDLY_VALID else "problem", says, LIGHTEN)
+    otherwise: Condition = "note" if valid > HARDLY_VALID else "problem"
+    return _ok_if(valid >= USUAL_VALID, says, LIGHTEN, otherwise)
 
 
-def _noise(stats: WindowStats, camera: Camera) -> Line:
+def _noise(frames: Any, camera: Any) -> CheckUp:
     """The noise of the middle window over time, as disparity where the baseline is known."""
+    from coursekit.stereo import window_stats
+
+    height, width = frames[0].depth.shape
+    side = min(WINDOW_PX, height, width)
+    stats = window_stats(frames, ((width - side) // 2, (height - side) // 2, side, side))
     if stats.invalid_fraction > 0.5:
         says = f"no depth in the middle of the image ({stats.invalid_fraction:.0%} invalid)"
-        return Line("Noise", "note", says, LIGHTEN)
+        return CheckUp("note", says, LIGHTEN)
     if stats.n_frames < LEAST_FRAMES_FOR_NOISE:
         says = f"{stats.n_frames} frames are too few to tell"
-        return Line("Noise", "note", says, f"record {TEST_FRAMES} or more")
+        return CheckUp("note", says, f"record {TEST_FRAMES} or more")
     says = f"{1e3 * stats.pixel_std_m:.2f} mm over time for a pixel at {stats.depth_m:.2f} m"
     if camera.baseline_m is None:
-        return Line("Noise", "ok", says)
+        return CheckUp("ok", says)
     disparity = camera.depth.fx * camera.baseline_m / stats.depth_m
     noise_px = disparity * stats.pixel_std_unrounded_m / stats.depth_m
     low, high = USUAL_NOISE_PX
     says += f", {noise_px:.3f} px of disparity (usual: {low} to {high} px)"
-    if noise_px <= high:
-        return Line("Noise", "ok", says)
-    return Line("Noise", "note", says, f"hold everything still, and {LIGHTEN}")
+    return _ok_if(noise_px <= high, says, f"hold everything still, and {LIGHTEN}")
 
 
 if __name__ == "__main__":

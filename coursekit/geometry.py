@@ -1,12 +1,12 @@
 """The pinhole camera with Brown-Conrady distortion, both ways, and rigid transforms.
 
 Camera frame: x right, y down, z forward, metres. Pixels: (0, 0) is the centre of the top-left
-pixel, u right, v down. Distortion coefficients in OpenCV's order (k1, k2, p1, p2, k3).
+pixel, u right, v down. Distortion coefficients in OpenCV's order (k1, k2, p1, p2, k3). `T_a_b`
+takes coordinates in frame b to coordinates in frame a.
 """
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -16,10 +16,21 @@ from scipy.spatial.transform import Rotation
 
 from coursekit import kernels
 from coursekit.arrays import ArrayLike, Floats, NDArray
+from coursekit.checks import (
+    array,
+    choice,
+    instance,
+    number,
+    positive,
+    transform,
+    transforms,
+    want,
+    whole,
+)
 
-MODELS = ("none", "brown_conrady", "inverse_brown_conrady", "modified_brown_conrady")
-NEWTON_STEPS = 50
-NEWTON_TOLERANCE = 1e-13  # normalised units; times fx this is 1e-10 px
+DISTORTION_MODELS = ("none", "brown_conrady", "inverse_brown_conrady", "modified_brown_conrady")
+_NEWTON_STEPS = 50
+_NEWTON_TOLERANCE = 1e-13  # normalised units; times fx this is 1e-10 px
 
 
 @dataclass(frozen=True)
@@ -41,21 +52,11 @@ class Intrinsics:
     coeffs: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        for name in ("width", "height"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-                raise ValueError(f"{name}: got {value!r}, want a positive whole number of pixels")
-            object.__setattr__(self, name, int(value))
-        for name in ("fx", "fy", "cx", "cy"):
-            object.__setattr__(self, name, _number(name, getattr(self, name)))
-        for name in ("fx", "fy"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"{name}: got {getattr(self, name)}, want a positive length in px")
-        if self.model not in MODELS:
-            raise ValueError(f"model: got {self.model!r}, want one of {', '.join(MODELS)}")
-        coeffs = _array("coeffs", self.coeffs, (5,), leading=False)
-        if not np.isfinite(coeffs).all():
-            raise ValueError(f"coeffs: got {coeffs.tolist()}, want finite numbers")
+        lengths = {"width": whole, "height": whole, "fx": positive, "fy": positive}
+        for name, check in (lengths | {"cx": number, "cy": number}).items():
+            object.__setattr__(self, name, check(name, getattr(self, name)))
+        choice("model", self.model, DISTORTION_MODELS)
+        coeffs = array("coeffs", self.coeffs, (5,), finite=True)
         object.__setattr__(self, "coeffs", tuple(coeffs.tolist()))
 
     @property
@@ -87,46 +88,22 @@ class Intrinsics:
         """The fields as plain numbers, for JSON."""
         return asdict(self) | {"coeffs": list(self.coeffs)}
 
-    def to_json(self) -> str:
-        """The fields as JSON text."""
-        return json.dumps(self.to_dict(), indent=1)
-
     @classmethod
     def from_dict(cls, fields: dict[str, Any]) -> Intrinsics:
         """Intrinsics from the dictionary that `to_dict` makes; a missing or unknown key raises."""
-        if not isinstance(fields, dict):
-            raise ValueError(f"fields: got {type(fields).__name__}, want a dictionary")
-        known = set(cls.__dataclass_fields__)
-        missing = known - {"model", "coeffs"} - set(fields)
-        if missing or set(fields) - known:
-            raise ValueError(
-                f"fields: missing {sorted(missing)}, unknown {sorted(set(fields) - known)}"
-            )
+        known = cls.__dataclass_fields__.keys()
+        given = instance("fields", fields, dict).keys()
+        missing, unknown = sorted(known - {"model", "coeffs"} - given), sorted(given - known)
+        if missing or unknown:
+            raise ValueError(f"fields: missing {missing}, unknown {unknown}")
         return cls(**fields)
-
-    @classmethod
-    def from_json(cls, text: str) -> Intrinsics:
-        """Intrinsics from the text that `to_json` makes."""
-        try:
-            fields = json.loads(text)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"text: not JSON ({error})") from error
-        return cls.from_dict(fields)
 
     @classmethod
     def from_realsense(cls, intrinsics: Any) -> Intrinsics:
         """Intrinsics from a `pyrealsense2.intrinsics` (coefficient order is OpenCV's)."""
         model = str(intrinsics.model).rsplit(".", 1)[-1]
-        return cls(
-            intrinsics.width,
-            intrinsics.height,
-            intrinsics.fx,
-            intrinsics.fy,
-            intrinsics.ppx,
-            intrinsics.ppy,
-            model,
-            tuple(intrinsics.coeffs),
-        )
+        i = intrinsics
+        return cls(i.width, i.height, i.fx, i.fy, i.ppx, i.ppy, model, tuple(i.coeffs))
 
 
 # --- project and deproject ---
@@ -139,8 +116,12 @@ def project(points: ArrayLike, K: ArrayLike, dist: ArrayLike | None = None) -> F
     Returns (..., 2): (u, v) in px, NaN for a point that is not in front of the camera (Z <= 0)
     or not finite. Raises ValueError for a wrong shape, K or dist.
     Source: Brown (1971) as OpenCV's `projectPoints` states it.
+
+    >>> K = np.array([[447.0, 0.0, 424.0], [0.0, 447.0, 240.0], [0.0, 0.0, 1.0]])
+    >>> print(project([0.10, -0.05, 0.45], K).round(2))
+    [523.33 190.33]
     """
-    xyz = _array("points", points, (3,))
+    xyz = array("points", points, (3,), leading=True)
     K = _intrinsic_matrix(K)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         z = np.where(xyz[..., 2:] > 0, xyz[..., 2:], np.nan)
@@ -160,16 +141,19 @@ def deproject(
     Returns (..., 3) in m, NaN where the depth is invalid (zero, negative, not finite) and where
     the distortion has no inverse (`undistort` says which those are).
     Raises ValueError for a wrong shape, K or dist.
+
+    >>> K = np.array([[447.0, 0.0, 424.0], [0.0, 447.0, 240.0], [0.0, 0.0, 1.0]])
+    >>> print(deproject([424.0, 240.0], [0.45, 0.0], K))
+    [[0.   0.   0.45]
+     [ nan  nan  nan]]
     """
-    uv = _array("pixels", pixels, (2,))
-    z = _array("depth_m", depth_m)
+    uv = array("pixels", pixels, (2,), leading=True)
+    z = array("depth_m", depth_m, leading=True)
     K = _intrinsic_matrix(K)
     try:
         shape = np.broadcast_shapes(uv.shape[:-1], z.shape)
     except ValueError:
-        raise ValueError(
-            f"depth_m: got shape {z.shape}, want one depth a pixel, {uv.shape[:-1]}"
-        ) from None
+        want(False, "depth_m", z.shape, f"one depth a pixel, {uv.shape[:-1]}")
     xy = (uv - K[:2, 2]) / K[[0, 1], [0, 1]]
     if dist is not None:
         xy, converged = undistort(xy, dist)
@@ -187,7 +171,7 @@ def distort(xy: ArrayLike, dist: ArrayLike) -> Floats:
     xy (..., 2): X/Z and Y/Z. dist: (k1, k2, p1, p2, k3). Returns (..., 2).
     Source: OpenCV, "Camera Calibration and 3D Reconstruction", with k4..k6 = 0.
     """
-    xy = _array("xy", xy, (2,))
+    xy = array("xy", xy, (2,), leading=True)
     k1, k2, p1, p2, k3 = _coefficients(dist)
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
@@ -208,23 +192,23 @@ def undistort(xy: ArrayLike, dist: ArrayLike) -> tuple[Floats, NDArray[np.bool_]
     where there is no answer. A strong barrel distortion folds: past a radius the polynomial turns
     back, a pixel there belongs to no ray, and the mask says so instead of inventing one.
     """
-    target = _array("xy", xy, (2,))
+    target = array("xy", xy, (2,), leading=True)
     dist = _coefficients(dist)
     ideal = np.where(np.isfinite(target), target, np.nan).copy()
     determinant = np.full(target.shape[:-1], np.nan)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        for _ in range(NEWTON_STEPS):
+        for _ in range(_NEWTON_STEPS):
             residual = distort(ideal, dist) - target
             a, b, d = distortion_jacobian(ideal, dist)
             determinant = a * d - b * b
             step_x = (d * residual[..., 0] - b * residual[..., 1]) / determinant
             step_y = (a * residual[..., 1] - b * residual[..., 0]) / determinant
             ideal = ideal - np.stack([step_x, step_y], axis=-1)
-            if not (np.hypot(step_x, step_y) > NEWTON_TOLERANCE).any():
+            if not (np.hypot(step_x, step_y) > _NEWTON_TOLERANCE).any():
                 break
         error = np.abs(distort(ideal, dist) - target).max(axis=-1, initial=0.0)
         radius = np.hypot(ideal[..., 0], ideal[..., 1])
-        converged = (error < 1e3 * NEWTON_TOLERANCE * (1 + radius)) & (determinant > 0)
+        converged = (error < 1e3 * _NEWTON_TOLERANCE * (1 + radius)) & (determinant > 0)
         converged &= radius < fold_radius(dist)
     return ideal, converged
 
@@ -263,60 +247,39 @@ def fold_radius(dist: Floats) -> float:
 
 def pixel_grid(width: int, height: int) -> Floats:
     """The (height, width, 2) pixel coordinates (u, v) of an image's pixel centres."""
-    for name, value in (("width", width), ("height", height)):
-        if not isinstance(value, (int, np.integer)) or value < 1:
-            raise ValueError(f"{name}: got {value!r}, want a positive whole number of pixels")
-    u, v = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
+    columns, rows = whole("width", width), whole("height", height)
+    u, v = np.meshgrid(np.arange(columns, dtype=float), np.arange(rows, dtype=float))
     return np.stack([u, v], axis=-1)
 
 
 def deproject_image(
-    depth: ArrayLike,
-    intrinsics: Intrinsics,
-    depth_scale_m: float = 0.001,
-    out: NDArray[np.float32] | None = None,
+    depth: ArrayLike, intrinsics: Intrinsics, depth_scale_m: float = 0.001
 ) -> NDArray[np.float32]:
     """The point cloud of a depth image.
 
     depth (H, W): uint16 counts of `depth_scale_m` metres, or floats already in metres.
-    Returns (H, W, 3) float32 in m, NaN for invalid pixels (0, negative, not finite); written to
-    `out` where one is given, which saves the allocation in a loop over frames.
-    Raises ValueError when the image does not have the intrinsics' size.
+    Returns (H, W, 3) float32 in m, NaN for invalid pixels (0, negative, not finite).
+    Raises ValueError when the image does not have the intrinsics' size or is of another type.
+
+    >>> tiny = Intrinsics(width=2, height=1, fx=100.0, fy=100.0, cx=0.0, cy=0.0)
+    >>> print(deproject_image(np.array([[0, 500]], np.uint16), tiny))
+    [[[  nan   nan   nan]
+      [0.005 0.    0.5  ]]]
     """
-    if not isinstance(intrinsics, Intrinsics):
-        raise ValueError(f"intrinsics: got {type(intrinsics).__name__}, want Intrinsics")
-    image = depth if isinstance(depth, np.ndarray) else _array("depth", depth)
-    shape = (intrinsics.height, intrinsics.width)
-    if image.shape != shape:
-        raise ValueError(f"depth: got shape {image.shape}, want {shape} as the intrinsics say")
-    if image.dtype.kind == "f":
-        scale = 1.0
-    elif image.dtype == np.uint16:
-        scale = _number("depth_scale_m", depth_scale_m)
-        if scale <= 0:
-            raise ValueError(f"depth_scale_m: got {scale}, want a positive number of metres")
+    i = instance("intrinsics", intrinsics, Intrinsics)
+    image = depth if isinstance(depth, np.ndarray) else array("depth", depth, leading=True)
+    shape = (i.height, i.width)
+    want(image.shape == shape, "depth", image.shape, f"{shape} as the intrinsics say")
+    counts = image.dtype == np.uint16
+    want(counts or image.dtype.kind == "f", "depth", image.dtype, "uint16 counts or float metres")
+    scale = positive("depth_scale_m", depth_scale_m) if counts else 1.0
+    points = np.empty((*shape, 3), np.float32)
+    if i.dist is None:
+        kernels.deproject_pinhole(image, scale, i.fx, i.fy, i.cx, i.cy, points)
     else:
-        raise ValueError(f"depth: got dtype {image.dtype}, want uint16 counts or float metres")
-    if out is None:
-        out = np.empty((*shape, 3), np.float32)
-    elif out.shape != (*shape, 3) or out.dtype != np.float32 or not out.flags.c_contiguous:
-        raise ValueError(f"out: got {out.dtype} {out.shape}, want contiguous float32 {(*shape, 3)}")
-    return _scale_rays(image, intrinsics, scale, out)
-
-
-def _scale_rays(
-    image: NDArray[Any], intrinsics: Intrinsics, scale: float, out: NDArray[np.float32]
-) -> NDArray[np.float32]:
-
-    if intrinsics.dist is None:
-        kernels.deproject_pinhole(
-            image, scale, intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy, out
-        )
-    else:
-        grid = pixel_grid(*intrinsics.size)
-        rays = deproject(grid, np.ones(grid.shape[:2]), intrinsics.K, intrinsics.dist)
-        kernels.scale_rays(image, scale, rays, out)
-    return out
+        rays = deproject(pixel_grid(*i.size), np.ones(shape), i.K, i.dist)
+        kernels.scale_rays(image, scale, rays, points)
+    return points
 
 
 def align_depth_to_color(
@@ -333,11 +296,10 @@ def align_depth_to_color(
     that the depth camera measured; deprojecting that with the colour K is off by the rotation
     between the two cameras. Source of the footprint rule: librealsense, `src/proc/align.cpp`.
     """
-    depth = _array("depth_m", depth_m)
+    depth = array("depth_m", depth_m, leading=True)
     shape = (depth_intrinsics.height, depth_intrinsics.width)
-    if depth.shape != shape:
-        raise ValueError(f"depth_m: got shape {depth.shape}, want {shape} as the intrinsics say")
-    T = check_transform("T_color_depth", T_color_depth)
+    want(depth.shape == shape, "depth_m", depth.shape, f"{shape} as the intrinsics say")
+    T = transform("T_color_depth", T_color_depth)
     source = _align_sources(depth, depth_intrinsics, color_intrinsics, T)
     grid = pixel_grid(*depth_intrinsics.size)
     points = deproject(grid, depth, depth_intrinsics.K, depth_intrinsics.dist)
@@ -363,33 +325,27 @@ def _align_sources(depth: Floats, of: Intrinsics, to: Intrinsics, T: Floats) -> 
 
 
 def make_transform(rotation: Rotation | ArrayLike, translation: ArrayLike) -> Floats:
-    """The 4x4 transform of a rotation, (3, 3) or SciPy's, and a translation (3,) in m."""
+    """The 4x4 transform of a rotation, (3, 3) or SciPy's, and a translation (3,) in m.
+
+    >>> T_base_camera = make_transform(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.4])
+    >>> print(T_base_camera[2])
+    [ 0.   0.  -1.   0.4]
+    """
     matrix = rotation.as_matrix() if hasattr(rotation, "as_matrix") else rotation
     T = np.eye(4)
-    T[:3, :3] = _array("rotation", matrix, (3, 3), leading=False)
-    T[:3, 3] = _array("translation", translation, (3,), leading=False)
-    return check_transform("rotation and translation", T)
-
-
-def check_transform(name: str, value: ArrayLike) -> Floats:
-    """`value` as (..., 4, 4) float64, or a ValueError under `name` if it is not rigid."""
-    T = _array(name, value, (4, 4))
-    if not np.isfinite(T).all():
-        raise ValueError(f"{name}: has NaN or infinite entries")
-    if not np.allclose(T[..., 3, :], [0, 0, 0, 1], atol=1e-9):
-        raise ValueError(f"{name}: the last row must be (0, 0, 0, 1)")
-    R = T[..., :3, :3]
-    off = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(initial=0.0)
-    if off > 1e-5:  # librealsense reports extrinsics in float32
-        raise ValueError(f"{name}: the rotation is not orthonormal (R R^T is off by {off:.1e})")
-    if (np.linalg.det(R) < 0).any():
-        raise ValueError(f"{name}: the rotation has determinant -1, a reflection")
-    return T
+    T[:3, :3] = array("rotation", matrix, (3, 3))
+    T[:3, 3] = array("translation", translation, (3,))
+    return transform("rotation and translation", T)
 
 
 def invert_transform(T: ArrayLike) -> Floats:
-    """The inverse of rigid transforms (..., 4, 4): R^T and -R^T t."""
-    T = check_transform("T", T)
+    """The inverse of rigid transforms (..., 4, 4): R^T and -R^T t.
+
+    >>> T_base_camera = make_transform(np.diag([1.0, -1.0, -1.0]), [0.1, 0.0, 0.4])
+    >>> print(invert_transform(T_base_camera)[:3, 3])
+    [-0.1  0.   0.4]
+    """
+    T = transforms("T", T)
     inverse = np.zeros_like(T)
     inverse[..., :3, :3] = np.swapaxes(T[..., :3, :3], -1, -2)
     inverse[..., :3, 3:] = -inverse[..., :3, :3] @ T[..., :3, 3:]
@@ -398,11 +354,14 @@ def invert_transform(T: ArrayLike) -> Floats:
 
 
 def transform_points(T: ArrayLike, points: ArrayLike) -> Floats:
-    """Points (..., 3) taken through the transform T (4, 4): R p + t."""
-    T = check_transform("T", T)
-    if T.ndim != 2:
-        raise ValueError(f"T: got shape {T.shape}, want one (4, 4) transform")
-    return _array("points", points, (3,)) @ T[:3, :3].T + T[:3, 3]
+    """Points (..., 3) taken through the transform T (4, 4): R p + t.
+
+    >>> T_base_camera = make_transform(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.4])
+    >>> print(transform_points(T_base_camera, [0.0, 0.1, 0.3]))
+    [ 0.  -0.1  0.1]
+    """
+    T = transform("T", T)
+    return array("points", points, (3,), leading=True) @ T[:3, :3].T + T[:3, 3]
 
 
 def cross_matrix(vectors: Floats) -> Floats:
@@ -413,45 +372,20 @@ def cross_matrix(vectors: Floats) -> Floats:
     return matrix
 
 
-# --- checks at the boundary ---
-
-
-def _array(name: str, value: Any, tail: tuple[int, ...] = (), leading: bool = True) -> Floats:
-    """`value` as float64 of shape (..., *tail), or of exactly `tail` when `leading` is False."""
-    try:
-        given = np.asarray(value)
-        if given.dtype.kind not in "fiub":
-            raise ValueError(f"{type(value).__name__} of dtype {given.dtype}")
-        array = given.astype(np.float64, copy=False)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name}: want an array of real numbers, got {error}") from None
-    extra = array.ndim - len(tail)
-    if extra < 0 or array.shape[extra:] != tail or (extra and not leading):
-        wanted = ", ".join(["..."] * leading + [str(n) for n in tail])
-        raise ValueError(f"{name}: got shape {array.shape}, want ({wanted})")
-    return array
-
-
-def _number(name: str, value: Any) -> float:
-    array = _array(name, value, leading=False)
-    if not np.isfinite(array):
-        raise ValueError(f"{name}: got {value!r}, want a finite number")
-    return float(array)
+# --- what a camera's numbers must be ---
 
 
 def _intrinsic_matrix(K: ArrayLike) -> Floats:
-    K = _array("K", K, (3, 3), leading=False)
-    if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
-        raise ValueError(f"K: got {K.tolist()}, want finite numbers with fx > 0 and fy > 0")
-    if K[0, 1] or K[1, 0] or tuple(K[2]) != (0.0, 0.0, 1.0):
-        raise ValueError(f"K: got {K.tolist()}, want [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+    K = array("K", K, (3, 3), finite=True)
+    upright = not K[0, 1] and not K[1, 0] and tuple(K[2]) == (0.0, 0.0, 1.0)
+    fits = K[0, 0] > 0 and K[1, 1] > 0 and upright
+    want(fits, "K", K, "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx > 0 and fy > 0")
     return K
 
 
 def _coefficients(dist: ArrayLike) -> Floats:
-    values = _array("dist", dist)
-    if values.shape not in ((4,), (5,)) or not np.isfinite(values).all():
-        raise ValueError(f"dist: got {values.tolist()}, want finite (k1, k2, p1, p2[, k3])")
+    values = array("dist", dist, leading=True, finite=True)
+    want(values.shape in ((4,), (5,)), "dist", values, "(k1, k2, p1, p2[, k3])")
     return np.append(values, 0.0) if values.shape == (4,) else values
 
 

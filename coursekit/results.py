@@ -16,17 +16,24 @@ from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from coursekit.cameras import Camera
+from typing import Any, Literal, Protocol, get_args
 
 ROOT = Path(__file__).resolve().parent.parent
 FORMAT = 1
 Source = Literal["live", "recorded", "simulated", "reference"]
 Kind = Literal["bias", "noise"]
+
+
+class Measured(Protocol):
+    """What a result is measured with: a camera, or what stands in for one."""
+
+    @property
+    def source(self) -> Source:
+        """Whether it is live, recorded, simulated or a reference."""
+
+    @property
+    def name(self) -> str:
+        """Its name for people, such as "Intel RealSense D435"."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +117,7 @@ def folder() -> Path:
 
 def save(
     lesson: str,
-    camera: Camera,
+    camera: Measured,
     quantities: Mapping[str, Quantity],
     covariances: Mapping[str, Covariance] | None = None,
 ) -> Path:
@@ -133,7 +140,7 @@ def save(
         camera.source,
         camera.name,
         now(),
-        _versions(),
+        versions(),
         dict(quantities),
         dict(covariances),
     )
@@ -166,7 +173,7 @@ def read(path: Path) -> Result:
         raise ValueError(f"{path.name}: {error}") from error
 
 
-def save_arrays(lesson: str, **arrays: np.ndarray) -> Path:
+def save_arrays(lesson: str, **arrays: Any) -> Path:
     """Write the raw measurements behind a result to `results/<lesson>.npz`, in one step."""
     import numpy as np
 
@@ -223,7 +230,7 @@ def _path(lesson: str) -> Path:
     return folder() / f"{lesson}.json"
 
 
-def _versions() -> dict[str, str]:
+def versions() -> dict[str, str]:
     found = {"python": platform.python_version()}
     for name in ("coursekit", "numpy", "opencv-python-headless", "pyrealsense2"):
         try:

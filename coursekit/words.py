@@ -1,4 +1,4 @@
-"""Words and tables for people: wrapped lines, plurals, p-values, and what a diagnosis found."""
+"""Words for people: wrapped lines, tables, plurals, what was found, how far to trust a number."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import overload
+
+from coursekit.arrays import Interval
+from coursekit.checks import is_number, want
 
 WIDTH = 88  # characters: fits a notebook's output cell; JupyterLab breaks longer lines in mid-word
 
@@ -52,7 +55,7 @@ def html_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """The same as an HTML table; text is escaped."""
 
     def row(tag: str, cells: Sequence[str]) -> str:
-        texts = (f"<{tag} style='text-align:left'>{html.escape(c)}</{tag}>" for c in cells)
+        texts = (f'<{tag} style="text-align: left">{html.escape(c)}</{tag}>' for c in cells)
         return f"<tr>{''.join(texts)}</tr>"
 
     return f"<table>{row('th', head)}{''.join(row('td', cells) for cells in rows)}</table>"
@@ -150,3 +153,41 @@ class Findings(Sequence[Finding]):
         notes = "".join(f"<p><small>{html.escape(line)}</small></p>" for line in self._looked_for())
         listed = f"<ol>{items}</ol>" if items else ""
         return f"<p><b>{self._headline()}</b></p>{listed}{notes}"
+
+
+class Estimate:
+    """Numbers that were estimated, and how far to trust each: what all results of a fit have alike.
+
+    A class that inherits this gives `value` and `sigma` of a number by its name and `dof`, and has
+    from here the `interval` that holds it. It also says in words how good it is (`verdict()`), and
+    all of it when it is printed.
+    """
+
+    def value(self, name: str) -> float:
+        """The estimate of the number of this name."""
+        raise NotImplementedError
+
+    def sigma(self, name: str) -> float:
+        """Its standard deviation, in the same unit."""
+        raise NotImplementedError
+
+    @property
+    def dof(self) -> float:
+        """Degrees of freedom that sigma rests on; infinite where the noise was known before."""
+        raise NotImplementedError
+
+    def quantile(self, level: float = 0.95) -> float:
+        """How many sigmas an interval of probability `level` reaches to either side.
+
+        Student's t. Raises ValueError for a level that is not between 0 and 1.
+        """
+        from scipy.stats import t
+
+        inside = is_number(level) and 0 < level < 1
+        want(inside, "level", level, "a probability between 0 and 1")
+        return float(t(self.dof).ppf((1 + level) / 2))
+
+    def interval(self, name: str, level: float = 0.95) -> Interval:
+        """The interval that holds the number of this name with probability `level`."""
+        half = self.quantile(level) * self.sigma(name)
+        return self.value(name) - half, self.value(name) + half

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from coursekit.cameras import librealsense, realsense
 from coursekit.cameras.librealsense import LibraryMissing, load_librealsense
 
 SERIAL = "728612070259"
@@ -19,6 +23,22 @@ def real_library() -> Any:
         return load_librealsense()
     except LibraryMissing as missing:
         pytest.skip(str(missing))
+
+
+def plugged_in(monkeypatch: pytest.MonkeyPatch, usb: Path, **behaviour: Any) -> FakeRealSense:
+    """Plug in a fake D435 that behaves as the arguments say, and nothing else into `usb`."""
+    rs = FakeRealSense(**behaviour)
+    monkeypatch.delenv("COURSEKIT_CAMERA", raising=False)
+    monkeypatch.setattr(librealsense, "USB_DEVICES", usb)
+    monkeypatch.setattr(realsense, "_live_cameras", {})
+    for module in (librealsense, realsense):
+        monkeypatch.setattr(module, "load_librealsense", lambda: rs)
+    return rs
+
+
+@cache
+def _noise() -> np.ndarray:
+    return np.random.default_rng(0).standard_normal((480, 848), np.float32)
 
 
 class _Names:
@@ -85,17 +105,18 @@ class FakeProfile:
 
 
 class FakeImage:
-    def __init__(self, number: int, pixels: np.ndarray) -> None:
+    def __init__(self, number: int, frames_per_s: float, pixels: Callable[[], np.ndarray]) -> None:
         self._number, self._pixels = number, pixels
+        self._time_ms = 1000.0 * number / frames_per_s
 
     def get_data(self) -> np.ndarray:
-        return self._pixels
+        return self._pixels()
 
     def get_frame_number(self) -> int:
         return self._number
 
     def get_timestamp(self) -> float:
-        return 1000.0 * self._number / 30
+        return self._time_ms
 
     def supports_frame_metadata(self, value: str) -> bool:
         return value in ("actual_exposure", "gain_level")
@@ -108,7 +129,9 @@ class FakeRealSense:
     """The module: `pyrealsense2` as far as the course's live camera uses it.
 
     start_error: what pipeline.start raises. frames: how many framesets come before `then` happens:
-    an exception to raise, or None for silence. color_late: each depth image comes twice.
+    an exception to raise, or None for silence. color_late: each depth image comes twice. told: what
+    the device says of itself. noise, filled: std of the depth in counts about 700 (None: the same
+    400 to 406 in each pixel), and the part of the pixels that have any.
     """
 
     __version__ = "fake"
@@ -124,28 +147,23 @@ class FakeRealSense:
         self.start_error, self.limit, self.then = start_error, frames, then
         self.color_late, self.color_format = color_late, color_format
         self.serials = [SERIAL]
+        self.noise: float | None = None
+        self.filled, self.frames_per_s = 1.0, 30
+        self.told = {
+            "name": "Intel RealSense D435",
+            "serial_number": SERIAL,
+            "usb_type_descriptor": "3.2",
+            "firmware_version": "5.16.0.1",
+            "recommended_firmware_version": "5.16.0.1",
+        }
         self.starts = self.stops = self.given = 0
         self.enabled: list[tuple[Any, ...]] = []
         self.query_error: str | None = None
-        self.depth_sensor = FakeSensor(
-            True,
-            {
-                "enable_auto_exposure": 1,
-                "exposure": 33000,
-                "gain": 16,
-                "stereo_baseline": 50.17,
-                "depth_units": 0.001,
-            },
-        )
-        self.color_sensor = FakeSensor(
-            False,
-            {
-                "enable_auto_exposure": 1,
-                "exposure": 156,
-                "gain": 64,
-                "enable_auto_white_balance": 1,
-            },
-        )
+        automatic = {"enable_auto_exposure": 1, "exposure": 33000, "gain": 16}
+        own = {"stereo_baseline": 50.17, "depth_units": 0.001}
+        self.depth_sensor = FakeSensor(True, automatic | own)
+        automatic = {"enable_auto_exposure": 1, "exposure": 156, "gain": 64}
+        self.color_sensor = FakeSensor(False, automatic | {"enable_auto_white_balance": 1})
         self.motion_sensor = FakeSensor(False, {})
         for group in ("stream", "format", "option", "camera_info", "frame_metadata_value"):
             setattr(self, group, _Names())
@@ -155,7 +173,7 @@ class FakeRealSense:
     def context(self) -> Any:
         if self.query_error:
             raise RuntimeError(self.query_error)
-        return SimpleNamespace(query_devices=lambda: [_Device(self, s) for s in self.serials])
+        return SimpleNamespace(query_devices=lambda: [_Device(self)] * len(self.serials))
 
     def pipeline(self) -> Any:
         return _Pipeline(self)
@@ -168,14 +186,9 @@ class FakeRealSense:
 
 
 class _Device:
-    def __init__(self, rs: FakeRealSense, serial: str) -> None:
-        self._rs, self._serial = rs, serial
-
-    def supports(self, field: str) -> bool:
-        return True
-
-    def get_info(self, field: str) -> str:
-        return {"name": "Intel RealSense D435", "serial_number": self._serial}[field]
+    def __init__(self, rs: FakeRealSense) -> None:
+        self._rs = rs
+        self.supports, self.get_info = rs.told.__contains__, rs.told.__getitem__
 
     def first_depth_sensor(self) -> FakeSensor:
         return self._rs.depth_sensor
@@ -196,7 +209,7 @@ class _Pipeline:
             FakeProfile("depth", "z16", 848, 480, 426.0),
             FakeProfile("color", self._rs.color_format, 640, 480, 613.0),
         ]
-        device = _Device(self._rs, SERIAL)
+        device = _Device(self._rs)
         return SimpleNamespace(get_device=lambda: device, get_streams=lambda: streams)
 
     def try_wait_for_frames(self, timeout_ms: int) -> tuple[bool, Any]:
@@ -207,9 +220,18 @@ class _Pipeline:
             return False, None
         rs.given += 1
         number = (rs.given + 1) // 2 if rs.color_late else rs.given
-        depth = FakeImage(number, np.full((480, 848), 400 + number % 7, np.uint16))
-        color = FakeImage(number, np.full((480, 640, 3), 128, np.uint8))
-        eyes = [FakeImage(number, np.full((480, 848), 50 * eye, np.uint8)) for eye in (1, 2)]
+
+        def depths() -> np.ndarray:
+            if rs.noise is None:
+                return np.full((480, 848), 400 + number % 7, np.uint16)
+            depth = np.rint(700 + rs.noise * np.roll(_noise(), 7919 * number))
+            empty = np.random.default_rng(number).random(depth.shape) >= rs.filled
+            return np.where(empty, 0, depth).astype(np.uint16)
+
+        depth = FakeImage(number, rs.frames_per_s, depths)
+        images = [np.full((480, 848), 50 * eye, np.uint8) for eye in (1, 2)]
+        images.append(np.full((480, 640, 3), 128, np.uint8))
+        *eyes, color = (FakeImage(number, rs.frames_per_s, lambda i=i: i) for i in images)
         return True, SimpleNamespace(
             get_depth_frame=lambda: depth,
             get_color_frame=lambda: color,

@@ -21,16 +21,18 @@ from typing import Any
 
 import numpy as np
 
-from coursekit.submission import bundle
-from coursekit.submission.contents import (
+from coursekit.submission.format import (
     CameraFacts,
     Claims,
     Conclusion,
     Outcome,
     Plot,
-    Row,
     Stack,
     Submission,
+    TableRow,
+    array_bytes,
+    bundle_bytes,
+    zip_bytes,
 )
 
 CAMERA = {
@@ -72,7 +74,7 @@ def submission(**changes: Any) -> Submission:
         "caliper_m": 0.06,
         "stacks": stacks,
         "claims": Claims(
-            rows=(Row(0.3, 0.5, 0.02, 1.25, 0.01, 0.0), Row(0.6, depth_std_mm=4.5)),
+            rows=(TableRow(0.3, 0.5, 0.02, 1.25, 0.01, 0.0), TableRow(0.6, depth_std_mm=4.5)),
             sigma_d_px=0.08,
             sigma_d_interval_px=(0.07, 0.09),
             exponent=2.1,
@@ -107,12 +109,12 @@ def hashed(members: Parts) -> Parts:
 
 def with_member(name: str, content: bytes) -> bytes:
     """The honest bundle, but this member has another content, or is there besides; rehashed."""
-    return bundle.zip_bytes(hashed(MEMBERS | {name: content}))
+    return zip_bytes(hashed(MEMBERS | {name: content}))
 
 
 def unhashed(name: str, content: bytes) -> bytes:
     """The honest bundle with another content of this member, and its manifest left as it was."""
-    return bundle.zip_bytes(MEMBERS | {name: content})
+    return zip_bytes(MEMBERS | {name: content})
 
 
 def with_json(name: str, change: Callable[[Any], Any]) -> bytes:
@@ -121,7 +123,7 @@ def with_json(name: str, change: Callable[[Any], Any]) -> bytes:
     replaced = change(content)
     changed = json.dumps(content if replaced is None else replaced).encode()
     if name == "manifest.json":
-        return bundle.zip_bytes(MEMBERS | {name: changed})
+        return zip_bytes(MEMBERS | {name: changed})
     return with_member(name, changed)
 
 
@@ -230,10 +232,19 @@ def deflated(content: bytes) -> bytes:
     return stream.compress(content) + stream.flush()
 
 
-def with_stream(content: bytes, size: int | None = None, behind: bytes = b"") -> bytes:
-    """As `with_deflated`: `content` compressed, declared to be `size` bytes, junk behind it."""
-    wrong = len(content) if size is None else size
-    return with_deflated(deflated(content) + behind, wrong, zlib.crc32(content))
+def with_stream(content: bytes, size: int) -> bytes:
+    """As `with_deflated`: `content` compressed, declared to be `size` bytes."""
+    return with_deflated(deflated(content), size, zlib.crc32(content))
+
+
+def junk_behind_stream() -> bytes:
+    """The honest bundle with four bytes behind a member's compressed content, counted to it."""
+    local, central = headers(HONEST, "facts.json")
+    packed = int.from_bytes(HONEST[local + 18 : local + 22], "little")
+    data = bytearray(inserted(local + 30 + len("facts.json") + packed, b"junk", moved=True))
+    for at in (local + 18, central + 4 + 20):
+        data[at : at + 4] = (packed + 4).to_bytes(4, "little")
+    return bytes(data)
 
 
 class _Shell:
@@ -275,16 +286,14 @@ def _bomb() -> bytes:
     return packed_by(
         lambda archive: [
             archive.writestr(name, content, zipfile.ZIP_DEFLATED)
-            for name, content in hashed(
-                MEMBERS | {"depth_0.npy": bundle.array_bytes(zeros[:240], "<u2")}
-            ).items()
+            for name, content in hashed(MEMBERS | {"depth_0.npy": array_bytes(zeros[:240])}).items()
         ]
     )
 
 
 def _same_name() -> bytes:
     """A zip with the same name twice (zipfile would warn)."""
-    return bundle.zip_bytes({"facts.json": b"{}", "factz.json": b"{}"}).replace(b"factz", b"facts")
+    return zip_bytes({"facts.json": b"{}", "factz.json": b"{}"}).replace(b"factz", b"facts")
 
 
 def _set(*path: Any, to: Any) -> Callable[[Any], None]:
@@ -317,20 +326,23 @@ def full_size(last: int) -> bytes:
     counts = _a_million(2)
     window = {"window": (400, 200, 64, 64), "times_s": np.arange(244) / 30}
     stacks = [Stack(distance_m=z, counts=counts, **window) for z in (0.3, 0.6)]
-    members = parts(bundle.bundle_bytes(submission(stacks=stacks)))
+    members = parts(bundle_bytes(submission(stacks=stacks)))
     content = members["depth_1.npy"]
     members["depth_1.npy"] = content[:-1] + bytes([content[-1] ^ last])
-    return bundle.zip_bytes(members)
+    return zip_bytes(members)
 
 
-HONEST = bundle.bundle_bytes(submission())
+HONEST = bundle_bytes(submission())
 MEMBERS = parts(HONEST)
 DIRECTORY = HONEST.index(b"PK\x01\x02")
 
 
 @dataclass(frozen=True)
 class Hostile:
-    """One kind: what it is, its bytes, and the reason that its refusal has to give."""
+    """One kind: what it is, its bytes, and the reason that its refusal has to give.
+
+    Without a reason it is read: what was added to it is nowhere in what comes out.
+    """
 
     name: str
     reason: str
@@ -347,45 +359,45 @@ def hostile() -> Iterator[Hostile]:
 
 def _files() -> dict[str, tuple[str, bytes]]:
     return {
-        "nothing": ("empty_file", b""),
+        "nothing": ("not_a_zip", b""),
         "a text": ("not_a_zip", b"Here is my homework.\n"),
         "a pickle": ("not_a_zip", pickle.dumps(_Shell())),
         "bzip2": ("not_a_zip", bz2.compress(HONEST)),
-        "6 MiB": ("file_too_large", HONEST + bytes(6 * 2**20)),
-        "half": ("truncated", HONEST[: len(HONEST) // 2]),
-        "without its last byte": ("truncated", HONEST[:-1]),
-        "a byte behind": ("data_behind", HONEST + b"\0"),
-        "a zip and most of another": ("truncated", HONEST + HONEST[:-1]),
-        "a zip and another": ("bad_directory", HONEST + HONEST),
-        "a zip's comment": ("data_behind", HONEST[:-2] + b"\x03\x00abc"),
-        "a program before": ("data_before", b"#!/bin/sh\nexit\n" + HONEST),
-        "junk before, offsets moved": ("data_before", inserted(0, b"GIF89a", moved=True)),
+        "6 MiB": ("too_large", HONEST + bytes(6 * 2**20)),
+        "half": ("not_a_zip", HONEST[: len(HONEST) // 2]),
+        "without its last byte": ("not_a_zip", HONEST[:-1]),
+        "a byte behind": ("not_plain", HONEST + b"\0"),
+        "a zip and most of another": ("not_a_zip", HONEST + HONEST[:-1]),
+        "a zip and another": ("not_plain", HONEST + HONEST),
+        "a zip's comment": ("not_plain", HONEST[:-2] + b"\x03\x00abc"),
+        "a program before": ("not_plain", b"#!/bin/sh\nexit\n" + HONEST),
+        "junk before, offsets moved": ("not_plain", inserted(0, b"GIF89a", moved=True)),
     }
 
 
 def _zips() -> dict[str, tuple[str, bytes]]:
     second = headers(HONEST, "facts.json")[0]
-    many = bundle.zip_bytes({f"depth_{i}.npy": b"" for i in range(33)})
+    many = zip_bytes({f"depth_{i}.npy": b"" for i in range(33)})
     return {
-        "no members": ("no_members", bundle.zip_bytes({})),
-        "33 members": ("too_many_members", many),
-        "junk between members": ("data_between", inserted(second, b"junk", moved=True)),
-        "junk before the directory": ("data_between", inserted(DIRECTORY, b"junk", moved=True)),
-        "overlapping members": ("overlap", lying("facts.json", offset=0)),
-        "a member longer than the file": ("lying_header", lying("times_1.npy", packed=10**6)),
-        "the directory elsewhere": ("bad_directory", lying_end(start=DIRECTORY + 1)),
-        "the directory damaged": ("bad_directory", HONEST.replace(b"PK\x01\x02", b"PK\x01\x03")),
-        "a member not counted": ("bad_directory", lying_end(here=8, count=8)),
-        "a member too many counted": ("bad_directory", lying_end(here=10, count=10)),
-        "a split zip": ("several_disks", lying_end(disk=1)),
-        "a member elsewhere": ("several_disks", lying("facts.json", disk=1)),
-        "a large zip": ("zip64", lying_end(here=0xFFFF, count=0xFFFF)),
-        "a large zip's locator": ("zip64", inserted_locator()),
-        "a large member": ("zip64", lying("times_1.npy", packed=0xFFFFFFFF)),
-        "streamed": ("data_descriptor", _streamed()),
-        "extra fields": ("extra_field", with_info("facts.json", extra=b"\x55\x54\x01\x00\x00")),
-        "a member's comment": ("extra_field", with_info("facts.json", comment=b"hello")),
-        "a name twice": ("duplicate_member", _same_name()),
+        "no members": ("missing_member", zip_bytes({})),
+        "33 members": ("too_large", many),
+        "junk between members": ("not_plain", inserted(second, b"junk", moved=True)),
+        "junk before the directory": ("not_plain", inserted(DIRECTORY, b"junk", moved=True)),
+        "overlapping members": ("not_plain", lying("facts.json", offset=0)),
+        "a member longer than the file": ("not_plain", lying("times_1.npy", packed=10**6)),
+        "the directory elsewhere": ("not_plain", lying_end(start=DIRECTORY + 1)),
+        "the directory damaged": ("not_a_zip", HONEST.replace(b"PK\x01\x02", b"PK\x01\x03")),
+        "a member not counted": ("not_plain", lying_end(here=8, count=8)),
+        "a member too many counted": ("not_plain", lying_end(here=10, count=10)),
+        "a split zip": ("not_plain", lying_end(disk=1)),
+        "a member elsewhere": ("not_plain", lying("facts.json", disk=1)),
+        "a large zip": ("not_plain", lying_end(here=0xFFFF, count=0xFFFF)),
+        "a large zip's locator": ("not_a_zip", inserted_locator()),
+        "a large member": ("too_large", lying("times_1.npy", packed=0xFFFFFFFF)),
+        "streamed": ("not_plain", _streamed()),
+        "extra fields": ("not_plain", with_info("facts.json", extra=b"\x55\x54\x01\x00\x00")),
+        "a member's comment": ("not_plain", with_info("facts.json", comment=b"hello")),
+        "a name twice": ("not_plain", _same_name()),
     }
 
 
@@ -401,61 +413,61 @@ def _headers() -> dict[str, tuple[str, bytes]]:
     zeros, noise = bytes(300_000), np.random.default_rng(3).bytes(300_000)
     link, pipe = 0o120777 << 16, 0o010644 << 16
     return {
-        "encrypted": ("encrypted", lying("facts.json", flags=1)),
-        "strongly encrypted": ("encrypted", lying("facts.json", flags=0x41)),
-        "unknown flags": ("unknown_flags", lying("facts.json", flags=0x20)),
-        "a symlink": ("symlink", with_info("facts.json", external_attr=link)),
-        "a pipe": ("special_file", with_info("facts.json", external_attr=pipe)),
-        "a folder by attribute": ("special_file", with_info("facts.json", external_attr=0x10)),
-        "LZMA": ("compression_method", with_info("facts.json", compress_type=zipfile.ZIP_LZMA)),
-        "bzip2 member": ("compression_method", lying("facts.json", method=12)),
-        "a zip bomb by ratio": ("zip_bomb", _bomb()),
+        "encrypted": ("not_plain", lying("facts.json", flags=1)),
+        "strongly encrypted": ("not_plain", lying("facts.json", flags=0x41)),
+        "unknown flags": ("not_plain", lying("facts.json", flags=0x20)),
+        "a symlink": ("not_plain", with_info("facts.json", external_attr=link)),
+        "a pipe": ("not_plain", with_info("facts.json", external_attr=pipe)),
+        "a folder by attribute": ("not_plain", with_info("facts.json", external_attr=0x10)),
+        "LZMA": ("not_plain", with_info("facts.json", compress_type=zipfile.ZIP_LZMA)),
+        "bzip2 member": ("not_plain", lying("facts.json", method=12)),
+        "a zip bomb by ratio": ("too_large", _bomb()),
         "a gigabyte declared": ("too_large", lying("depth_0.npy", size=2**30)),
-        "300 kB of JSON": ("member_too_large", with_member("facts.json", noise)),
-        "two sizes": ("lying_header", lying("facts.json", where="local", size=9)),
-        "two names": ("lying_header", HONEST.replace(b"facts.json", b"FACTS.json", 1)),
-        "two checksums": ("lying_header", lying("facts.json", where="central", crc=9)),
-        "stored, two sizes": ("lying_header", lying("facts.json", method=0)),
+        "300 kB of JSON": ("too_large", with_member("facts.json", noise)),
+        "two sizes": ("not_plain", lying("facts.json", where="local", size=9)),
+        "two names": ("damaged", HONEST.replace(b"facts.json", b"FACTS.json", 1)),
+        "two checksums": ("not_plain", lying("facts.json", where="central", crc=9)),
+        "stored, two sizes": ("damaged", lying("facts.json", method=0)),
         "no local header": (
-            "bad_header",
+            "damaged",
             b"PK\x03\x04" + HONEST[4:].replace(b"PK\x03\x04", b"PK\x03\x05"),
         ),
-        "more than declared": ("lying_header", with_stream(facts * 9, size=len(facts))),
-        "a bomb behind a lie": ("lying_header", with_stream(zeros, size=9_000)),
-        "less than declared": ("lying_header", with_stream(facts, size=len(facts) + 1)),
-        "junk behind the stream": ("bad_compression", with_stream(facts, behind=b"junk")),
-        "no deflate stream": ("bad_compression", with_deflated(b"\xff" * 90, 100, 0)),
-        "half a stream": ("bad_compression", with_deflated(deflated(facts)[:-9], len(facts), 0)),
-        "a bit of the content": ("bad_checksum", with_deflated(deflated(facts), len(facts), 1)),
+        "more than declared": ("damaged", with_stream(facts * 9, size=len(facts))),
+        "a bomb behind a lie": ("damaged", with_stream(zeros, size=9_000)),
+        "less than declared": ("damaged", with_stream(facts, size=len(facts) + 1)),
+        "junk behind the stream": ("", junk_behind_stream()),
+        "no deflate stream": ("damaged", with_deflated(b"\xff" * 90, 100, 0)),
+        "half a stream": ("damaged", with_deflated(deflated(facts)[:-9], len(facts), 0)),
+        "a bit of the content": ("damaged", with_deflated(deflated(facts), len(facts), 1)),
     }
 
 
 def _names() -> dict[str, tuple[str, bytes]]:
     names = {
-        "an absolute path": ("absolute_path", "/etc/passwd"),
-        "a Windows path": ("absolute_path", "C:\\Windows\\system.ini"),
-        "a network path": ("absolute_path", "\\\\server\\share"),
-        "path traversal": ("path_traversal", "../../.bashrc"),
-        "path traversal inside": ("path_traversal", "raw/../../facts.json"),
-        "path traversal, Windows": ("path_traversal", "..\\facts.json"),
-        "a backslash": ("backslash", "raw\\facts.json"),
-        "a folder": ("folder", "raw/"),
-        "a bundle in a folder": ("zipped_again", "studio_1_Ada/manifest.json"),
-        "a Mac's zip of a bundle": ("zipped_again", "__MACOSX/._manifest.json"),
-        "a Mac's view of a folder": ("zipped_again", ".DS_Store"),
-        "a nested archive": ("nested_archive", "more.zip"),
-        "a nested archive, NumPy's": ("nested_archive", "depth.NPZ"),
-        "a program": ("unknown_member", "setup.py"),
-        "a Mac's leftovers": ("unknown_member", "__MACOSX"),
-        "another case": ("unknown_member", "Facts.json"),
-        "a line end in a name": ("unknown_member", "facts.json\n"),
-        "other digits in a name": ("unknown_member", "depth_٣.npy"),
-        "a long name": ("unknown_member", "a" * 60_000),
-        "a formula for a name": ("unknown_member", '=HYPERLINK("http://x")'),
+        "an absolute path": "/etc/passwd",
+        "a Windows path": "C:\\Windows\\system.ini",
+        "a network path": "\\\\server\\share",
+        "path traversal": "../../.bashrc",
+        "path traversal inside": "raw/../../facts.json",
+        "path traversal, Windows": "..\\facts.json",
+        "a backslash": "raw\\facts.json",
+        "a folder": "raw/",
+        "a bundle in a folder": "studio_1_Ada/manifest.json",
+        "a Mac's zip of a bundle": "__MACOSX/._manifest.json",
+        "a Mac's view of a folder": ".DS_Store",
+        "a nested archive": "more.zip",
+        "a nested archive, NumPy's": "depth.NPZ",
+        "a program": "setup.py",
+        "a Mac's leftovers": "__MACOSX",
+        "another case": "Facts.json",
+        "a line end in a name": "facts.json\n",
+        "other digits in a name": "depth_٣.npy",
+        "a long name": "a" * 60_000,
+        "a formula for a name": '=HYPERLINK("http://x")',
     }
-    kinds = {k: (reason, bundle.zip_bytes(MEMBERS | {n: b""})) for k, (reason, n) in names.items()}
-    nul = bundle.zip_bytes(MEMBERS | {"facts.json?": b""}).replace(b"json?", b"json\0")
-    return kinds | {"a NUL in a name": ("unknown_member", nul)}
+    kinds = {kind: zip_bytes(MEMBERS | {name: b""}) for kind, name in names.items()}
+    nul = zip_bytes(MEMBERS | {"facts.json?": b""}).replace(b"json?", b"json\0")
+    return {k: ("unknown_member", v) for k, v in (kinds | {"a NUL in a name": nul}).items()}
 
 
 def _hashes() -> dict[str, tuple[str, bytes]]:
@@ -470,9 +482,9 @@ def _hashes() -> dict[str, tuple[str, bytes]]:
         "members swapped": ("wrong_hash", unhashed("depth_0.npy", MEMBERS["depth_1.npy"])),
         "a wrong size in the manifest": ("wrong_hash", with_json("manifest.json", listed)),
         "as large as can be, last value changed": ("wrong_hash", full_size(last=1)),
-        "a member missing": ("missing_member", bundle.zip_bytes(gone)),
-        "a member missing everywhere": ("missing_member", bundle.zip_bytes(hashed(gone))),
-        "no manifest": ("missing_member", bundle.zip_bytes({"facts.json": b"{}"})),
+        "a member missing": ("missing_member", zip_bytes(gone)),
+        "a member missing everywhere": ("missing_member", zip_bytes(hashed(gone))),
+        "no manifest": ("missing_member", zip_bytes({"facts.json": b"{}"})),
         "a member not listed": ("unlisted_member", unhashed("depth_2.npy", b"")),
         "an array of no distance": ("unlisted_member", with_member("depth_2.npy", npy())),
     }
@@ -482,51 +494,51 @@ def _jsons() -> dict[str, tuple[str, bytes]]:
     name = "claims.json"
     whole = {
         "no JSON": ("not_json", b"{'a': 1}"),
-        "brackets that do not match": ("bad_nesting", b"]]][[["),
+        "brackets that do not match": ("not_json", b"]]][[["),
         "brackets of two kinds": ("not_json", b"[}"),
-        "40,000 strings": ("wrong_type", b"[" + b'"",' * 40_000 + b'""]'),
-        "half a JSON": ("bad_nesting", MEMBERS[name][:40]),
+        "40,000 strings": ("bad_value", b"[" + b'"",' * 40_000 + b'""]'),
+        "half a JSON": ("not_json", MEMBERS[name][:40]),
         "a byte order mark": ("not_json", b"\xef\xbb\xbf" + MEMBERS[name]),
         "a string without end": ("not_json", b'"' + b'\\"' * 65_000),
-        "UTF-16": ("not_utf8", MEMBERS[name].decode().encode("utf-16")),
-        "invalid UTF-8": ("not_utf8", b'{"rows": "\xff\xfe\x80"}'),
-        "an overlong UTF-8": ("not_utf8", b'{"rows": "\xc0\xaf"}'),
-        "deep lists": ("bad_nesting", b"[" * 60_000 + b"]" * 60_000),
-        "deep objects": ("bad_nesting", b'{"a":' * 20_000 + b"1" + b"}" * 20_000),
-        "wide lists": ("wrong_type", b"[" + b"[]," * 40_000 + b"[]]"),
-        "a list for an object": ("wrong_type", b"[1, 2]"),
-        "a number for an object": ("wrong_type", b"3"),
-        "a name of 5,000 letters": ("unknown_key", b'{"' + b"a" * 5_000 + b'": 1}'),
-        "8,000 keys": ("unknown_key", json.dumps(dict.fromkeys(map(str, range(8_000)))).encode()),
+        "UTF-16": ("not_json", MEMBERS[name].decode().encode("utf-16")),
+        "invalid UTF-8": ("not_json", b'{"rows": "\xff\xfe\x80"}'),
+        "an overlong UTF-8": ("not_json", b'{"rows": "\xc0\xaf"}'),
+        "deep lists": ("not_json", b"[" * 60_000 + b"]" * 60_000),
+        "deep objects": ("not_json", b'{"a":' * 20_000 + b"1" + b"}" * 20_000),
+        "wide lists": ("bad_value", b"[" + b"[]," * 40_000 + b"[]]"),
+        "a list for an object": ("bad_value", b"[1, 2]"),
+        "a number for an object": ("bad_value", b"3"),
+        "a name of 5,000 letters": ("bad_value", b'{"' + b"a" * 5_000 + b'": 1}'),
+        "8,000 keys": ("bad_value", json.dumps(dict.fromkeys(map(str, range(8_000)))).encode()),
     }
     kinds = {kind: (reason, with_member(name, data)) for kind, (reason, data) in whole.items()}
     return kinds | {
-        "NaN": ("not_finite", with_text(name, "4.5", "NaN")),
-        "infinity": ("not_finite", with_text(name, "4.5", "-Infinity")),
-        "1e999": ("not_finite", with_text(name, "4.5", "1e999")),
-        "an integer of 5,000 digits": ("huge_number", with_text(name, "4.5", "9" * 5_000)),
-        "a number of 5,000 digits": ("huge_number", with_text(name, "4.5", "0." + "9" * 5_000)),
+        "NaN": ("bad_value", with_text(name, "4.5", "NaN")),
+        "infinity": ("bad_value", with_text(name, "4.5", "-Infinity")),
+        "1e999": ("bad_value", with_text(name, "4.5", "1e999")),
+        "an integer of 5,000 digits": ("not_json", with_text(name, "4.5", "9" * 5_000)),
+        "a number of 5,000 digits": ("", with_text(name, "4.5", "0." + "9" * 5_000)),
         "a key twice": (
-            "duplicate_key",
+            "not_json",
             with_text(name, '"exponent"', '"sigma_d_px": 1, "exponent"'),
         ),
-        "an unknown key": ("unknown_key", with_json(name, _set("bonus", to=5))),
-        "a method's name for a key": ("unknown_key", with_json(name, _set("__class__", to="x"))),
-        "a key missing": ("missing_key", with_json(name, _without("sigma_d_px"))),
+        "an unknown key": ("bad_value", with_json(name, _set("bonus", to=5))),
+        "a method's name for a key": ("bad_value", with_json(name, _set("__class__", to="x"))),
+        "a key missing": ("bad_value", with_json(name, _without("sigma_d_px"))),
         "a key of a row missing": (
-            "missing_key",
+            "bad_value",
             with_json(name, _without("rows", 0, "depth_std_mm")),
         ),
         "a later format": ("other_format", with_json("manifest.json", _set("format", to=2))),
         "no format": ("other_format", with_json("manifest.json", _without("format"))),
-        "True for a format": ("other_format", with_json("manifest.json", _set("format", to=True))),
-        "members is a list": ("wrong_type", with_json("manifest.json", _set("members", to=[1]))),
+        "True for a format": ("bad_value", with_json("manifest.json", _set("format", to=True))),
+        "members is a list": ("bad_value", with_json("manifest.json", _set("members", to=[1]))),
         "101 outcomes": (
-            "too_many",
+            "bad_value",
             with_member("outcomes.json", json.dumps({f"a{i}": 1 for i in range(101)}).encode()),
         ),
-        "13 rows": ("too_many", with_json(name, _set("rows", to=[{}] * 13))),
-        "13 stacks": ("too_many", with_json("facts.json", _set("stacks", to=[{}] * 13))),
+        "13 rows": ("bad_value", with_json(name, _set("rows", to=[{}] * 13))),
+        "13 stacks": ("bad_value", with_json("facts.json", _set("stacks", to=[{}] * 13))),
     }
 
 
@@ -561,13 +573,6 @@ def _values() -> dict[str, tuple[str, bytes]]:
         "a list for a name": ["Zoë"],
     }
     claims, conclusion, outcomes = "claims.json", "conclusion.json", "outcomes.json"
-    kinds = {
-        k: ("bad_value", with_json("facts.json", _set(*p, to=v))) for k, (p, v) in facts.items()
-    }
-    kinds |= {
-        k: ("bad_value", with_json("manifest.json", _set("student", to=v)))
-        for k, v in manifest.items()
-    }
     others = {
         "another exercise": ("manifest.json", _set("exercise", to="../studio_9")),
         "no such day": ("manifest.json", _set("made", to="2026-02-30T12:00:00+00:00")),
@@ -585,63 +590,60 @@ def _values() -> dict[str, tuple[str, bytes]]:
         "minus 3 attempts": (outcomes, _set("depth_std", "attempts", to=-3)),
         "1 for True": (outcomes, _set("depth_std", "right", to=1)),
     }
-    return kinds | {k: ("bad_value", with_json(n, change)) for k, (n, change) in others.items()}
+    changes = {k: ("facts.json", _set(*path, to=v)) for k, (path, v) in facts.items()}
+    changes |= {k: ("manifest.json", _set("student", to=v)) for k, v in manifest.items()}
+    kinds = {k: ("bad_value", with_json(*change)) for k, change in (changes | others).items()}
+    kinds["a window of another size"] = ("bad_array", kinds["a window of another size"][1])
+    return kinds
 
 
 def _arrays() -> dict[str, tuple[str, bytes]]:
     struct_type = "[('a', '<u2'), ('b', '<u2')]"
     code = "__import__('os').system('id')"
     depth = {
-        "a pickled object array": ("object_array", _pickled_array()),
-        "an object array in a record": ("object_array", npy("[('a', '|O')]")),
-        "a zip for an array": ("nested_archive", HONEST),
-        "a text for an array": ("not_npy", b"1 2 3\n4 5 6\n"),
-        "nothing for an array": ("not_npy", b""),
-        "an array's magic only": ("not_npy", b"\x93NUMPY\x01\x00"),
-        "version 2 of NumPy's format": ("npy_version", npy(version=b"\x02\x00")),
-        "version 3 of NumPy's format": ("npy_version", npy(version=b"\x03\x00")),
-        "code in a header": ("bad_npy_header", npy(shape=code)),
-        "code for a dtype": ("bad_npy_header", npy(descr=code)),
-        "a header of a list of 300 lists": ("bad_npy_header", npy(shape="[" * 300 + "]" * 300)),
-        "a header beyond the end": ("bad_npy_header", b"\x93NUMPY\x01\x00\xff\xff{}"),
-        "a negative dimension": ("bad_npy_header", npy(shape="(-3, 4, 5)")),
-        "floats for counts": ("wrong_dtype", npy("'<f4'", content=bytes(240))),
-        "complex counts": ("wrong_dtype", npy("'<c8'", content=bytes(480))),
-        "text in an array": ("wrong_dtype", npy("'<U1'", content=bytes(240))),
-        "dates in an array": ("wrong_dtype", npy("'<M8[s]'", content=bytes(480))),
-        "a record in an array": ("wrong_dtype", npy(struct_type, content=bytes(240))),
-        "big-endian": ("byte_order", npy("'>u2'")),
-        "Fortran order": ("fortran_order", npy(fortran="True")),
-        "two dimensions": ("wrong_shape", npy(shape="(12, 5)")),
-        "no dimensions": ("wrong_shape", npy(shape="()")),
-        "sixty dimensions": ("wrong_shape", npy(shape=f"({'1, ' * 60})")),
-        "no frames": ("wrong_shape", npy(shape="(0, 4, 5)", content=b"")),
-        "a dimension of 300 digits": ("wrong_shape", npy(shape=f"({'9' * 300}, 4, 5)")),
-        "a billion values": ("too_many_values", npy(shape="(1000, 1000, 1000)")),
-        "2^64 values": ("too_many_values", npy(shape="(4294967296, 4294967296, 1)")),
-        "fewer values than declared": ("wrong_length", npy(content=bytes(119))),
-        "more values than declared": ("wrong_length", npy(content=bytes(121))),
-        "another window": ("bad_value", npy(shape="(3, 5, 4)")),
-        "more frames than times": ("bad_value", npy(shape="(4, 4, 5)", content=bytes(160))),
+        "a pickled object array": _pickled_array(),
+        "an object array in a record": npy("[('a', '|O')]"),
+        "a zip for an array": HONEST,
+        "a text for an array": b"1 2 3\n4 5 6\n",
+        "nothing for an array": b"",
+        "an array's magic only": b"\x93NUMPY\x01\x00",
+        "version 2 of NumPy's format": npy(version=b"\x02\x00"),
+        "version 3 of NumPy's format": npy(version=b"\x03\x00"),
+        "code in a header": npy(shape=code),
+        "code for a dtype": npy(descr=code),
+        "a header of a list of 300 lists": npy(shape="[" * 300 + "]" * 300),
+        "a header beyond the end": b"\x93NUMPY\x01\x00\xff\xff{}",
+        "a negative dimension": npy(shape="(-3, 4, 5)"),
+        "floats for counts": npy("'<f4'", content=bytes(240)),
+        "complex counts": npy("'<c8'", content=bytes(480)),
+        "text in an array": npy("'<U1'", content=bytes(240)),
+        "dates in an array": npy("'<M8[s]'", content=bytes(480)),
+        "a record in an array": npy(struct_type, content=bytes(240)),
+        "big-endian": npy("'>u2'"),
+        "Fortran order": npy(fortran="True"),
+        "two dimensions": npy(shape="(12, 5)"),
+        "no dimensions": npy(shape="()"),
+        "sixty dimensions": npy(shape=f"({'1, ' * 60})"),
+        "no frames": npy(shape="(0, 4, 5)", content=b""),
+        "a dimension of 300 digits": npy(shape=f"({'9' * 300}, 4, 5)"),
+        "a billion values": npy(shape="(1000, 1000, 1000)"),
+        "2^64 values": npy(shape="(4294967296, 4294967296, 1)"),
+        "fewer values than declared": npy(content=bytes(119)),
+        "more values than declared": npy(content=bytes(121)),
+        "another window": npy(shape="(3, 5, 4)"),
+        "more frames than times": npy(shape="(4, 4, 5)", content=bytes(160)),
     }
     nan, infinity = (struct.pack("<3d", 0, 1, value) for value in (float("nan"), float("inf")))
     times = {
-        "NaN for a time": ("not_finite", npy("'<f8'", "(3,)", content=nan)),
-        "infinity for a time": ("not_finite", npy("'<f8'", "(3,)", content=infinity)),
-        "a time of 1e300": (
-            "bad_value",
-            npy("'<f8'", "(3,)", content=struct.pack("<3d", 0, 1, 1e300)),
-        ),
+        "NaN for a time": npy("'<f8'", "(3,)", content=nan),
+        "infinity for a time": npy("'<f8'", "(3,)", content=infinity),
+        "a time of 1e300": npy("'<f8'", "(3,)", content=struct.pack("<3d", 0, 1, 1e300)),
     }
-    kinds = {
-        kind: (reason, with_member("depth_0.npy", data)) for kind, (reason, data) in depth.items()
-    }
-    kinds |= {
-        kind: (reason, with_member("times_0.npy", data)) for kind, (reason, data) in times.items()
-    }
-    huge = bundle.array_bytes(_a_million(4), "<u2")
-    three = {f"depth_{i}.npy": huge for i in range(3)} | {f"times_{i}.npy": b"" for i in range(3)}
+    kinds = {k: ("bad_array", with_member("depth_0.npy", data)) for k, data in depth.items()}
+    kinds |= {k: ("bad_value", with_member("times_0.npy", data)) for k, data in times.items()}
+    huge, clock = array_bytes(_a_million(4)), array_bytes(np.arange(244) / 30)
+    three = {f"depth_{i}.npy": huge for i in range(3)} | {f"times_{i}.npy": clock for i in range(3)}
     facts = json.loads(MEMBERS["facts.json"])
     facts["stacks"] = [{"distance_m": 0.3 + i, "window": [0, 0, 64, 64]} for i in range(3)]
     all_of = hashed(MEMBERS | three | {"facts.json": json.dumps(facts).encode()})
-    return kinds | {"three million values": ("too_many_values", bundle.zip_bytes(all_of))}
+    return kinds | {"three million values": ("bad_value", zip_bytes(all_of))}

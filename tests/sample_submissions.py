@@ -9,23 +9,25 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
-from coursekit.submission.contents import (
+from coursekit.submission.format import (
     CameraFacts,
     Claims,
     Conclusion,
     Outcome,
     Plot,
-    Row,
     Stack,
     Submission,
+    TableRow,
 )
 from coursekit.submission.recompute import Recomputed, recompute
+from coursekit.submission.rubric import grade
 
 DISTANCES = (0.30, 0.45, 0.60)
 MADE = "2026-03-02T10:00:00+00:00"
@@ -136,7 +138,7 @@ def claims_of(submission: Submission, found: Recomputed | None = None) -> Claims
         steady = np.isfinite(z).all(axis=0)
         assert m.std is not None
         rows.append(
-            Row(
+            TableRow(
                 m.distance_m,
                 round(float(z[:, steady].mean()) - 1e3 * m.distance_m, 2),
                 m.bias_se_mm,
@@ -152,7 +154,7 @@ def claims_of(submission: Submission, found: Recomputed | None = None) -> Claims
 def exact_claims(found: Recomputed) -> Claims:
     """The recomputed values themselves, with an exponent: the middle of every tolerance."""
     rows = tuple(
-        Row(
+        TableRow(
             m.distance_m,
             m.bias and m.bias.value,
             m.bias_se_mm,
@@ -177,8 +179,16 @@ def honest(
     seed: int = 0, frames: int = 100, of_camera: dict[str, Any] | None = None, **changes: Any
 ) -> Submission:
     """A submission that deserves full points; `changes` are fields to replace afterwards."""
-    facts, stacks = raw(seed, frames, **(of_camera or {}))
-    return finished(facts, stacks, **{"student": f"Student {seed}", **changes})
+    whole = _honest(seed, frames, tuple(sorted((of_camera or {}).items())))
+    return replace(whole, **changes) if changes else whole
+
+
+@cache
+def _honest(seed: int, frames: int, of_camera: tuple[tuple[str, Any], ...]) -> Submission:
+    return finished(*raw(seed, frames, **dict(of_camera)), f"Student {seed}")
+
+
+graded = cache(grade)  # by the submission itself: whoever shares one shares its grade
 
 
 def finished(
@@ -222,6 +232,7 @@ def finished(
 # --- weak and wrong -----------------------------------------------------------------------------
 
 
+@cache
 def weak(seed: int = 0) -> Submission:
     """84 frames at 0.60 m, nothing at 0.30 m, no plot, three words of a paragraph."""
     full = honest(seed)
@@ -249,6 +260,7 @@ def predicting(plot: Plot, factor: float) -> Plot:
     return replace(plot, predicted_mm=tuple(factor * mm for mm in plot.predicted_mm or ()))
 
 
+@cache
 def mistaken(seed: int = 0) -> dict[str, tuple[str, Submission]]:
     """One wrong submission for each named mistake: {mistake: (item's topic, submission)}."""
     # Depths in tenths of a millimetre, a bias and holes: mistakes that would hide otherwise show.
@@ -392,6 +404,7 @@ COPIES: dict[str, Change] = {
 }
 
 
+@cache
 def copied(
     original: Submission, how: str, student: str = "Copying Student", seed: int = 5
 ) -> Submission:
@@ -416,6 +429,7 @@ def _made_up(seed: int, make: Callable[[np.random.Generator, float], Counts]) ->
     return finished(facts, stacks, f"Inventive Student {seed}")
 
 
+@cache
 def random_numbers(seed: int = 0) -> Submission:
     """Independent Gaussian numbers of the right size instead of a camera's."""
     return _made_up(

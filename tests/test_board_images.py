@@ -72,15 +72,16 @@ def test_corners_are_where_opencv_projects_them(board, view, lens):
     assert np.abs(error.mean(axis=0)).max() < 0.012
 
 
-@pytest.mark.parametrize("view", [NEAR, TILTED], ids=["near", "tilted"])
-def test_light_agrees_with_a_warp_of_the_print_by_opencv(view, monkeypatch):
+def test_light_agrees_with_a_warp_of_the_print_by_opencv(monkeypatch):
     """OpenCV warps and distorts the print at six times the size, then takes means of 6x6."""
-    monkeypatch.setattr(board_images, "LAMP_M", (0.0, 0.0, -1e6))  # even light
-    T, times = pose(CHARUCO, view), 6
+    monkeypatch.setattr(board_images, "LAMP_FROM_MIDDLE_M", (0.0, 0.0, -1e6))  # even light
+    T, times = pose(CHARUCO, TILTED), 6
     grey = render_board(CHARUCO, T, LENS, None).astype(float)
-    light = (grey - board_images.BLACK_GREY) / (board_images.WHITE_GREY - board_images.BLACK_GREY)
+    light = (grey - board_images.NO_LIGHT_GREY) / (
+        board_images.PAPER_GREY - board_images.NO_LIGHT_GREY
+    )
     expected, inside = warped(T, times)
-    expected = gaussian_filter(expected, board_images.LENS_SIGMA_PX)
+    expected = gaussian_filter(expected, board_images.CAMERA_BLUR_PX)
     assert inside.sum() > 15_000
     off = (light - expected)[inside]
     assert np.sqrt((off**2).mean()) < 0.008  # of white; a shift by a tenth of a pixel makes 0.02
@@ -94,7 +95,7 @@ def warped(T, times):
     """What OpenCV makes of the pattern alone, (480, 640), and where nothing else is seen."""
     texels = 140
     texture = CHARUCO.image(texels).astype(np.float32) / 255
-    texture = board_images.INK + (board_images.PAPER - board_images.INK) * texture
+    texture = board_images.INK_LIGHT + (board_images.PAPER_LIGHT - board_images.INK_LIGHT) * texture
     size = (640 * times, 480 * times)
     K = LENS.K.copy()
     K[:2] *= times
@@ -157,8 +158,9 @@ def test_motion_blurs_like_a_mean_of_shifted_pictures(direction):
     still = render_board(CHECKERS, T, LENS, None).astype(float)
     ways = way_px * ((np.arange(50) + 0.5) / 50 - 0.5)
     down, right = direction[1], direction[0]
+    around, middle = np.s_[150:330, 210:430], np.s_[10:-10, 10:-10]
+    moving, still = moving[around], still[around]
     expected = np.mean([shift(still, (way * down, way * right), order=3) for way in ways], axis=0)
-    middle = np.s_[160:320, 220:420]
     assert np.abs((moving - still)[middle]).max() > 20
     assert np.abs((moving - expected)[middle]).max() < 6.0  # grey; splines ring at sharp edges
     added = blur_of(CHECKERS, T, velocity=velocity) - blur_of(CHECKERS, T)
@@ -213,12 +215,12 @@ def test_variance_grows_linearly_with_the_mean():
     mean = np.array([images[:, some].mean() for some in at])
     variance = np.array([images[:, some].var(axis=0, ddof=1).mean() for some in at])
     gain, offset = np.polyfit(mean, variance, 1)
-    expected = (board_images.WHITE_GREY - board_images.BLACK_GREY) / (
+    expected = (board_images.PAPER_GREY - board_images.NO_LIGHT_GREY) / (
         8.0 * board_images.ELECTRONS_PER_MS
     )
     assert gain == pytest.approx(expected, rel=0.02)
     dark = (expected * board_images.READ_NOISE_E) ** 2 + 1 / 12
-    assert offset + gain * board_images.BLACK_GREY == pytest.approx(dark, abs=0.6)
+    assert offset + gain * board_images.NO_LIGHT_GREY == pytest.approx(dark, abs=0.6)
     np.testing.assert_allclose(variance, offset + gain * mean, rtol=0.04)
     np.testing.assert_allclose(mean, [clean[some].mean() for some in at], atol=0.3)
 
@@ -254,8 +256,8 @@ def test_corners_are_found_with_a_noise_of_about_a_twentieth_of_a_pixel(board):
     for view in (((0, 0, 3), 0.45), TILTED, ((20, 25, 10), 0.55)):
         T = pose(board, view)
         projected = opencv_pixels(board.points, T, LENS)
-        off = np.full((6, *projected.shape), np.nan)
-        for seed in range(6):
+        off = np.full((4, *projected.shape), np.nan)
+        for seed in range(4):
             found = detect(render_board(board, T, LENS, np.random.default_rng(seed)), board)
             off[seed, found.ids] = found.pixels - projected[found.ids]
         seen = np.isfinite(off).all(axis=(0, 2))
@@ -282,7 +284,7 @@ def test_pixels_that_no_ray_reaches_are_black():
         640, 480, 300.0, 300.0, 319.5, 239.5, "brown_conrady", (-0.5, 0.0, 0.0, 0.0, 0.0)
     )
     image = render_board(CHARUCO, pose(CHARUCO, NEAR), folded, None)
-    assert (image[:20, :20] == round(board_images.BLACK_GREY)).all()
+    assert (image[:20, :20] == round(board_images.NO_LIGHT_GREY)).all()
     assert image[240, 320] > 12
 
 
@@ -299,8 +301,8 @@ def test_pixels_that_no_ray_reaches_are_black():
         ({"exposure_ms": 0}, "^exposure_ms: got 0, want 0.01 to 1000 ms"),
         ({"readout_ms": "20"}, "^readout_ms: got '20'"),
         ({"light": np.inf}, "^light: got inf"),
-        ({"velocity": (0.1, 0.2)}, r"^velocity: got \(0.1, 0.2\), want six"),
-        ({"velocity": "fast"}, "^velocity: got 'fast', want six"),
+        ({"velocity": (0.1, 0.2)}, r"^velocity: got shape \(2,\), want \(6,\)"),
+        ({"velocity": "fast"}, "^velocity: want an array of real numbers"),
     ],
 )
 def test_refuses_bad_arguments(change, message):

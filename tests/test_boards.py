@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
 import struct
 import zlib
+from functools import lru_cache
 
 import cv2
 import matplotlib as mpl
@@ -23,8 +25,9 @@ from coursekit.boards import (
     save_sheet,
 )
 from coursekit.boards.corners import blur_covariance, noise_levels
-from coursekit.boards.find import find
+from coursekit.boards.find import find_corners
 
+NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 CHECKERBOARD = Board("checkerboard", (10, 7), 0.025)
 CHARUCO = Board("charuco", (9, 6), 0.025)
 OLD = Board("charuco", (9, 6), 0.025, old_origin=True)
@@ -45,34 +48,35 @@ def pose(board, tilt_deg=25.0, roll_deg=10.0, z_m=0.5, shift_m=(0.0, 0.0), axis_
     return T
 
 
+@lru_cache(maxsize=8)
+def sheet(board, pixels_per_square):
+    """The print in grey levels with a square of white paper around it."""
+    white = np.pad(board.image(pixels_per_square), pixels_per_square, constant_values=255)
+    return DARK + (BRIGHT - DARK) / np.float32(255) * white
+
+
 def view(board, T=None, size=(640, 480), blur_px=0.6, motion_px=(0.0, 0.0), pixels_per_square=112):
     """A noiseless view (h, w) in grey levels and the true corners (N, 2) px; no lens distortion."""
     T = pose(board) if T is None else T
     width, height = size
     K = np.array([[FOCAL, 0, (width - 1) / 2], [0, FOCAL, (height - 1) / 2], [0, 0, 1]])
     H = K @ np.c_[T[:3, :2], T[:3, 3]]
-    paper = np.pad(board.image(pixels_per_square) / np.float32(255), pixels_per_square)
-    rim = np.ones_like(paper, bool)
-    rim[pixels_per_square:-pixels_per_square, pixels_per_square:-pixels_per_square] = False
-    paper[rim] = 1.0
     to_image = board.image_from_board(pixels_per_square)
     to_image[:2, 2] += pixels_per_square
     over = np.array([[OVER, 0, (OVER - 1) / 2], [0, OVER, (OVER - 1) / 2], [0, 0, 1]])
     grey = cv2.warpPerspective(
-        DARK + (BRIGHT - DARK) * paper,
+        sheet(board, pixels_per_square),
         over @ H @ np.linalg.inv(to_image),
         (width * OVER, height * OVER),
         borderValue=AROUND,
     )
     grey = cv2.GaussianBlur(grey, (0, 0), blur_px * OVER)
     if any(motion_px):
-        grey = np.mean(
-            [
-                cv2.warpAffine(grey, np.float64([[1, 0, dx], [0, 1, dy]]), grey.shape[::-1])
-                for dx, dy in np.linspace(-0.5, 0.5, 25)[:, None] * np.array(motion_px) * OVER
-            ],
-            axis=0,
-        )
+        moved = np.zeros_like(grey)
+        for dx, dy in ((np.arange(12) + 0.5) / 12 - 0.5)[:, None] * OVER * np.array(motion_px):
+            there = np.float64([[1, 0, dx], [0, 1, dy]])
+            moved += cv2.warpAffine(grey, there, grey.shape[::-1]) / 12
+        grey = moved
     grey = grey.reshape(height, OVER, width, OVER).mean(axis=(1, 3))
     corners = np.c_[board.points[:, :2], np.ones(len(board.points))] @ H.T
     return grey, corners[:, :2] / corners[:, 2:]
@@ -144,29 +148,22 @@ def test_the_old_origin_is_at_the_bottom_left_with_y_up():
 
 
 @pytest.mark.parametrize(
-    ("squares", "turns"),
-    [((10, 7), 1), ((7, 10), 1), ((10, 8), 2), ((9, 7), 2), ((8, 8), 2), ((9, 9), 4)],
-)
-def test_turns_are_those_that_leave_the_colours_alone(squares, turns):
-    image = Board("checkerboard", squares, 0.02).image(4)
-    same = [np.array_equal(np.rot90(image, k), image) for k in range(4)]
-    assert Board("checkerboard", squares, 0.02).turns == turns == sum(same)
-
-
-@pytest.mark.parametrize(
     ("fields", "message"),
     [
-        (("chess", (9, 6), 0.02), "kind: got 'chess', want 'checkerboard' or 'charuco'"),
+        (("chess", (9, 6), 0.02), "kind: got 'chess', want one of checkerboard, charuco"),
         (("checkerboard", (9, 3), 0.02), "squares: got (9, 3), want (columns, rows) of squares"),
         (("charuco", (9, 2), 0.02), "squares: got (9, 2), want"),
         (("charuco", 9, 0.02), "squares: got 9, want"),
         (("charuco", (9.0, 6), 0.02), "squares: got (9.0, 6), want"),
-        (("charuco", (9, 6), -0.02), "square_m: got -0.02, want a positive number of metres"),
+        (("charuco", (9, 6), -0.02), "square_m: got -0.02, want 0.0005 to 1.0 m (25 mm is 0.025)"),
         (("charuco", (9, 6), float("nan")), "square_m: got nan, want"),
-        (("charuco", (9, 6), 0.02, 0.02), "marker_m: got 0.02, want less than the square's 0.02 m"),
+        (("charuco", (9, 6), 0.02, 0.02), "marker_m: got 0.02, want less than 0.02 m"),
         (("charuco", (9, 6), 0.02, None, "DICT_9X9"), "dictionary: got 'DICT_9X9', want one of"),
-        (("charuco", (15, 9), 0.02, None, "DICT_4X4_50"), "DICT_4X4_50 holds 50 markers"),
-        (("checkerboard", (9, 6), 0.02, 0.01), "marker_m, old_origin: a checkerboard has neither"),
+        (("charuco", (15, 9), 0.02, None, "DICT_4X4_50"), "want one of 67 markers or more"),
+        (
+            ("checkerboard", (9, 6), 0.02, 0.01),
+            "marker_m, old_origin: got (0.01, False), want none",
+        ),
     ],
 )
 def test_fields_that_make_no_board(fields, message):
@@ -226,9 +223,12 @@ def test_it_is_corner_sub_pix_where_nothing_is_different():
     ],
 )
 def test_the_noise_estimate_is_the_scatter_of_the_corners(board, noise, photon, blur_px, z_m):
-    """80 to 108 coordinates over 40 seeds: their standard deviation is known to 1.5 %."""
+    """80 to 108 coordinates over 12 seeds: their standard deviation is known to 2.2 %."""
     grey, _ = view(board, pose(board, tilt_deg=20, z_m=z_m), blur_px=blur_px)
-    views = [detect(photograph(grey, seed, noise, photon), board) for seed in range(40)]
+    views = [
+        detect(photograph(grey, seed, noise, photon), board)
+        for seed in range(40 if NIGHTLY else 12)
+    ]
     scatter = np.sqrt(np.var([seen.pixels for seen in views], axis=0, ddof=1).mean())
     estimate = np.sqrt(np.mean([seen.noise_px**2 for seen in views]))
     assert estimate == pytest.approx(scatter, rel=0.07)
@@ -250,7 +250,6 @@ def test_noise_levels_measures_noise_and_not_edges():
         (1.2, (0, 0)),
         (0.6, (3, 0)),
         (0.6, (0, 3)),
-        (0.6, (2.1, 2.1)),
         (0.6, (2.1, -2.1)),
     ],
 )
@@ -315,15 +314,15 @@ def test_part_of_a_charuco_board_is_enough():
 def test_a_checkerboard_is_whole_and_its_own_or_not_found():
     """OpenCV's searches take the outer edge for corners, or skewed parts of a larger board."""
     found = missed = 0
-    for T in random_poses(CHECKERBOARD, 6, 12, z_m=(0.3, 0.35), roll_deg=(-40, 40)):
+    for T in random_poses(CHECKERBOARD, 6, 8, z_m=(0.3, 0.35), roll_deg=(-40, 40)):
         grey, truth = view(CHECKERBOARD, T)
         inside = ((truth > 5) & (truth < np.array([634, 474]))).all()
-        seen = find(photograph(grey), CHECKERBOARD)
+        seen = find_corners(photograph(grey), CHECKERBOARD)
         missed += inside and seen is None
         if seen is not None:
             found += 1
             assert np.linalg.norm(seen[1] - truth, axis=1).max() < 5
-    assert found >= 4
+    assert found >= 3
     assert missed == 0
     image = photograph(view(CHECKERBOARD)[0])
     for squares in ((6, 5), (5, 4), (8, 6), (9, 6), (10, 6), (9, 7), (11, 7)):
@@ -641,7 +640,7 @@ def test_a_sheet_repeats_and_takes_no_notice_of_the_readers_style(tmp_path):
     ("changes", "message"),
     [
         ({"path": "a.svg"}, "path: got 'a.svg', want a name that ends in .pdf or .png"),
-        ({"path": "none/a.pdf"}, "path: the folder none does not exist"),
+        ({"path": "none/a.pdf"}, "path: got 'none/a.pdf', want a name in a folder that exists"),
         ({"paper": "A7"}, "paper: got 'A7', want one of A4, A3"),
         ({"dpi": 10}, "dpi: got 10, want a whole number from 72 to 2400"),
         (

@@ -3,31 +3,31 @@
 from __future__ import annotations
 
 import gc
-import sys
+from functools import partial
 
 import numpy as np
 import pytest
-from fake_realsense import SERIAL, FakeRealSense, real_library
+from fake_realsense import SERIAL, plugged_in, real_library
 
-from coursekit.cameras import CameraError, librealsense, open_camera, realsense
+from coursekit.cameras import CameraError, open_camera, realsense
 from coursekit.cameras.librealsense import LibraryMissing, load_librealsense
 
 
 @pytest.fixture
 def plug_in(monkeypatch, tmp_path):
-    """Plug in a fake D435 that behaves as the arguments say; a short patience with silence."""
-    monkeypatch.delenv("COURSEKIT_CAMERA", raising=False)
-    monkeypatch.setattr(librealsense, "USB_DEVICES", tmp_path)
-    monkeypatch.setattr(realsense, "SILENCE_S", 0.05)
-    monkeypatch.setattr(realsense, "_live_cameras", {})
+    """Plug in a fake D435 that behaves as the arguments say."""
+    return partial(plugged_in, monkeypatch, tmp_path)
 
-    def plug(**behaviour):
-        rs = FakeRealSense(**behaviour)
-        for module in (librealsense, realsense):
-            monkeypatch.setattr(module, "load_librealsense", lambda: rs)
-        return rs
 
-    return plug
+@pytest.fixture
+def rs(plug_in):
+    return plug_in()
+
+
+@pytest.fixture
+def camera(rs):
+    with open_camera() as opened:
+        yield opened
 
 
 def put_on_usb(folder, product):
@@ -64,18 +64,13 @@ def test_opens_the_connected_camera_and_asks_it_for_everything(plug_in, which):
         )
 
 
-def test_automatic_exposure_settles_before_the_first_frame(plug_in):
-    plug_in()
-    with open_camera() as camera:
-        assert camera.frame().number == 31
+def test_automatic_exposure_settles_before_the_first_frame(camera):
+    assert camera.frame().number == 31
 
 
-def test_consecutive_captures_go_on(plug_in):
-    plug_in()
-    with open_camera() as camera:
-        assert [frame.number for frame in camera.frames(3)] == [31, 32, 33]
-        assert camera.frame().number == 34
-        assert camera.frame_when_still().depth.shape == (480, 848)
+def test_consecutive_captures_go_on(camera):
+    assert [frame.number for frame in camera.frames(3)] == [31, 32, 33]
+    assert camera.frame().number == 34
 
 
 def test_a_depth_image_is_never_given_twice(plug_in):
@@ -204,7 +199,6 @@ def test_unplugged_while_recording_leaves_a_readable_file(plug_in, tmp_path, mon
         camera.record(path, 100)
     camera.close()
     monkeypatch.setattr(realsense, "load_librealsense", load_librealsense)
-    monkeypatch.setattr(realsense, "SILENCE_S", 5.0)
     with open_camera(path) as played:
         assert (played.name, played.serial) == ("Intel RealSense D435", SERIAL)
         assert played.color.model == "inverse_brown_conrady"
@@ -279,24 +273,20 @@ def test_a_bad_distance_is_refused_before_anybody_is_asked(plug_in, monkeypatch)
         camera.place("wall", -1)
 
 
-def test_the_depth_unit_is_set_with_the_camera_stopped(plug_in):
-    rs = plug_in()
-    with open_camera() as camera:
-        assert camera.set(depth_scale_m=1e-4) == "Depth unit set to 0.1 mm."
-        assert (rs.starts, rs.stops) == (2, 1)
-        assert rs.depth_sensor.set_calls == [("depth_units", 1e-4)]
-        assert camera.depth_scale_m == camera.frame().depth_scale_m == 1e-4
-        with pytest.raises(ValueError, match=r"^depth_scale_m: got 1"):
-            camera.set(depth_scale_m=1)
+def test_the_depth_unit_is_set_with_the_camera_stopped(rs, camera):
+    assert camera.set(depth_scale_m=1e-4) == "Depth unit set to 0.1 mm."
+    assert (rs.starts, rs.stops) == (2, 1)
+    assert rs.depth_sensor.set_calls == [("depth_units", 1e-4)]
+    assert camera.depth_scale_m == camera.frame().depth_scale_m == 1e-4
+    with pytest.raises(ValueError, match=r"^depth_scale_m: got 1"):
+        camera.set(depth_scale_m=1)
 
 
-def test_light_and_exposure_are_the_persons(plug_in):
-    rs = plug_in()
-    with open_camera() as camera:
-        sentence = camera.set(ambient=0.05, exposure=5.0)
-        assert sentence.startswith("The room's light is yours to change")
-        assert "exposure stays: lock()" in sentence
-        assert camera.set() == "Nothing to change."
+def test_light_and_exposure_are_the_persons(rs, camera):
+    sentence = camera.set(ambient=0.05, exposure=5.0)
+    assert sentence.startswith("The room's light is yours to change")
+    assert "exposure stays: lock()" in sentence
+    assert camera.set() == "Nothing to change."
     assert rs.depth_sensor.set_calls == []
     assert rs.starts == 1
 
@@ -325,19 +315,16 @@ def test_a_depth_unit_that_is_refused(plug_in, monkeypatch, silently):
         assert camera.frame().depth_scale_m == 0.001  # still streaming
 
 
-def test_nobody_knows_a_real_cameras_truth(plug_in):
-    plug_in()
-    with open_camera() as camera, pytest.raises(CameraError, match="nobody knows the true geom"):
+def test_nobody_knows_a_real_cameras_truth(camera):
+    with pytest.raises(CameraError, match="nobody knows the true geom"):
         camera.reveal()
 
 
 # --- lock ---
 
 
-def test_lock_fixes_the_exposure_that_the_camera_chose(plug_in):
-    rs = plug_in()
-    with open_camera() as camera:
-        sentence = camera.lock()
+def test_lock_fixes_the_exposure_that_the_camera_chose(rs, camera):
+    sentence = camera.lock()
     assert rs.depth_sensor.set_calls == [
         ("enable_auto_exposure", 0),
         ("exposure", 8500),  # of the newest image, not the 33000 of the manual setting
@@ -356,12 +343,10 @@ def test_lock_fixes_the_exposure_that_the_camera_chose(plug_in):
     )
 
 
-def test_lock_waits_until_the_new_exposure_shows(plug_in):
-    rs = plug_in()
-    with open_camera() as camera:
-        before = rs.given
-        camera.lock()
-        assert rs.given - before == 1 + 6
+def test_lock_waits_until_the_new_exposure_shows(rs, camera):
+    before = rs.given
+    camera.lock()
+    assert rs.given - before == 1 + 6
 
 
 def test_lock_that_the_camera_refuses(plug_in, monkeypatch):
@@ -375,22 +360,13 @@ def test_lock_that_the_camera_refuses(plug_in, monkeypatch):
         camera.lock()
 
 
-def test_lock_of_a_closed_camera(plug_in):
-    plug_in()
-    camera = open_camera()
+def test_lock_of_a_closed_camera(camera):
     camera.close()
     with pytest.raises(CameraError, match="closed: open it again"):
         camera.lock()
 
 
 # --- without the library ---
-
-
-@pytest.fixture
-def no_library(monkeypatch):
-    monkeypatch.delenv("COURSEKIT_CAMERA", raising=False)
-    monkeypatch.setitem(sys.modules, "pyrealsense2", None)
-    monkeypatch.setitem(sys.modules, "libusb_package", None)
 
 
 def test_without_the_library_auto_is_simulated_and_says_why(no_library):
@@ -415,11 +391,6 @@ def test_without_the_library_nothing_is_recorded(no_library, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_library_that_does_not_load_says_so(monkeypatch, tmp_path):
-    (tmp_path / "pyrealsense2.py").write_text(
-        "raise ImportError('libusb-1.0.so.0: no such file')", encoding="utf-8"
-    )
-    monkeypatch.delitem(sys.modules, "pyrealsense2", raising=False)
-    monkeypatch.syspath_prepend(tmp_path)
+def test_a_library_that_does_not_load_says_so(broken_library):
     with pytest.raises(LibraryMissing, match=r"does not load \(libusb-1\.0\.so\.0: no such file"):
         load_librealsense()

@@ -8,14 +8,15 @@ import sqlite3
 import time
 import zipfile
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from fake_realsense import real_library
 
-from coursekit.cameras import Camera, CameraError, Frame, open_camera
+from coursekit.cameras import Camera, CameraError, Frame, open_camera, recording
 from coursekit.cameras.realsense import _rgb_converter
-from coursekit.cameras.recording import depth_frame_numbers
+from coursekit.cameras.recording import depth_frame_numbers, restore_order
 from coursekit.geometry import Intrinsics, make_transform
 
 SIX_DECIMALS = 6e-7  # the recorder writes extrinsics with %f: half a unit, and float32
@@ -48,7 +49,7 @@ class RandomCamera(Camera):
         self.baseline_m, self.depth_scale_m, self.n = baseline_m, scale_m, n
         self.infrared = infrared
 
-    def _stream(self):
+    def stream(self):
         rng = np.random.default_rng(11)
         for number in range(1, self.n + 1):
             depth = rng.integers(0, 65536, (self.depth.height, self.depth.width), np.uint16)
@@ -73,12 +74,18 @@ class RandomCamera(Camera):
 
 
 def same_float32(one: Intrinsics, other: Intrinsics) -> bool:
-    def rounded(intrinsics):
-        values = {name: float(np.float32(getattr(intrinsics, name))) for name in ("fx", "fy")}
-        values |= {name: float(np.float32(getattr(intrinsics, name))) for name in ("cx", "cy")}
-        return replace(intrinsics, coeffs=tuple(np.float32(intrinsics.coeffs).tolist()), **values)
+    def rounded(k):
+        values = {name: float(np.float32(getattr(k, name))) for name in ("fx", "fy", "cx", "cy")}
+        return replace(k, coeffs=tuple(np.float32(k.coeffs).tolist()), **values)
 
     return rounded(one) == rounded(other)
+
+
+def same_images(one: Frame, other: Frame) -> None:
+    assert one.number == other.number
+    assert one.time_s == pytest.approx(other.time_s, abs=1e-8)
+    np.testing.assert_array_equal(one.depth, other.depth)
+    np.testing.assert_array_equal(one.color, other.color)  # or None
 
 
 # --- what is written is what is read ---
@@ -105,14 +112,8 @@ def test_round_trip(rs, tmp_path, color):
             assert played.color is None
             assert played.T_color_depth is None
             assert "no colour" in repr(played)
-    for mine, theirs in zip(camera._stream(), frames, strict=True):
-        assert theirs.number == mine.number
-        assert theirs.time_s == pytest.approx(mine.time_s, abs=1e-8)
-        np.testing.assert_array_equal(theirs.depth, mine.depth)
-        if color:
-            np.testing.assert_array_equal(theirs.color, mine.color)
-        else:
-            assert theirs.color is None
+    for mine, theirs in zip(camera.stream(), frames, strict=True):
+        same_images(theirs, mine)
     assert [entry.name for entry in tmp_path.iterdir()] == ["all.db3"]
 
 
@@ -121,12 +122,9 @@ def test_infrared_round_trip(rs, tmp_path, color):
     camera = RandomCamera(n=12, color=color, infrared=True)
     with open_camera(camera.record(tmp_path / "a.db3", 12, infrared=True)) as played:
         for _ in range(3):
-            for mine, theirs in zip(camera._stream(), played.frames(12), strict=True):
-                assert theirs.number == mine.number
-                np.testing.assert_array_equal(theirs.depth, mine.depth)
+            for mine, theirs in zip(camera.stream(), played.frames(12), strict=True):
+                same_images(theirs, mine)
                 np.testing.assert_array_equal(theirs.infrared, mine.infrared)
-                if color:
-                    np.testing.assert_array_equal(theirs.color, mine.color)
 
 
 @pytest.mark.parametrize(("has", "asked"), [(True, False), (False, True)])
@@ -157,9 +155,7 @@ def test_a_recording_of_a_recording_is_the_same(rs, tmp_path):
         second = played.record(tmp_path / "second.db3", 5)
         with open_camera(second) as again:
             for one, other in zip(played.frames(5), again.frames(5), strict=True):
-                assert (one.number, one.time_s) == (other.number, other.time_s)
-                np.testing.assert_array_equal(one.depth, other.depth)
-                np.testing.assert_array_equal(one.color, other.color)
+                same_images(one, other)
 
 
 def test_no_frame_is_lost_at_the_start_of_a_playback(rs, tmp_path):
@@ -174,29 +170,28 @@ def test_no_frame_is_lost_by_a_slow_reader(rs, tmp_path):
     path = RandomCamera(n=10).record(tmp_path / "a.db3", 10)
     with open_camera(path) as played:
         numbers = []
-        for frame in played._stream():
+        for frame in played.stream():
             numbers.append(frame.number)
             time.sleep(0.04)  # longer than the recorded pace
     assert numbers == [7 * k for k in range(1, 11)]
 
 
-def test_other_streams_in_a_recording_do_not_disturb(rs, tmp_path):
+def test_other_streams_in_a_recording_do_not_disturb(rs, tmp_path, monkeypatch):
     path = tmp_path / "infrared.db3"
     camera = RandomCamera(n=6)
-    record_with_infrared(rs, path, camera)
+    record_with_infrared(monkeypatch, rs, path, camera)
     with open_camera(path) as played:
         frames = played.frames(6)
-    for mine, theirs in zip(camera._stream(), frames, strict=True):
-        np.testing.assert_array_equal(theirs.depth, mine.depth)
-        np.testing.assert_array_equal(theirs.color, mine.color)
+    for mine, theirs in zip(camera.stream(), frames, strict=True):
+        same_images(mine, theirs)
 
 
 def test_memory_does_not_grow_while_recording(rs, tmp_path):
     """300 depth images are 244 MB; without flow control librealsense keeps most of them waiting."""
     resource = pytest.importorskip("resource")
     camera = RandomCamera(n=1, color=False, size=(848, 480))
-    frame = next(camera._stream())
-    camera._stream = lambda: (replace(frame, number=k, time_s=k / 30) for k in range(1, 301))
+    frame = next(camera.stream())
+    camera.stream = lambda: (replace(frame, number=k, time_s=k / 30) for k in range(1, 301))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     camera.record(tmp_path / "long.db3", 300)
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
@@ -208,13 +203,13 @@ def test_memory_does_not_grow_while_recording(rs, tmp_path):
 
 
 def ending_after(camera: Camera, k: int, with_what: BaseException) -> None:
-    stream = camera._stream
+    stream = camera.stream
 
     def shortened():
         yield from itertools.islice(stream(), k)
         raise with_what
 
-    camera._stream = shortened
+    camera.stream = shortened
 
 
 def test_ctrl_c_keeps_what_came(rs, tmp_path, capsys):
@@ -228,23 +223,20 @@ def test_ctrl_c_keeps_what_came(rs, tmp_path, capsys):
 
 
 def test_ctrl_c_between_colour_and_depth_leaves_whole_frames(rs, tmp_path, monkeypatch, capsys):
-    from coursekit.cameras import recording
-
-    add, calls = recording._Writer._add, itertools.count(1)
+    add, calls = recording.Writer.add_image, itertools.count(1)
 
     def interrupted(self, stream, pixels, frame):
         if next(calls) == 6:  # the depth image of the third frame
             raise KeyboardInterrupt
         add(self, stream, pixels, frame)
 
-    monkeypatch.setattr(recording._Writer, "_add", interrupted)
+    monkeypatch.setattr(recording.Writer, "add_image", interrupted)
     camera = RandomCamera()
     path = camera.record(tmp_path / "a.db3", 9)
     assert "holds the 2 frames" in capsys.readouterr().out
     with open_camera(path) as played:
-        for mine, theirs in zip(camera._stream(), played.frames(2), strict=False):
-            np.testing.assert_array_equal(theirs.color, mine.color)
-            np.testing.assert_array_equal(theirs.depth, mine.depth)
+        for mine, theirs in zip(camera.stream(), played.frames(2), strict=False):
+            same_images(mine, theirs)
 
 
 def test_unplugged_while_recording_keeps_what_came(rs, tmp_path):
@@ -256,34 +248,27 @@ def test_unplugged_while_recording_keeps_what_came(rs, tmp_path):
         assert [frame.number for frame in played.frames(7)] == [7, 14, 21, 28, 35, 42, 49]
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt(), CameraError("gone")])
-def test_no_frame_at_all_leaves_no_file(rs, tmp_path, error):
+@pytest.mark.parametrize(
+    ("after", "error"),
+    [(0, KeyboardInterrupt()), (0, CameraError("gone")), (2, ZeroDivisionError())],
+)
+def test_no_frame_at_all_or_another_failure_leaves_no_file(rs, tmp_path, after, error):
     camera = RandomCamera()
-    ending_after(camera, 0, error)
+    ending_after(camera, after, error)
     with pytest.raises(type(error)):
-        camera.record(tmp_path / "a.db3", 9)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_any_other_failure_leaves_no_file(rs, tmp_path):
-    camera = RandomCamera()
-    ending_after(camera, 2, ZeroDivisionError())
-    with pytest.raises(ZeroDivisionError):
         camera.record(tmp_path / "a.db3", 9)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_frames_that_do_not_reach_the_disk_are_noticed(rs, tmp_path, monkeypatch):
     """librealsense says nothing on a full disk: 5 of 20 frames arrived on one of 8 MB."""
-    from coursekit.cameras import recording
-
-    add, calls = recording._Writer._add, itertools.count(1)
+    add, calls = recording.Writer.add_image, itertools.count(1)
 
     def lossy(self, stream, pixels, frame):
         if next(calls) < 10:
             add(self, stream, pixels, frame)
 
-    monkeypatch.setattr(recording._Writer, "_add", lossy)
+    monkeypatch.setattr(recording.Writer, "add_image", lossy)
     with pytest.raises(CameraError, match=r"only 4 of 9 frames could be written .* disk is"):
         RandomCamera().record(tmp_path / "a.db3", 9)
     assert list(tmp_path.iterdir()) == []
@@ -326,8 +311,6 @@ def test_refuses_a_bad_path(tmp_path, name, message):
 
 
 def test_frames_stay_in_order_though_the_recorders_clock_steps_back(rs, tmp_path):
-    from coursekit.cameras.recording import _restore_order
-
     path = RandomCamera(n=8).record(tmp_path / "a.db3", 8)
     with sqlite3.connect(path) as file:  # what a late correction did to the third frame
         late = file.execute("SELECT MAX(timestamp) + 1 FROM messages").fetchone()[0]
@@ -339,7 +322,7 @@ def test_frames_stay_in_order_though_the_recorders_clock_steps_back(rs, tmp_path
             ).fetchone()
             file.execute("UPDATE messages SET timestamp = ? WHERE id = ?", (late, third))
     assert depth_frame_numbers(path) == [7, 14, 28, 35, 42, 49, 56, 21]
-    _restore_order(path)
+    restore_order(path)
     with open_camera(path) as played:
         assert [frame.number for frame in played.frames(8)] == [7 * k for k in range(1, 9)]
 
@@ -373,21 +356,13 @@ def test_a_truncated_recording(good, tmp_path, fraction):
     assert [entry.name for entry in tmp_path.iterdir()] == ["cut.db3"]
 
 
-def foreign(path):
-    with sqlite3.connect(path) as file:
-        file.execute("CREATE TABLE shopping (item TEXT)")
+def tables(*statements):
+    def make(path):
+        with sqlite3.connect(path) as file:
+            for statement in statements:
+                file.execute(f"CREATE TABLE {statement}")
 
-
-def robot(path):
-    with sqlite3.connect(path) as file:
-        file.execute(
-            "CREATE TABLE topics(id INTEGER PRIMARY KEY,name TEXT NOT NULL,type TEXT NOT NULL,"
-            "serialization_format TEXT NOT NULL,offered_qos_profiles TEXT NOT NULL)"
-        )
-        file.execute(
-            "CREATE TABLE messages(id INTEGER PRIMARY KEY,topic_id INTEGER NOT NULL,"
-            "timestamp INTEGER NOT NULL, data BLOB NOT NULL)"
-        )
+    return make
 
 
 def zipped(path):
@@ -395,33 +370,33 @@ def zipped(path):
         archive.writestr("frame.txt", "no frame")
 
 
+def text(content):
+    return lambda path: path.write_text(content, encoding="utf-8")
+
+
+robot = tables(
+    "topics(id INTEGER PRIMARY KEY,name TEXT NOT NULL,type TEXT NOT NULL,"
+    "serialization_format TEXT NOT NULL,offered_qos_profiles TEXT NOT NULL)",
+    "messages(id INTEGER PRIMARY KEY,topic_id INTEGER NOT NULL,timestamp INTEGER NOT NULL,"
+    "data BLOB NOT NULL)",
+)
+
+
 @pytest.mark.parametrize(
     ("name", "make", "message"),
     [
-        ("empty.db3", lambda path: path.touch(), "is empty: copy it again"),
-        ("empty.bag", lambda path: path.touch(), "is empty: copy it again"),
-        (
-            "text.db3",
-            lambda path: path.write_text("hello", encoding="utf-8"),
-            r"is not a \.db3 recording, though",
-        ),
-        (
-            "text.bag",
-            lambda path: path.write_text("hello", encoding="utf-8"),
-            r"is not a \.bag recording, though",
-        ),
+        ("empty.db3", Path.touch, "is empty: copy it again"),
+        ("empty.bag", Path.touch, "is empty: copy it again"),
+        ("text.db3", text("hello"), r"is not a \.db3 recording, though"),
+        ("text.bag", text("hello"), r"is not a \.bag recording, though"),
         ("zip.bag", zipped, r"is not a \.bag recording, though"),
         ("zip.db3", zipped, r"is not a \.db3 recording, though"),
-        ("foreign.db3", foreign, "not from a RealSense; copy it again"),
+        ("foreign.db3", tables("shopping (item TEXT)"), "not from a RealSense; copy it again"),
         ("robot.db3", robot, "not from a RealSense; copy it again"),
-        (
-            "header.bag",
-            lambda path: path.write_text("#ROSBAG V2.0\n", encoding="utf-8"),
-            "damaged, incomplete",
-        ),
-        ("folder.db3", lambda path: path.mkdir(), "is a folder: name the"),
-        ("film.mp4", lambda path: path.touch(), r"its name must end in \.db3 or \.bag"),
-        ("GOOD.DB3", lambda path: path.touch(), r"its name must end in \.db3 or \.bag, in lower"),
+        ("header.bag", text("#ROSBAG V2.0\n"), "damaged, incomplete"),
+        ("folder.db3", Path.mkdir, "is a folder: name the"),
+        ("film.mp4", Path.touch, r"its name must end in \.db3 or \.bag"),
+        ("GOOD.DB3", Path.touch, r"its name must end in \.db3 or \.bag, in lower"),
         ("nothing.db3", lambda path: None, "there is no file .*nothing.db3: check the name"),
         ("nothing.bag", lambda path: None, "there is no file .*nothing.bag: check the name"),
     ],
@@ -430,10 +405,9 @@ def test_a_foreign_file(rs, tmp_path, name, make, message):
     path = tmp_path / name
     make(path)
     before = sorted(entry.name for entry in tmp_path.iterdir())
-    with pytest.raises(CameraError, match=message):
-        open_camera(path)
-    with pytest.raises(CameraError, match=message):
-        open_camera(str(path))
+    for which in (path, str(path)):
+        with pytest.raises(CameraError, match=message):
+            open_camera(which)
     assert sorted(entry.name for entry in tmp_path.iterdir()) == before
 
 
@@ -509,12 +483,12 @@ def test_other_colour_formats_are_refused(rs, tmp_path):
 
 
 @pytest.mark.parametrize("form", ["bgr8", "bgra8", "yuyv"])
-def test_a_recording_in_another_colour_format(rs, tmp_path, form):
+def test_a_recording_in_another_colour_format(rs, tmp_path, monkeypatch, form):
     path, camera = tmp_path / "a.db3", RandomCamera(n=2)
     bpp = {"bgr8": 3, "bgra8": 4, "yuyv": 2}[form]
     pixels = np.full((48, 32, bpp), 128, np.uint8)
     pixels[..., 0] = 200  # blue, or luma
-    record_raw(rs, path, camera, form, pixels)
+    record_raw(monkeypatch, rs, path, camera, form, pixels)
     with open_camera(path) as played:
         color = played.frame().color
     assert color.shape == (48, 32, 3)
@@ -522,9 +496,10 @@ def test_a_recording_in_another_colour_format(rs, tmp_path, form):
     np.testing.assert_allclose(color[5, 5], expected, atol=1)
 
 
-def test_a_grey_recording_is_refused(rs, tmp_path):
+def test_a_grey_recording_is_refused(rs, tmp_path, monkeypatch):
     path = tmp_path / "a.db3"
-    record_raw(rs, path, RandomCamera(n=2), "y8", np.full((48, 32), 9, np.uint8))
+    pixels = np.full((48, 32), 9, np.uint8)
+    record_raw(monkeypatch, rs, path, RandomCamera(n=2), "y8", pixels)
     with pytest.raises(CameraError, match="colour is stored as y8, want rgb8"):
         open_camera(path)
 
@@ -532,60 +507,41 @@ def test_a_grey_recording_is_refused(rs, tmp_path):
 # --- recordings that the course's own writer does not make ---
 
 
-def record_raw(rs, path, camera, form, pixels):
+def record_raw(monkeypatch, rs, path, camera, form, pixels):
     """Record frames with the colour stream in the format `form`, all colour images `pixels`."""
-    from coursekit.cameras import recording
-
-    class Writer(recording._Writer):
-        pass
-
-    video_stream = recording._video_stream
-
-    def stream_of_form(rs, kind, fmt, bpp, intrinsics):
-        stream = video_stream(rs, kind, fmt, bpp, intrinsics)
-        if kind == rs.stream.color:
-            stream.fmt = getattr(rs.format, form)
-            stream.bpp = pixels.shape[2] if pixels.ndim == 3 else 1
-        return stream
-
-    recording._video_stream = stream_of_form
-    try:
-        writer = Writer(rs, path, camera)
-    finally:
-        recording._video_stream = video_stream
-    for frame in camera._stream():
+    size = pixels.shape[2] if pixels.ndim == 3 else 1
+    monkeypatch.setitem(recording.STREAMS, "color", ("color", form, size, 0, 1))
+    writer = recording.Writer(rs, path, camera)
+    for frame in camera.stream():
         writer.add(replace(frame, color=pixels))
     writer.close()
 
 
-def record_with_infrared(rs, path, camera):
-    """Record depth, colour and one infrared image a frame."""
-    from coursekit.cameras import recording
-
+def record_with_infrared(monkeypatch, rs, path, camera):
+    """Record depth, colour and, by a sensor of its own, one infrared image a frame."""
     recorder = rs.recorder
 
-    class Writer(recording._Writer):
+    class Writer(recording.Writer):
         def add(self, frame):
-            self._add("infrared", (frame.depth >> 8).astype(np.uint8), frame)
+            self.add_image("one eye", (frame.depth >> 8).astype(np.uint8), frame)
             super().add(frame)
 
-    def recorder_with_infrared(name, device):
-        sensor = device.add_sensor("Infrared")
-        stream = recording._video_stream(rs, rs.stream.infrared, rs.format.y8, 1, camera.depth)
-        stream.uid = 2
-        profile = sensor.add_video_stream(stream)
-        streams["infrared"] = (sensor, profile.as_video_stream_profile())
+        def _add_stream(self, name, sensor, intrinsics):
+            if name == "depth":
+                self.start = lambda device: super(Writer, self)._add_stream(
+                    "one eye", device.add_sensor("Infrared"), intrinsics
+                )
+            return super()._add_stream(name, sensor, intrinsics)
+
+    def with_infrared(name, device):
+        writer.start(device)
         return recorder(name, device)
 
-    streams: dict = {}
-    rs.recorder = recorder_with_infrared
-    try:
-        writer = Writer(rs, path, camera)
-    finally:
-        rs.recorder = recorder
-    writer._streams |= streams
-    streams.clear()
-    for frame in camera._stream():
+    monkeypatch.setitem(recording.STREAMS, "one eye", ("infrared", "y8", 1, 0, 2))
+    monkeypatch.setattr(rs, "recorder", with_infrared)
+    writer = Writer.__new__(Writer)
+    writer.__init__(rs, path, camera)
+    for frame in camera.stream():
         writer.add(frame)
     writer.close()
-    recording._restore_order(path)  # as write_recording does
+    recording.restore_order(path)  # as write_recording does

@@ -6,10 +6,14 @@ from motion in pictures, not in made-up numbers.
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
+import pickle
 import zlib
 from functools import lru_cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -17,11 +21,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from coursekit.boards import Board, Detection, detect, detect_all
-from coursekit.cameras import Camera, CameraError, Frame, live_view
+from coursekit.cameras import Camera, CameraError, Frame, simulated
 from coursekit.cameras import capture as module
-from coursekit.cameras.capture import capture, is_new, is_still
-from coursekit.cameras.guidance import guidance, middle_of, outline
-from coursekit.cameras.live_view import LiveImage
+from coursekit.cameras.capture import (
+    LiveImage,
+    Screen,
+    Sight,
+    capture,
+    guidance,
+    is_new,
+    is_still,
+    outline,
+)
 from coursekit.cameras.simulated import SimulatedCamera
 from coursekit.geometry import Intrinsics, make_transform, project, transform_points
 from coursekit.simulation.board_images import render_board
@@ -30,12 +41,17 @@ from coursekit.simulation.corner_sessions import corner_session
 BOARD = Board("charuco", (9, 6), 0.025)
 CHECKERS = Board("checkerboard", (10, 7), 0.025)
 LENS = Intrinsics(640, 480, 613.2, 613.4, 319.9, 239.2)
+NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 DEPTH = np.zeros((480, 848), np.uint16)
+
+
+def kind(board):
+    return board.kind
 
 
 def pose(angles_deg, at_m, board=BOARD):
     R = Rotation.from_euler("xyz", angles_deg, degrees=True)
-    return make_transform(R, np.array(at_m) - R.apply(middle_of(board)))
+    return make_transform(R, np.array(at_m) - R.apply(board.middle))
 
 
 POSES = (
@@ -43,6 +59,28 @@ POSES = (
     pose((30, 0, 5), (0.06, 0.02, 0.45)),
     pose((0, -35, 0), (-0.06, -0.03, 0.45)),
 )
+
+
+def once(function):
+    """The function, which does what it is asked for with the same things only once."""
+    done = {}
+
+    def remembering(*things):
+        key = hashlib.sha256(pickle.dumps(things)).digest()
+        if key not in done:
+            done[key] = function(*things)
+        return done[key]
+
+    return remembering
+
+
+@pytest.fixture(scope="module", autouse=True)
+def same_pictures_once():
+    """The same board in the same light is rendered, and looked for, once for all tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(simulated, "render_board", once(render_board))
+        patch.setattr(module, "see", once(module.see))
+        yield
 
 
 @lru_cache(maxsize=200)
@@ -64,7 +102,7 @@ class HeldBoard(Camera):
         self.locked = self.streams = 0
         self.shown = []  # what each frame showed: the number of a pose, or None on the way
 
-    def _stream(self):
+    def stream(self):
         self.streams += 1
         for number, T in enumerate(self.poses):
             rng = np.random.default_rng(0)
@@ -140,7 +178,7 @@ def test_the_same_call_takes_the_same_pictures_and_another_unit_others(tmp_path)
     assert one[0] != other[0]
 
 
-@pytest.mark.parametrize("board", [BOARD, CHECKERS], ids=lambda board: board.kind)
+@pytest.mark.parametrize("board", [BOARD, *([CHECKERS] if NIGHTLY else [])], ids=kind)
 def test_twenty_guided_views_lack_nothing_and_determine_the_lens(board, tmp_path):
     camera = SimulatedCamera()
     seen = capture(camera, board, 20, tmp_path)
@@ -165,11 +203,11 @@ def test_twenty_guided_views_lack_nothing_and_determine_the_lens(board, tmp_path
 def interrupt_after(monkeypatch, views):
     """Ctrl-C, pressed while the image after so many views is shown."""
 
-    def show(self, image, detection, wanted, taken, why=""):
-        if len(taken) == views:
+    def show(self, sight):
+        if len(sight.taken) == views:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(live_view.Bar, "show", show)
+    monkeypatch.setattr(Screen, "show", show)
 
 
 def test_ctrl_c_keeps_what_came_and_the_next_call_goes_on(tmp_path, monkeypatch, capsys):
@@ -304,21 +342,16 @@ def moving(px_per_frame, frames, noise_px=0.05, seed=0):
     """Detections of a board that moves by so much a frame."""
     rng = np.random.default_rng(seed)
     pixels = project(transform_points(POSES[0], BOARD.points), LENS.K)
-    steps = np.outer(np.arange(frames), px_per_frame)
-    return [
-        Detection(
-            np.arange(len(pixels)),
-            pixels + step + noise_px * rng.standard_normal(pixels.shape),
-            LENS.size,
-            noise_px=noise_px,
-        )
-        for step in steps
-    ]
+    ids, views = np.arange(len(pixels)), []
+    for step in np.outer(np.arange(frames), px_per_frame):
+        seen = pixels + step + noise_px * rng.standard_normal(pixels.shape)
+        views.append(Detection(ids, seen, LENS.size, noise_px=noise_px))
+    return views
 
 
 @pytest.mark.parametrize("noise_px", [0.02, 0.1, 0.3])
 def test_noise_alone_is_still(noise_px):
-    assert all(is_still(moving((0, 0), 5, noise_px, seed)) for seed in range(200))
+    assert all(is_still(moving((0, 0), 5, noise_px, seed)) for seed in range(50))
 
 
 def test_a_slow_motion_is_not_still():
@@ -353,7 +386,7 @@ def session(poses, board=BOARD):
     return views
 
 
-@pytest.mark.parametrize("board", [BOARD, CHECKERS], ids=lambda board: board.kind)
+@pytest.mark.parametrize("board", [BOARD, CHECKERS], ids=kind)
 def test_an_empty_session_lacks_everything_and_the_first_view_is_one_that_can_be_taken(board):
     guide = guidance([], board, LENS.size, LENS)
     kinds = [text.split(":")[0] for text in guide.missing]
@@ -378,7 +411,7 @@ def test_flat_views_lack_all_tilts():
 @pytest.mark.parametrize("angles_deg", [(30, 0, 0), (-30, 0, 0), (0, 30, 0), (0, -30, 0)])
 def test_a_tilt_counts_for_the_edge_that_is_farther_away(angles_deg):
     T = pose(angles_deg, (0, 0, 0.45))
-    farthest = BOARD.points[transform_points(T, BOARD.points)[:, 2].argmax()] - middle_of(BOARD)
+    farthest = BOARD.points[transform_points(T, BOARD.points)[:, 2].argmax()] - BOARD.middle
     axis = 0 if angles_deg[1] else 1
     away = (("left", "right"), ("top", "bottom"))[axis][int(farthest[axis] > 0)]
     lacks = guidance(session([T] * 3), BOARD, LENS.size, LENS).missing
@@ -406,7 +439,7 @@ def test_the_words_describe_the_target():
     seen = []
     for _ in range(12):
         guide = guidance(session(seen), BOARD, LENS.size, LENS)
-        middle = transform_points(guide.target, middle_of(BOARD))
+        middle = transform_points(guide.target, BOARD.middle)
         assert f"{middle[2]:.2f} m from the camera" in guide.next
         u, v = project(middle, LENS.K)
         assert ("left" in guide.next.split(",")[0]) == (u < 640 / 3)
@@ -445,7 +478,8 @@ def test_the_live_image_shows_what_is_seen_taken_and_wanted(capsys):
     views = session(POSES[:2])
     guide = guidance(views[:1], BOARD, LENS.size, LENS)
     live.say("Locked exposure at 8 ms.")
-    live.show(np.zeros((480, 640), np.uint8), views[1], guide, views[:1])
+    black = np.zeros((480, 640), np.uint8)
+    live.show(Sight(black, views[1], guide, views[:1]))
     image = cv2.imdecode(np.frombuffer(live._image.value, np.uint8), cv2.IMREAD_COLOR)
     assert image.shape == (480, 640, 3)
     ring = outline(BOARD, guide.target, LENS)
@@ -458,7 +492,7 @@ def test_the_live_image_shows_what_is_seen_taken_and_wanted(capsys):
         assert image[v - 5 : v + 6, u - 5 : u + 6].max() > 100
     assert "<b>1 of 28 views.</b> Locked exposure at 8 ms." in live._words.value
     assert guide.next in live._words.value
-    live.show(np.zeros((480, 640), np.uint8), None, guide, views[:1], "no <board> at all")
+    live.show(Sight(black, None, guide, views[:1], "no <board> at all"))
     assert "no &lt;board&gt; at all" in live._words.value
     bundle = live._repr_mimebundle_()
     assert bundle["text/plain"] == "The live image appears here while the cell runs."
@@ -467,7 +501,7 @@ def test_the_live_image_shows_what_is_seen_taken_and_wanted(capsys):
 
 def test_in_a_notebook_the_live_image_is_displayed_once(tmp_path, monkeypatch, capsys):
     shown = []
-    monkeypatch.setattr(live_view, "_in_notebook", lambda: True)
+    monkeypatch.setattr("IPython.get_ipython", lambda: SimpleNamespace(kernel="a kernel"))
     monkeypatch.setattr("IPython.display.display", shown.append)
     capture(HeldBoard(POSES[:1]), BOARD, 1, tmp_path / "views")
     assert [type(one) for one in shown] == [LiveImage]

@@ -8,55 +8,19 @@ import subprocess
 import sys
 import tempfile
 import webbrowser
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fake_realsense import SERIAL, FakeImage, FakeRealSense, real_library
+from fake_realsense import SERIAL, plugged_in
 
 from coursekit import doctor, results
-from coursekit.cameras import librealsense, open_camera, realsense
-from coursekit.doctor import Line, examine
+from coursekit.doctor import CheckUp, checks
 from coursekit.geometry import Intrinsics
 
 UDEV = "99-realsense-libusb.rules"
-
-
-class PluggedIn(FakeRealSense):
-    """The fake D435 with what a device tells about its link and firmware, and noisy depth."""
-
-    def __init__(self, **behaviour):
-        super().__init__(**behaviour)
-        self.told = {
-            "name": "Intel RealSense D435",
-            "serial_number": SERIAL,
-            "usb_type_descriptor": "3.2",
-            "firmware_version": "5.16.0.1",
-            "recommended_firmware_version": "5.16.0.1",
-        }
-        self.filled, self.noise = 1.0, 0.6
-
-    def context(self):
-        device = SimpleNamespace(supports=self.told.__contains__, get_info=self.told.__getitem__)
-        super().context()  # may not be allowed to
-        return SimpleNamespace(query_devices=lambda: [device] * len(self.serials))
-
-    def pipeline(self):
-        pipeline = super().pipeline()
-        wait, rng = pipeline.try_wait_for_frames, np.random.default_rng(0)
-
-        def noisy(timeout_ms):
-            arrived, frameset = wait(timeout_ms)
-            if arrived:
-                depth = np.rint(700 + self.noise * rng.standard_normal((480, 848)))
-                depth[rng.random(depth.shape) >= self.filled] = 0
-                image = FakeImage(frameset.get_depth_frame().get_frame_number(), depth.astype("u2"))
-                frameset.get_depth_frame = lambda: image
-            return arrived, frameset
-
-        pipeline.try_wait_for_frames = noisy
-        return pipeline
 
 
 @pytest.fixture(autouse=True)
@@ -72,25 +36,18 @@ def alone(monkeypatch, tmp_path):
 @pytest.fixture
 def plug_in(monkeypatch, tmp_path):
     """Plug in a fake D435 that behaves as the arguments say."""
-    monkeypatch.setattr(librealsense, "USB_DEVICES", tmp_path)
-    monkeypatch.setattr(realsense, "SILENCE_S", 0.05)
-    monkeypatch.setattr(realsense, "_live_cameras", {})
-
-    def plug(**behaviour):
-        rs = PluggedIn(**behaviour)
-        for module in (librealsense, realsense):
-            monkeypatch.setattr(module, "load_librealsense", lambda: rs)
-        return rs
-
-    return plug
+    return partial(plugged_in, monkeypatch, tmp_path)
 
 
 @pytest.fixture
 def quick(monkeypatch):
-    """Without the checks of the computer, and with few frames of the simulated camera."""
-    for name in ("_python", "_packages", "_loading", "_kernel", "_browser", "_results"):
-        monkeypatch.setattr(doctor, name, lambda: iter(()))
-    monkeypatch.setattr(doctor, "LONGEST_TEST_S", 0.2)
+    """Without the checks of the computer, and with few frames of the camera."""
+    monkeypatch.setattr(doctor, "COMPUTER", ())
+    monkeypatch.setattr(doctor, "TEST_FRAMES", 8)
+
+
+def examine(camera="auto"):
+    return list(checks(camera))
 
 
 def line(lines, check):
@@ -100,9 +57,8 @@ def line(lines, check):
     return found[-1]
 
 
-def only(generator):
-    (one,) = generator
-    return one
+def stop(error):
+    raise error
 
 
 # --- the computer ---
@@ -118,27 +74,23 @@ def test_this_computer_with_the_simulated_camera(capsys):
 
 
 @pytest.mark.parametrize(
-    ("attribute", "value", "verdict", "says"),
+    ("owner", "attribute", "value", "verdict", "says"),
     [
-        ("version_info", (3, 10, 4), "problem", "3.10.4 .* too old, want 3.11 or newer"),
-        ("version_info", (3, 15, 0), "note", "newer than what the course was tested with"),
-        ("version_info", (3, 12, 1), "ok", "3.12.1 on"),
-        ("maxsize", 2**31 - 1, "problem", "a 32-bit Python"),
+        (sys, "version_info", (3, 10, 4), "problem", "3.10.4 .* too old, want 3.11 or newer"),
+        (sys, "version_info", (3, 15, 0), "note", "newer than what the course was tested with"),
+        (sys, "version_info", (3, 12, 1), "ok", "3.12.1 on"),
+        (sys, "maxsize", 2**31 - 1, "problem", "a 32-bit Python"),
+        (doctor.platform, "machine", lambda: "x86_64", "problem", "Intel processors"),
     ],
 )
-def test_python(monkeypatch, attribute, value, verdict, says):
-    monkeypatch.setattr(sys, attribute, value)
-    found = only(doctor._python())
+def test_python(monkeypatch, owner, attribute, value, verdict, says):
+    if attribute == "machine":
+        monkeypatch.setattr(sys, "platform", "darwin")
+    monkeypatch.setattr(owner, attribute, value)
+    found = doctor._python()
     assert found.verdict == verdict
     assert re.search(says, found.says)
-    assert ("install Python 3.13" in found.remedy) == (verdict != "ok")
-
-
-def test_an_intel_mac(monkeypatch):
-    monkeypatch.setattr(sys, "platform", "darwin")
-    monkeypatch.setattr(doctor.platform, "machine", lambda: "x86_64")
-    found = only(doctor._python())
-    assert (found.verdict, "a hub" in found.remedy) == ("problem", True)
+    assert ("Python 3.13" in found.remedy or "a hub" in found.remedy) == (verdict != "ok")
 
 
 @pytest.fixture
@@ -158,19 +110,19 @@ def pinned(monkeypatch, tmp_path):
 
 
 def test_packages_as_pinned(pinned):
-    assert only(doctor._packages()) == Line("Packages", "ok", "all 2 as pinned in requirements.txt")
+    assert [*doctor._packages()] == [CheckUp("ok", "all 2 as pinned in requirements.txt")]
 
 
 def test_a_missing_package(pinned):
     del pinned["tomlish"]
-    found = only(doctor._packages())
+    found = next(doctor._packages())
     assert (found.verdict, found.says) == ("problem", "not installed: tomlish")
     assert "pip install -r requirements.txt" in found.remedy
 
 
 def test_another_version_is_a_note_and_one_that_does_not_do_a_problem(pinned):
     pinned["numpy"] = "2.5.1"
-    found = only(doctor._packages())
+    found = next(doctor._packages())
     assert (found.verdict, "numpy 2.5.1 (tested with 2.4.0)" in found.says) == ("note", True)
     pinned["numpy"] = "1.26.0"
     first, _ = doctor._packages()
@@ -180,7 +132,7 @@ def test_another_version_is_a_note_and_one_that_does_not_do_a_problem(pinned):
 
 def test_without_a_requirements_file(pinned, monkeypatch, tmp_path):
     monkeypatch.setattr(doctor, "PINS", tmp_path / "gone.txt")
-    assert only(doctor._packages()).verdict == "note"
+    assert next(doctor._packages()).verdict == "note"
 
 
 def test_every_line_of_the_real_requirements_is_understood():
@@ -198,7 +150,7 @@ def test_a_package_that_does_not_load(monkeypatch):
         return real(name)
 
     monkeypatch.setattr(importlib, "import_module", broken)
-    found = only(doctor._loading())
+    found = doctor._loading()
     assert found.says == "cv2 does not load (libGL.so.1: cannot open shared object file)"
     assert (found.verdict, "course.py lab" in found.remedy) == ("problem", True)
 
@@ -217,7 +169,7 @@ def test_the_kernel(monkeypatch, command, verdict):
 
     spec = SimpleNamespace(argv=[command, "-m", "ipykernel_launcher"], resource_dir="kernels")
     monkeypatch.setattr(kernelspec.KernelSpecManager, "get_kernel_spec", lambda self, name: spec)
-    found = only(doctor._kernel())
+    found = doctor._kernel()
     assert found.verdict == verdict
     assert ("jupyter kernelspec remove python3" in found.remedy) == (verdict == "problem")
 
@@ -225,81 +177,71 @@ def test_the_kernel(monkeypatch, command, verdict):
 def test_no_kernel(monkeypatch):
     from jupyter_client import kernelspec
 
-    def none(self, name):
-        raise kernelspec.NoSuchKernel(name)
-
-    monkeypatch.setattr(kernelspec.KernelSpecManager, "get_kernel_spec", none)
-    found = only(doctor._kernel())
+    missing = partial(stop, kernelspec.NoSuchKernel("python3"))
+    monkeypatch.setattr(kernelspec.KernelSpecManager, "get_kernel_spec", lambda *_: missing())
+    found = doctor._kernel()
     assert (found.verdict, "there is no kernel python3" in found.says) == ("problem", True)
 
 
 def test_browsers(monkeypatch):
-    assert only(doctor._browser()) == Line("Browser", "ok", "firefox opens the notebooks")
-
-    def none():
-        raise webbrowser.Error("could not locate runnable browser")
-
-    monkeypatch.setattr(webbrowser, "get", none)
-    found = only(doctor._browser())
+    assert doctor._browser() == CheckUp("ok", "firefox opens the notebooks")
+    missing = partial(stop, webbrowser.Error("could not locate runnable browser"))
+    monkeypatch.setattr(webbrowser, "get", missing)
+    found = doctor._browser()
     assert (found.verdict, "prints an address" in found.remedy) == ("note", True)
-    monkeypatch.setenv("JUPYTERHUB_SERVICE_PREFIX", "/user/ada/")
-    assert only(doctor._browser()).verdict == "ok"
-
-
-def test_no_screen(monkeypatch):
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.delenv("DISPLAY")
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    found = only(doctor._browser())
-    assert (found.verdict, "ssh -L" in found.remedy) == ("note", True)
+    found = doctor._browser()
+    assert (found.verdict, "no screen" in found.says, "ssh -L" in found.remedy) == (
+        "note", True, True,
+    )  # fmt: skip
+    monkeypatch.setenv("JUPYTERHUB_SERVICE_PREFIX", "/user/ada/")
+    assert doctor._browser().verdict == "ok"
 
 
 def test_results_are_tried_without_leaving_anything(tmp_path):
-    assert only(doctor._results()).verdict == "ok"
+    assert doctor._results().verdict == "ok"
     assert not (tmp_path / "results").exists()
 
 
 def test_results_that_cannot_be_written(monkeypatch, tmp_path):
-    def refuse(dir):
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(tempfile, "TemporaryFile", refuse)
-    found = only(doctor._results())
+    refuse = partial(stop, PermissionError(13, "Permission denied"))
+    with monkeypatch.context() as patch:
+        patch.setattr(tempfile, "TemporaryFile", lambda dir: refuse())
+        found = doctor._results()
     assert (found.verdict, "(Permission denied)" in found.says) == ("problem", True)
     assert "COURSEKIT_RESULTS" in found.remedy
-
-
-def test_results_is_a_file(tmp_path):
-    (tmp_path / "results").write_text("mine", encoding="utf-8")
-    assert only(doctor._results()).verdict == "problem"
+    (tmp_path / "results").write_text("a file", encoding="utf-8")
+    assert doctor._results().verdict == "problem"
 
 
 def test_a_full_disk(monkeypatch):
     monkeypatch.setattr(doctor.shutil, "disk_usage", lambda path: SimpleNamespace(free=2_000_000))
-    found = only(doctor._results())
+    found = doctor._results()
     assert (found.verdict, "only 2 MB" in found.says) == ("problem", True)
 
 
 # --- nothing stops it ---
 
 
-@pytest.mark.parametrize("error", doctor.CONTAINED)
+@pytest.mark.parametrize("error", [ImportError, OSError, RuntimeError, SyntaxError, ValueError])
 def test_what_a_check_raises_becomes_a_line(error):
     def fail():
-        yield Line("Packages", "ok", "so far")
+        yield CheckUp("ok", "so far")
         raise error("broken")
 
-    first, found = doctor._contained("Packages", fail)
-    assert first.says == "so far"
-    assert (found.verdict, "could not be checked" in found.says) == ("problem", True)
+    first, found = doctor._named("Packages", fail)
+    assert (first.check, first.says) == ("Packages", "so far")
+    assert (found.verdict, f"could not be checked ({error.__name__}" in found.says) == (
+        "problem", True,
+    )  # fmt: skip
     assert "course.py lab" in found.remedy
 
 
 def test_a_check_that_fails_does_not_stop_the_others(quick, monkeypatch):
-    def fail():
-        raise OSError("broken")
-
-    monkeypatch.setattr(doctor, "_packages", fail)
+    broken = ("Packages", lambda: stop(OSError("broken")))
+    monkeypatch.setattr(doctor, "COMPUTER", (broken,))
     lines = examine("simulated")
     assert line(lines, "Packages").verdict == "problem"
     assert line(lines, "Camera").verdict == "ok"
@@ -320,25 +262,21 @@ def test_without_numpy_or_any_package_at_all():
     assert "course.py lab" in result.stdout
 
 
-def test_ctrl_c_is_not_contained(quick, monkeypatch):
-    def stop():
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(doctor, "_packages", stop)
+def test_ctrl_c_is_not_contained():
     with pytest.raises(KeyboardInterrupt):
-        examine("simulated")
+        next(doctor._named("Packages", lambda: stop(KeyboardInterrupt())))
 
 
 def test_a_line_as_it_is_printed():
-    assert str(Line("USB", "ok", "fine")) == "ok       USB          fine"
-    long = str(Line("USB", "problem", "slow " * 40, "push it " * 30)).splitlines()
+    assert str(CheckUp("ok", "fine", check="USB")) == "ok       USB          fine"
+    long = str(CheckUp("problem", "slow " * 40, "push it " * 30, check="USB")).splitlines()
     assert all(len(row) <= doctor.WIDTH for row in long)
     assert any(row.strip().startswith("-> push it") for row in long)
 
 
 def test_the_exit_code(quick, monkeypatch, capsys):
     for verdict, code in (("ok", 0), ("note", 0), ("problem", 1)):
-        monkeypatch.setattr(doctor, "checks", lambda camera, v=verdict: [Line("USB", v, "x")])
+        monkeypatch.setattr(doctor, "checks", lambda camera, v=verdict: [CheckUp(v, "x")])
         assert doctor.run() == code
     assert "1 problem: do what stands there" in capsys.readouterr().out
 
@@ -357,18 +295,12 @@ def test_no_camera_is_fine(quick, plug_in, monkeypatch, tmp_path):
     assert any("simulated camera stands in, which is fine" in one.says for one in lines)
     assert line(lines, "Camera").says.startswith("Simulated D435")
     (tmp_path / "99-realsense-libusb.rules").touch()
-    assert only(doctor._udev()).verdict == "ok"
+    assert doctor._udev().verdict == "ok"
 
 
 def test_the_variable_is_named(quick, monkeypatch):
     monkeypatch.setenv("COURSEKIT_CAMERA", "simulated")
     assert "COURSEKIT_CAMERA names 'simulated'" in examine()[0].says
-
-
-@pytest.fixture
-def no_library(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pyrealsense2", None)
-    monkeypatch.setitem(sys.modules, "libusb_package", None)
 
 
 def test_no_driver_is_a_note_unless_a_camera_is_asked_for(quick, no_library):
@@ -380,12 +312,7 @@ def test_no_driver_is_a_note_unless_a_camera_is_asked_for(quick, no_library):
         assert [one.verdict for one in examine(which)] == ["problem"]
 
 
-def test_a_driver_that_does_not_load_is_a_problem(quick, monkeypatch, tmp_path):
-    (tmp_path / "pyrealsense2.py").write_text(
-        "raise ImportError('libusb-1.0.so.0: no such file')", encoding="utf-8"
-    )
-    monkeypatch.delitem(sys.modules, "pyrealsense2", raising=False)
-    monkeypatch.syspath_prepend(tmp_path)
+def test_a_driver_that_does_not_load_is_a_problem(quick, broken_library):
     found = line(examine(), "Driver")
     assert (found.verdict, "libusb-1.0.so.0" in found.says) == ("problem", True)
     assert "--force-reinstall -r requirements-camera.txt" in found.says
@@ -404,39 +331,29 @@ def test_no_permission(quick, plug_in, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("error", "remedy"),
+    ("behaviour", "which", "says"),
     [
-        ("Device or resource busy", "another program uses it: close the RealSense Viewer"),
-        ("Couldn't resolve requests", "USB 3 port with a USB 3 cable"),
-        ("something new", "unplug it, plug it in, try again"),
+        ({"start_error": "Device or resource busy"}, "auto", "close the RealSense Viewer"),
+        ({"start_error": "Couldn't resolve requests"}, "auto", "USB 3 port with a USB 3 cable"),
+        ({"start_error": "something new"}, "auto", "unplug it, plug it in, try again"),
+        ({}, "123", f"there is {SERIAL}"),
+        ({}, "nonsense", "nonsense"),
+        ({}, "gone.db3", "gone.db3"),
     ],
 )
-def test_a_camera_that_does_not_start(quick, plug_in, error, remedy):
-    plug_in(start_error=error)
-    found = examine()[-1]
-    assert (found.check, found.verdict) == ("Camera", "problem")
-    assert remedy in found.says
-
-
-def test_another_serial_number(quick, plug_in):
-    plug_in()
-    found = examine("123")[-1]
-    assert (found.verdict, f"there is {SERIAL}" in found.says) == ("problem", True)
-
-
-@pytest.mark.parametrize("which", ["nonsense", "gone.db3"])
-def test_what_is_no_camera(quick, plug_in, which):
-    plug_in()
+def test_a_camera_that_does_not_open(quick, plug_in, behaviour, which, says):
+    plug_in(**behaviour)
     found = examine(which)[-1]
-    assert (found.check, found.verdict, which in found.says) == ("Camera", "problem", True)
+    assert (found.check, found.verdict, says in found.says) == ("Camera", "problem", True)
 
 
 # --- a camera ---
 
 
 def test_a_camera_in_order(quick, plug_in, monkeypatch):
-    monkeypatch.setattr(doctor, "LONGEST_TEST_S", 60.0)
+    monkeypatch.setattr(doctor, "TEST_FRAMES", 30)
     rs = plug_in()
+    rs.noise = 0.6
     lines = examine()
     assert [one.check for one in lines] == [
         "Driver", "USB", "USB link", "Firmware", "Camera", "Depth unit", "Baseline", "K of depth",
@@ -448,7 +365,7 @@ def test_a_camera_in_order(quick, plug_in, monkeypatch):
     assert line(lines, "Baseline").says == "50.17 mm (usual: 50 mm to 2 %)"
     assert line(lines, "K of depth").says.startswith("fx 426.00, fy 426.25, cx 425.50, cy 237.50 ")
     assert line(lines, "K of colour").says.startswith("fx 613.00, fy 613.25, cx 321.50, cy 237.50")
-    assert line(lines, "Frames").says.startswith("30 in ")
+    assert line(lines, "Frames").says.startswith("30 in 0.97 s, 0 lost")  # on its own clock
     assert "100%" in line(lines, "Filled").says
     assert "for a pixel at 0.70 m, 0.02" in line(lines, "Noise").says
     assert rs.stops == 1  # and it is let go
@@ -489,7 +406,7 @@ def test_unusual_figures(quick, plug_in):
 
 @pytest.mark.parametrize(("fy", "cx"), [(640.0, 319.5), (613.0, 380.0)])
 def test_an_unusual_matrix(fy, cx):
-    found = doctor._matrix("K of colour", Intrinsics(640, 480, 613.0, fy, cx, 239.5))
+    found = doctor._matrix(Intrinsics(640, 480, 613.0, fy, cx, 239.5))
     assert (found.verdict, "restore it" in found.remedy) == ("note", True)
 
 
@@ -499,24 +416,37 @@ def test_an_unusual_matrix(fy, cx):
         (range(31, 61), 0.97, "ok"),
         (range(31, 61), 2.9, "note"),
         (range(31, 91, 2), 1.0, "note"),
-        ([31], 3.1, "note"),
+        ([31], 0.0, "note"),
     ],
 )
 def test_frames_late_or_lost(numbers, seconds, verdict):
-    found = doctor._arrival(list(numbers), seconds, live=True)
+    times_s = np.linspace(5.0, 5.0 + seconds, len(numbers))
+    frames = [SimpleNamespace(number=n, time_s=t) for n, t in zip(numbers, times_s, strict=True)]
+    found = doctor._arrival(frames)
     assert found.verdict == verdict
     assert ("plug the camera in directly" in found.remedy) == (verdict == "note")
 
 
-def test_a_camera_that_falls_silent(quick, plug_in):
-    plug_in(frames=30 + 7)
+def test_a_slow_camera_is_given_three_seconds_of_its_own_clock(quick, plug_in, monkeypatch):
+    """Not of the computer's, which may be busy."""
+    monkeypatch.setattr(doctor, "TEST_FRAMES", 30)
+    rs = plug_in()
+    rs.frames_per_s = 2
+    found = line(examine(), "Frames")
+    assert (found.verdict, found.says[:10]) == ("note", "8 in 3.50 ")
+
+
+@pytest.mark.parametrize("given", [0, 1, 7])
+def test_a_camera_that_falls_silent(quick, plug_in, given):
+    plug_in(frames=30 + given)
     found = line(examine(), "Frames")
     assert (found.verdict, "is it still plugged in" in found.says) == ("problem", True)
 
 
 @pytest.mark.parametrize(("filled", "verdict"), [(0.3, "note"), (0.01, "problem")])
 def test_little_depth(quick, plug_in, filled, verdict):
-    plug_in().filled = filled
+    rs = plug_in()
+    rs.filled, rs.noise = filled, 0.6
     lines = examine()
     assert line(lines, "Filled").verdict == verdict
     assert "clean the front glass" in line(lines, "Filled").remedy
@@ -524,7 +454,6 @@ def test_little_depth(quick, plug_in, filled, verdict):
 
 
 def test_noisy_depth(quick, plug_in, monkeypatch):
-    monkeypatch.setattr(doctor, "LONGEST_TEST_S", 60.0)
     plug_in().noise = 12.0
     found = line(examine(), "Noise")
     assert (found.verdict, "hold everything still" in found.remedy) == ("note", True)
@@ -533,18 +462,13 @@ def test_noisy_depth(quick, plug_in, monkeypatch):
 # --- a recording ---
 
 
-def test_a_recording(quick, tmp_path, monkeypatch):
-    real_library()
-    path = tmp_path / "table.db3"
-    with open_camera("simulated") as camera:
-        camera.record(path, 6)
-    monkeypatch.setattr(doctor, "LONGEST_TEST_S", 60.0)
-    lines = examine(str(path))
+def test_a_recording(quick, tabletop, monkeypatch):
+    lines = examine(str(tabletop))
     assert {one.verdict for one in lines} == {"ok"}, [str(one) for one in lines]
-    assert "recording table.db3" in line(lines, "Camera").says
-    assert line(lines, "Frames").says.startswith("6 read in ")
+    assert "recording tabletop.db3" in line(lines, "Camera").says
+    assert line(lines, "Frames").says.startswith("8 read in ")
     monkeypatch.setattr(doctor, "TEST_FRAMES", 2)
-    assert line(examine(str(path)), "Noise").verdict == "note"
+    assert line(examine(str(tabletop)), "Noise").verdict == "note"
 
 
 def test_a_damaged_recording(quick, plug_in, tmp_path):

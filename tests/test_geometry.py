@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import cv2
 import numpy as np
 import pytest
@@ -43,7 +41,7 @@ def points_in_view(seed: int, n: int = 40) -> np.ndarray:
 # --- against OpenCV ---
 
 
-@settings(max_examples=2000, deadline=None, derandomize=True)
+@settings(max_examples=200, deadline=None, derandomize=True)
 @given(matrices, coefficients, st.integers(0, 10**6))
 def test_project_is_opencvs(K: np.ndarray, dist: np.ndarray, seed: int) -> None:
     points = points_in_view(seed)
@@ -53,7 +51,7 @@ def test_project_is_opencvs(K: np.ndarray, dist: np.ndarray, seed: int) -> None:
     assert np.abs(geometry.project(points, K) - plain[:, 0]).max() < 1e-9
 
 
-@settings(max_examples=1000, deadline=None, derandomize=True)
+@settings(max_examples=150, deadline=None, derandomize=True)
 @given(matrices, coefficients, st.integers(0, 10**6))
 def test_deproject_inverts_and_is_opencvs(K: np.ndarray, dist: np.ndarray, seed: int) -> None:
     points = points_in_view(seed)
@@ -162,6 +160,7 @@ BAD_ARRAYS = {
         ("fx", lambda x: Intrinsics(2, 2, x, 1, 0, 0)),
         ("width", lambda x: Intrinsics(x, 2, 1, 1, 0, 0)),
         ("width", lambda x: geometry.pixel_grid(x, 4)),
+        ("height", lambda x: geometry.pixel_grid(4, -1 if x is None else x)),
         ("fields", Intrinsics.from_dict),
     ],
 )
@@ -170,33 +169,17 @@ def test_bad_input_names_the_argument(name: str, call, bad) -> None:
         call(bad)
 
 
-@pytest.mark.parametrize("bad", ["{", "", "[1", None, 3])
-def test_bad_json(bad) -> None:
-    with pytest.raises(ValueError, match=r"^text: "):
-        Intrinsics.from_json(bad)
-
-
-@pytest.mark.parametrize(
-    "bad",
-    [
-        np.zeros((3, 3)),
-        [[-1, 0, 0], [0, 1, 0], [0, 0, 1]],
-        [[1, 0.1, 0], [0, 1, 0], [0, 0, 1]],
-        [[1, 0, 0], [0, np.nan, 0], [0, 0, 1]],
-        [[1, 0, 0], [0, 1, 0], [0, 0, 2]],
-    ],
-)
-def test_a_matrix_that_is_no_K(bad) -> None:
-    with pytest.raises(ValueError, match=r"^K: "):
-        geometry.project([0, 0, 1], bad)
-    with pytest.raises(ValueError, match=r"^K: "):
-        geometry.deproject([0, 0], 1, bad)
-
-
-@pytest.mark.parametrize("bad", [[0.1], [0, 0, 0], np.zeros(6), [np.nan] * 5, np.inf])
-def test_wrong_number_of_coefficients(bad) -> None:
-    with pytest.raises(ValueError, match=r"^dist: "):
-        geometry.project([0, 0, 1], K, bad)
+def test_a_matrix_that_is_no_K_and_a_wrong_number_of_coefficients() -> None:
+    skewed, unscaled, negative, unknown = np.eye(3), np.diag([1, 1, 2]), np.eye(3), np.eye(3)
+    skewed[0, 1], negative[0, 0], unknown[1, 1] = 0.1, -1, np.nan
+    for bad in (np.zeros((3, 3)), skewed, unscaled, negative, unknown):
+        with pytest.raises(ValueError, match=r"^K: "):
+            geometry.project([0, 0, 1], bad)
+        with pytest.raises(ValueError, match=r"^K: "):
+            geometry.deproject([0, 0], 1, bad)
+    for bad in ([0.1], [0, 0, 0], np.zeros(6), [np.nan] * 5, np.inf):
+        with pytest.raises(ValueError, match=r"^dist: "):
+            geometry.project([0, 0, 1], K, bad)
 
 
 def test_four_coefficients_mean_k3_is_zero() -> None:
@@ -205,7 +188,7 @@ def test_four_coefficients_mean_k3_is_zero() -> None:
 
 
 def test_depths_that_do_not_fit_the_pixels() -> None:
-    with pytest.raises(ValueError, match=r"^depth_m: got shape \(4,\)"):
+    with pytest.raises(ValueError, match=r"^depth_m: got \(4,\)"):
         geometry.deproject(np.zeros((3, 2)), np.ones(4), K)
 
 
@@ -214,8 +197,8 @@ def test_depths_that_do_not_fit_the_pixels() -> None:
 
 def test_intrinsics_round_trip() -> None:
     camera = Intrinsics(640, 480, 612.5, 598.0, 331.4, 236.8, "brown_conrady", tuple(DIST))
-    assert Intrinsics.from_json(camera.to_json()) == camera
-    assert json.loads(camera.to_json())["coeffs"] == DIST.tolist()
+    assert Intrinsics.from_dict(camera.to_dict()) == camera
+    assert camera.to_dict()["coeffs"] == DIST.tolist()
     assert np.array_equal(camera.K, K)
     assert np.array_equal(camera.dist, DIST)
     assert LESSON.dist is None
@@ -267,9 +250,6 @@ def test_deproject_image_is_deproject(dtype: type, dist: np.ndarray | None) -> N
     assert points.dtype == np.float32
     assert np.array_equal(np.isnan(points), np.isnan(wanted))
     assert np.nanmax(np.abs(points - wanted)) < 1e-6  # 1 µm
-    again = np.empty_like(points)
-    assert geometry.deproject_image(depth, camera, 0.0001, out=again) is again
-    assert np.array_equal(again, points, equal_nan=True)
 
 
 def test_deproject_image_invalid_floats_are_nan() -> None:
@@ -279,26 +259,18 @@ def test_deproject_image_invalid_floats_are_nan() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "call"),
+    ("name", "given"),
     [
-        ("depth", lambda: geometry.deproject_image(np.zeros((3, 3), np.uint16), LESSON)),
-        ("depth", lambda: geometry.deproject_image(np.zeros((480, 848), np.int32), LESSON)),
-        ("depth", lambda: geometry.deproject_image(np.zeros((480, 848), complex), LESSON)),
-        ("intrinsics", lambda: geometry.deproject_image(np.zeros((480, 848)), K)),
-        (
-            "depth_scale_m",
-            lambda: geometry.deproject_image(np.zeros((480, 848), np.uint16), LESSON, 0),
-        ),
-        (
-            "out",
-            lambda: geometry.deproject_image(np.zeros((480, 848)), LESSON, out=np.zeros((2, 2))),
-        ),
-        ("height", lambda: geometry.pixel_grid(3, -1)),
+        ("depth", (np.zeros((3, 3), np.uint16), LESSON)),
+        ("depth", (np.zeros((480, 848), np.int32), LESSON)),
+        ("depth", (np.zeros((480, 848), complex), LESSON)),
+        ("intrinsics", (np.zeros((480, 848)), K)),
+        ("depth_scale_m", (np.zeros((480, 848), np.uint16), LESSON, 0)),
     ],
 )
-def test_bad_images(name: str, call) -> None:
-    with pytest.raises(ValueError, match=f"^{name}: "):
-        call()
+def test_bad_images(name: str, given: tuple) -> None:
+    with pytest.raises(ValueError, match=f"^{name}: got"):
+        geometry.deproject_image(*given)
 
 
 def test_aligned_depth_is_in_the_colour_frame() -> None:

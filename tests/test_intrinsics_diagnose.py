@@ -23,6 +23,7 @@ from coursekit.intrinsics.causes import Calibration, Corners, Linear
 from coursekit.intrinsics.diagnosis import blur_lengths_px, depth_scale, diagnose, stored_power
 from coursekit.intrinsics.fit import calibrate
 from coursekit.simulation.corner_sessions import Effects, Truth, corner_session
+from tools import make_data
 
 NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 FIRST_SEED = 100_000
@@ -103,15 +104,7 @@ def test_the_stored_power_is_what_is_measured(cause: str) -> None:
     assert (np.diff(named) >= -10).all()
     assert named[-1] >= 95
     middle = int(np.argmin(np.abs(named - 50)))
-    effects = {
-        "bowed_board": Effects(bow_m=1e-3 * sizes[middle]),
-        "focus_drift": Effects(focus_drift=0.01 * sizes[middle]),
-        "rolling_shutter": Effects(readout_s=0.02, speed_m_s=sizes[middle]),
-    }
-    found = 0
-    for seed in range(200, 200 + count):
-        detections, _ = corner_session(CHARUCO, LENS, seed, effects=effects[cause])
-        found += cause in diagnose(detections, CHARUCO).names
+    found = make_data.times_named(cause, sizes[middle], range(200, 200 + count))
     low, high = binom.interval(0.999, count, named[middle] / 100)
     assert low - 3 <= found <= high + 3 if NIGHTLY else low <= found <= high
 

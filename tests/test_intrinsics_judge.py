@@ -1,4 +1,4 @@
-"""Judging a fit: coverage, tilts, verdict, halves, held-out views, the factory's K, bow, next view.
+"""Judging a fit: coverage, tilts, verdict, halves, the factory's K, bow.
 
 COURSEKIT_NIGHTLY=1 takes more sessions.
 """
@@ -50,7 +50,7 @@ def test_coverage_counts_cells_and_margins() -> None:
     assert seen.margins == pytest.approx((0.1, 0.1, 0.1, 0.3))
     assert seen.reach == pytest.approx(math.hypot(256, 192) / 400)
     assert seen.empty_sides == ("bottom",)
-    with pytest.raises(ValueError, match="detections: there are none"):
+    with pytest.raises(ValueError, match="detections: got 0, want at least one view"):
         intrinsics.coverage([])
 
 
@@ -72,7 +72,7 @@ def test_tilts_are_the_angles_the_boards_were_turned_by(good) -> None:
 
 # --- the verdict ---
 
-SEEDS = range(100, 130) if NIGHTLY else range(100, 104)
+SEEDS = range(100, 130) if NIGHTLY else range(100, 103)
 FLAT, INNER = Effects(max_tilt_deg=3.0), Effects(inner_only=0.15)
 
 
@@ -99,8 +99,6 @@ def test_verdict_does_not_judge_by_rms() -> None:
     verdicts = [fit(CHARUCO, seed).verdict() for seed in SEEDS]
     assert sum(text.startswith("Good: ") for text in verdicts) >= 0.75 * len(verdicts)
     assert not any(text.startswith("Not") for text in verdicts)
-    flat = fit(CHARUCO, 100, effects=FLAT)
-    assert flat.rms_px == pytest.approx(fit(CHARUCO, 100).rms_px, rel=0.05)
     few = fit(CHARUCO, 3, views=4).verdict()
     assert "4 views are few" in few
 
@@ -108,24 +106,18 @@ def test_verdict_does_not_judge_by_rms() -> None:
 # --- two halves ---
 
 
-def test_p_values_of_healthy_halves_are_uniform() -> None:
-    p_values = []
-    for seed in range(7000, 7000 + (500 if NIGHTLY else 40)):
+def test_halves_of_healthy_sessions_differ_as_they_say() -> None:
+    """P-values are uniform, and differences are as large as their stated deviations."""
+    found = []
+    for seed in range(7000, 7000 + (500 if NIGHTLY else 30)):
         detections, _ = corner_session(CHARUCO, LENS, seed)
-        p_values.append(intrinsics.halves(detections, CHARUCO, shape=(2, 2)).p_value)
+        found.append(intrinsics.halves(detections, CHARUCO, range_m=0.6, shape=(5, 5)))
+    p_values = np.array([both.p_value for both in found])
     for level in (0.1, 0.5):
-        share = np.mean(np.array(p_values) < level)
-        assert abs(share - level) < 3.5 * math.sqrt(level * (1 - level) / len(p_values))
-
-
-def test_difference_of_halves_is_as_large_as_it_says() -> None:
-    lengths, expected = [], []
-    for seed in range(7600, 7600 + (300 if NIGHTLY else 25)):
-        detections, _ = corner_session(CHARUCO, LENS, seed)
-        both = intrinsics.halves(detections, CHARUCO, range_m=0.6, shape=(5, 5))
-        lengths.append(both.length_px)
-        expected.append(both.expected_px)
+        share = np.mean(p_values < level)
+        assert abs(share - level) < 3.5 * math.sqrt(level * (1 - level) / len(found))
     # the length has two directions, the expected sigma is of the worse one
+    lengths, expected = ([getattr(b, k) for b in found] for k in ("length_px", "expected_px"))
     ratio = np.sqrt(np.mean(np.square(lengths), axis=0) / np.mean(np.square(expected), axis=0))
     assert 0.8 < ratio.min() < ratio.max() < 1.7
     assert 0.95 < np.median(ratio) < 1.45
@@ -162,26 +154,6 @@ def test_difference_takes_out_a_motion_of_the_frame_and_no_more() -> None:
     assert np.linalg.norm(difference_px(LENS, bent, grid, 0.5), axis=1).max() > 0.3
 
 
-# --- held out ---
-
-
-def test_held_out_views_prove_little(good) -> None:
-    detections = good.detections
-    held = intrinsics.held_out(detections, CHARUCO)
-    assert held.fitted_rms_px == good.rms_px
-    assert good.rms_px < held.rms_px < 1.1 * good.rms_px
-    assert held.per_view_rms_px.shape == (28,)
-    corners = np.array([len(d) for d in detections])
-    mean = (corners * held.per_view_rms_px**2).sum() / corners.sum()
-    assert held.rms_px**2 == pytest.approx(mean)
-    flat, _ = corner_session(CHARUCO, LENS, 1, effects=FLAT)
-    useless = intrinsics.held_out(flat, CHARUCO)
-    assert useless.rms_px == pytest.approx(held.rms_px, rel=0.1)  # and f is unknown by 20 %
-    assert "This proves little" in repr(useless)
-    with pytest.raises(ValueError, match="folds: got 1, want 2 to 28"):
-        intrinsics.held_out(detections, CHARUCO, folds=1)
-
-
 # --- the factory's K ---
 
 
@@ -198,7 +170,7 @@ def test_comparison_with_the_truth_and_with_another_camera(good) -> None:
     expected = np.linalg.norm(own) * (8 / 620)
     assert other.shift_m[0, 0] == pytest.approx(expected, abs=0.0015)
     assert max(map(len, repr(other).splitlines())) <= 92
-    with pytest.raises(ValueError, match=r"factory: made for \(848, 480\) px"):
+    with pytest.raises(ValueError, match=r"factory: got \(848, 480\), want the fit's size"):
         intrinsics.compare(good, Intrinsics(848, 480, 600, 600, 424, 240))
 
 

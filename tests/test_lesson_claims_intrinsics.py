@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import replace
+from functools import cache
 
 import cv2
 import numpy as np
@@ -32,6 +33,7 @@ CHARUCO = Board("charuco", (9, 6), 0.025)
 CHECKERBOARD = Board("checkerboard", (10, 7), 0.025)  # 9 x 6 inner corners
 
 
+@cache
 def fits(board: Board, seeds: range = SEEDS, **session) -> list[intrinsics.IntrinsicsResult]:
     return [
         intrinsics.calibrate(corner_session(board, LENS, seed, **session)[0], board)

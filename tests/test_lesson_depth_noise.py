@@ -4,26 +4,15 @@ from __future__ import annotations
 
 import math
 import re
-from statistics import mean, median
+from statistics import median
 
 import numpy as np
 import pytest
-from test_lessons import own_results  # noqa: F401
 
 from coursekit import stereo
-from coursekit.lessons.checkpoints import Choice
-from coursekit.lessons.depth_noise import (
-    CHECKPOINTS,
-    DEPTH_NOISE,
-    EXERCISES,
-    IMAGE,
-    OBJECTIVES,
-    ROBUST_DEPTH,
-)
+from coursekit.lessons import CHECKPOINTS
+from coursekit.lessons.depth_noise import DEPTH_NOISE, IMAGE, ROBUST_DEPTH
 from tools import build_notebooks
-
-BY_NAME = {c.name.partition(".")[2]: c for c in CHECKPOINTS}
-
 
 # --- depth_noise ---
 
@@ -222,7 +211,7 @@ def test_no_printed_line_is_longer_than_a_page() -> None:
     assert [line for line in lines if len(line) > 100] == []
 
 
-# --- checkpoints and objectives ---
+# --- checkpoints ---
 
 
 def test_the_numbers_of_the_checkpoints() -> None:
@@ -230,21 +219,21 @@ def test_the_numbers_of_the_checkpoints() -> None:
     step = 0.0006 * 447 * 0.05 / 0.4**2  # px that make 0.6 mm at 0.4 m
     d = 447 * 0.05 / 0.8
     noise = 447 * 0.05 * (1 / (d - step / 2) - 1 / (d + step / 2))
-    assert BY_NAME["twice_as_far"].value == pytest.approx(1000 * noise, rel=1e-4)
+    assert CHECKPOINTS["depth_noise.twice_as_far"].value == pytest.approx(1000 * noise, rel=1e-4)
 
     law = DEPTH_NOISE.model()
     ratio = law(0.4, 447, 0.018, 0.08) / law(0.4, 447, 0.050, 0.08)
-    assert BY_NAME["short_baseline"].value == pytest.approx(ratio)
-    assert BY_NAME["short_baseline"].value == pytest.approx(2.78, abs=0.005)
+    assert CHECKPOINTS["depth_noise.short_baseline"].value == pytest.approx(ratio)
+    assert CHECKPOINTS["depth_noise.short_baseline"].value == pytest.approx(2.78, abs=0.005)
     assert 1000 * law(0.4, 447, 0.018, 0.08) == pytest.approx(1.59, abs=0.005)
 
-    limit = BY_NAME["minimum_range"].value
+    limit = CHECKPOINTS["depth_noise.minimum_range"].value
     left, right = (431.1 * X / limit for X in (0.0, -0.05017))
     assert left - right == pytest.approx(126)
     assert limit == pytest.approx(0.172, abs=0.0005)
     slips = [126 * 0.05017 / 431.1, 126 / 431.1 / 0.05017, 431.1 * 0.05017, 0.05017, 431.1 / 126]
     slips.append(447 * 0.05 / 126)
-    classics = [c.value for c in BY_NAME["minimum_range"].classics]
+    classics = [c.value for c in CHECKPOINTS["depth_noise.minimum_range"].classics]
     assert classics == pytest.approx(slips, rel=0.01)
 
 
@@ -278,16 +267,3 @@ def test_what_the_texts_state() -> None:
     # a baseline that is 10 % too long
     d = 447 * 0.05 / np.array([0.3, 0.45, 2.0])
     np.testing.assert_allclose(447 * 0.055 / d, 1.1 * np.array([0.3, 0.45, 2.0]))
-
-
-def test_no_option_is_given_away_by_its_length() -> None:
-    """The right one is not the longest in more than half of the choices."""
-    choices = [c for c in CHECKPOINTS if isinstance(c, Choice)]
-    longest = [max(c.options, key=lambda o: len(o.text)).right for c in choices]
-    assert mean(longest) <= 0.5
-
-
-def test_objectives_cover_every_checkpoint_and_exercise() -> None:
-    named = [n for o in OBJECTIVES for n in o.names]
-    assert sorted(named) == sorted([c.name for c in CHECKPOINTS] + [e.name for e in EXERCISES])
-    assert len(CHECKPOINTS) == 8

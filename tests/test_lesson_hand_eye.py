@@ -8,10 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import coursekit as ck
+from coursekit.lessons import CHECKPOINTS
 from coursekit.lessons import hand_eye as lesson
 from coursekit.simulation.arm_sessions import HandEyeMistakes, hand_eye_session
-
-BY_NAME = {c.name.partition(".")[2]: c for c in lesson.CHECKPOINTS}
 
 
 def pairs_of(session):
@@ -34,7 +33,7 @@ def test_the_right_option_is_the_eye_to_hand_equation() -> None:
         as_before = np.linalg.inv(T_j) @ T_i
         assert pytest.approx(right @ truth.X, abs=1e-6) == truth.X @ B
         assert np.abs(truth.X @ B - as_before @ truth.X).max() > 0.01
-    options = BY_NAME["eye_to_hand"].lettered()
+    options = CHECKPOINTS["hand_eye.eye_to_hand"].lettered()
     assert options["B"].right
     assert "T_base_gripper(j) inverse(T_base_gripper(i))" in options["B"].text
 
@@ -62,7 +61,7 @@ def test_inverted_poses_leave_centimetres_and_are_not_the_inverse() -> None:
     inverse = np.linalg.inv(truth.X)
     for X in (truth.X, inverse):
         assert np.linalg.norm(result.X[:3, 3] - X[:3, 3]) > 0.02
-    assert BY_NAME["inverted_poses"].lettered()["B"].right
+    assert CHECKPOINTS["hand_eye.inverted_poses"].lettered()["B"].right
 
 
 def test_the_grid_fixes_the_rotation_and_leaves_the_translation_free() -> None:
@@ -82,7 +81,7 @@ def test_the_grid_fixes_the_rotation_and_leaves_the_translation_free() -> None:
 
 def test_the_lever_is_what_a_rotation_does() -> None:
     turned = Rotation.from_euler("y", 0.3, degrees=True).apply([0, 0, 0.4])
-    assert BY_NAME["lever"].value == pytest.approx(
+    assert CHECKPOINTS["hand_eye.lever"].value == pytest.approx(
         1000 * np.linalg.norm(turned - [0, 0, 0.4]), 1e-4
     )
 

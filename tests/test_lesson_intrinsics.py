@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 import coursekit as ck
 from coursekit.geometry import Intrinsics, make_transform
 from coursekit.intrinsics.derivatives import project_with_derivatives, twist_columns
+from coursekit.lessons import CHECKPOINTS
 from coursekit.lessons import intrinsics as lesson
 from coursekit.plots import intrinsics as figures
 from coursekit.simulation.corner_sessions import Effects, corner_session
@@ -51,7 +52,7 @@ def test_one_view_has_eight_numbers_to_give_and_two_are_enough() -> None:
     views = [tilted(30, 5, 0.5), tilted(-10, 35, 0.45)]
     assert rank(jacobian(views[:1])) == 8 < 4 + 6
     assert rank(jacobian(views)) == 4 + 12
-    assert lesson.CHECKPOINTS[0].value == 2
+    assert CHECKPOINTS["intrinsics.two_views"].value == 2
 
 
 def test_square_on_leaves_f_and_the_distances_free() -> None:

@@ -16,7 +16,7 @@ from coursekit.geometry import Intrinsics
 from coursekit.hand_eye import error_study
 from coursekit.intrinsics import calibrate, compare, stored_power
 from coursekit.plots import depth_noise, error_budget, hand_eye, intrinsics, pinhole
-from coursekit.plots.interactive import label
+from coursekit.plots.style import label
 from coursekit.simulation import (
     Effects,
     corner_session,
@@ -29,7 +29,7 @@ D435 = specifications.device("D435").unit
 LENSES = {n: specifications.lens(n).intrinsics for n in ("opencv_left", "d405_color")}
 
 
-def all_figures() -> dict[str, plots.LessonFigure]:
+def pinhole_figures() -> dict[str, plots.LessonFigure]:
     depth = np.full((480, 848), 0.5, np.float32)
     depth[:5] = 0
     color = np.zeros((480, 640, 3), np.uint8)
@@ -47,24 +47,47 @@ def all_figures() -> dict[str, plots.LessonFigure]:
     }
 
 
-FIGURES = all_figures()
+@pytest.fixture(scope="module")
+def figures() -> dict[str, plots.LessonFigure]:
+    """Every figure of the notebooks, by its function's name."""
+    return {
+        **pinhole_figures(),
+        **depth_noise_figures(),
+        **intrinsics_figures(),
+        **hand_eye_figures(),
+        **error_budget_figures(),
+    }
 
 
-def check_labels_and_words(fig: plots.LessonFigure) -> None:
-    assert len(fig.alt) > 40
-    bundle, metadata = fig._repr_mimebundle_()
+def test_every_axis_has_a_label_and_every_figure_words(figures) -> None:
+    for name, fig in figures.items():
+        assert len(fig.alt) > 40, name
+        for ax in fig.axes:
+            if ax.get_visible() and ax.get_label() != "<colorbar>":
+                assert "(" in ax.get_xlabel(), f"{name}: no unit in {ax.get_xlabel()!r}"
+                shared = ax.get_shared_y_axes().get_siblings(ax)
+                assert any(a.get_ylabel() for a in shared) or not ax.get_yticks().size, name
+
+
+@pytest.mark.parametrize("name", ["pixel_grid", "displacement", "noise_law", "coverage", "bars"])
+def test_a_notebook_gets_a_picture_and_its_words(name: str, figures) -> None:
+    """Some of them here; the notebooks' own tests draw every one."""
+    bundle, metadata = figures[name]._repr_mimebundle_()
     assert base64.b64decode(bundle["image/png"]).startswith(b"\x89PNG")
-    assert metadata["image/png"]["alt"] == bundle["text/plain"] == fig.alt
-    for ax in fig.axes:
-        if ax.get_visible() and ax.get_label() != "<colorbar>":
-            assert "(" in ax.get_xlabel(), f"no unit in the x label {ax.get_xlabel()!r}"
-            shared = ax.get_shared_y_axes().get_siblings(ax)
-            assert any(a.get_ylabel() for a in shared) or not ax.get_yticks().size
+    assert metadata["image/png"]["alt"] == bundle["text/plain"] == figures[name].alt
 
 
-@pytest.mark.parametrize("name", FIGURES)
-def test_every_axis_has_a_label_and_every_figure_words(name: str) -> None:
-    check_labels_and_words(FIGURES[name])
+def test_there_is_a_figure_of_every_function(figures) -> None:
+    """That a module of `plots` calls public and that returns a figure."""
+    drawing = {
+        name
+        for module in (pinhole, depth_noise, intrinsics, hand_eye, error_budget)
+        for name, function in vars(module).items()
+        if getattr(function, "__module__", "") == module.__name__ and name[0] != "_"
+        if function.__annotations__["return"] == "LessonFigure"
+    }
+    assert drawing == {name.partition(" ")[0] for name in figures}
+    assert len(drawing) == 38
 
 
 def test_similar_triangles_shows_f_x_over_z() -> None:
@@ -75,7 +98,7 @@ def test_similar_triangles_shows_f_x_over_z() -> None:
     assert "0.500 mm" in sensor.get_title()
 
 
-def test_displacement_is_opencvs() -> None:
+def test_displacement_is_opencvs(figures) -> None:
     import cv2
 
     lens = LENSES["opencv_left"]
@@ -85,7 +108,7 @@ def test_displacement_is_opencvs() -> None:
     assert size[0, 0] == pytest.approx(np.hypot(*bent), abs=1e-9)
     edge, corner = pinhole.edge_and_corner(size)
     assert (round(edge, 1), round(corner, 1)) == (33.7, 51.6)
-    assert "33.7 px at an edge, 51.6 px in a corner" in FIGURES["displacement"].alt
+    assert "33.7 px at an edge, 51.6 px in a corner" in figures["displacement"].alt
 
 
 def test_brown_conrady_is_worth_what_the_lesson_says() -> None:
@@ -110,13 +133,13 @@ def test_entries_of_K_moves_the_wire_frame_as_the_equation_says() -> None:
     assert shift == pytest.approx(20.0)
 
 
-def test_field_of_view_in_millimetres() -> None:
+def test_field_of_view_in_millimetres(figures) -> None:
     width = 1000 * 0.45 * 848 / D435.depth.fx
-    assert f"{width:.0f} mm wide" in FIGURES["field_of_view"].alt
+    assert f"{width:.0f} mm wide" in figures["field_of_view"].alt
 
 
-def test_point_cloud_leaves_invalid_points_out() -> None:
-    assert f"{475 * 848} points" in FIGURES["point_cloud"].alt
+def test_point_cloud_leaves_invalid_points_out(figures) -> None:
+    assert f"{475 * 848} points" in figures["point_cloud"].alt
 
 
 def test_point_cloud_shows_what_is_near_from_the_side_if_there_is_anything() -> None:
@@ -213,22 +236,10 @@ def depth_noise_figures() -> dict[str, plots.LessonFigure]:
     }  # fmt: skip
 
 
-DEPTH_NOISE_FIGURES = depth_noise_figures()
-
-
-@pytest.mark.parametrize("name", DEPTH_NOISE_FIGURES)
-def test_depth_noise_figures_have_labels_and_words(name: str) -> None:
-    check_labels_and_words(DEPTH_NOISE_FIGURES[name])
-
-
-def test_technologies_at_one_and_two_metres() -> None:
+def test_technologies_at_one_and_two_metres(figures) -> None:
     """Claims D2 and D10: 3.6 and 14.3 mm for stereo, Z^2 for both triangulating cameras."""
-    assert (
-        "active stereo 3.6 mm at 1 m and 14.3 mm at 2 m" in DEPTH_NOISE_FIGURES["technologies"].alt
-    )
-    stereo, light, flight = (
-        line.get_ydata() for line in DEPTH_NOISE_FIGURES["technologies"].axes[0].lines
-    )
+    assert "active stereo 3.6 mm at 1 m and 14.3 mm at 2 m" in figures["technologies"].alt
+    stereo, light, flight = (line.get_ydata() for line in figures["technologies"].axes[0].lines)
     ratio = (depth_noise.RANGE_M[-1] / depth_noise.RANGE_M[0]) ** 2
     assert stereo[-1] / stereo[0] == pytest.approx(ratio)
     assert light[-1] / light[0] == pytest.approx(ratio)
@@ -244,6 +255,7 @@ def test_reciprocal_is_the_derivative() -> None:
 # --- notebook 03 ---
 
 BOARD = boards.Board("charuco", (9, 6), 0.025)
+SESSION = specifications.DATA / "intrinsics_session"
 
 
 def toy(tilt_deg: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -261,10 +273,11 @@ def intrinsics_figures() -> dict[str, plots.LessonFigure]:
     flat, _ = corner_session(BOARD, D435.color, seed=1, views=10, effects=Effects(max_tilt_deg=8))
     two = {"P": calibrate(flat, BOARD), "Q": calibrate(found, BOARD)}
     X, Y, seen = toy(30)
+    shipped = [SESSION / f"view_0{n}.jpg" for n in (0, 1)]
     return {
         "best_fits": intrinsics.best_fits(X, Y, {"30 deg": seen}, 600.0),
         "board": intrinsics.board(BOARD),
-        "views": intrinsics.views(specifications.DATA / "intrinsics_session", SHIPPED),
+        "views": intrinsics.views(SESSION, boards.detect_all(shipped, BOARD, False)),
         "coverage": intrinsics.coverage(two["Q"]),
         "residuals": intrinsics.residuals(two["Q"]),
         "uncertainty": intrinsics.uncertainty(two, 0.45),
@@ -274,17 +287,6 @@ def intrinsics_figures() -> dict[str, plots.LessonFigure]:
         "power": intrinsics.power(stored_power()),
         "difference": intrinsics.difference(compare(two["Q"], D435.color)),
     }
-
-
-SHIPPED = boards.detect_all(
-    [specifications.DATA / "intrinsics_session" / f"view_0{n}.jpg" for n in (0, 1)], BOARD, False
-)
-INTRINSICS_FIGURES = intrinsics_figures()
-
-
-@pytest.mark.parametrize("name", INTRINSICS_FIGURES)
-def test_intrinsics_figures_have_labels_and_words(name: str) -> None:
-    check_labels_and_words(INTRINSICS_FIGURES[name])
 
 
 def test_square_on_every_focal_length_fits_and_tilted_only_one() -> None:
@@ -307,8 +309,8 @@ def test_outlines_are_opencvs() -> None:
     assert intrinsics.outlines(result)[3] == pytest.approx(seen[:, 0], abs=1e-6)
 
 
-def test_maps_of_two_sessions_share_their_scale() -> None:
-    axes = INTRINSICS_FIGURES["uncertainty"].axes
+def test_maps_of_two_sessions_share_their_scale(figures) -> None:
+    axes = figures["uncertainty"].axes
     limits = [ax.collections[0].get_clim() for ax in axes[:2]]
     assert limits[0] == limits[1]
 
@@ -334,26 +336,16 @@ def hand_eye_figures() -> dict[str, plots.LessonFigure]:
     }
 
 
-HAND_EYE_FIGURES = hand_eye_figures()
-
-
-@pytest.mark.parametrize("name", HAND_EYE_FIGURES)
-def test_hand_eye_figures_have_labels_and_words(name: str) -> None:
-    check_labels_and_words(HAND_EYE_FIGURES[name])
-
-
-def test_the_rig_is_drawn_where_forward_kinematics_puts_it() -> None:
+def test_the_rig_is_drawn_where_forward_kinematics_puts_it(figures) -> None:
     q = np.array([0.0, 0.7, 1.3, 0.7, 0.0, 0.0])
     rig = default_setup("eye_in_hand")
-    chain = HAND_EYE_FIGURES["mounts"].axes[0].lines[0]
+    chain = figures["mounts"].axes[0].lines[0]
     x, z = chain.get_xdata()[-1], chain.get_ydata()[-1]
     assert (x, z) == pytest.approx(tuple(rig.arm.forward(q)[[0, 2], 3]))
 
 
-def test_gaps_say_their_root_mean_squares() -> None:
-    assert "rms 1.58 mm over 2 fitted poses, 2.00 mm over 1 held out" in (
-        HAND_EYE_FIGURES["gaps"].alt
-    )
+def test_gaps_say_their_root_mean_squares(figures) -> None:
+    assert "rms 1.58 mm over 2 fitted poses, 2.00 mm over 1 held out" in (figures["gaps"].alt)
 
 
 # --- notebook 05 ---
@@ -373,14 +365,6 @@ def error_budget_figures() -> dict[str, plots.LessonFigure]:
         "distances": error_budget.distances(budget.best_distance(table)),
         "misses": error_budget.misses(missed),
     }
-
-
-ERROR_BUDGET_FIGURES = error_budget_figures()
-
-
-@pytest.mark.parametrize("name", ERROR_BUDGET_FIGURES)
-def test_error_budget_figures_have_labels_and_words(name: str) -> None:
-    check_labels_and_words(ERROR_BUDGET_FIGURES[name])
 
 
 def test_ellipse_and_ellipsoid_hold_ninety_five_of_a_hundred_grasps() -> None:

@@ -102,6 +102,13 @@ def keywords(call: ast.Call) -> dict[str | None, ast.expr]:
     return {keyword.arg: keyword.value for keyword in call.keywords}
 
 
+def cases(faults: str, fine: str) -> list[tuple[str, bool]]:
+    """Pieces of code, with " | " between them, and whether each is a fault."""
+    return [(code, True) for code in faults.split(" | ")] + [
+        (code, False) for code in fine.split(" | ")
+    ]
+
+
 # --- encodings ---
 
 
@@ -132,23 +139,12 @@ def test_text_is_read_and_written_as_utf_8() -> None:
 
 @pytest.mark.parametrize(
     ("code", "fault"),
-    [
-        ("open('a')", True),
-        ("open('a', 'w')", True),
-        ("p.open()", True),
-        ("p.open('a+')", True),
-        ("p.read_text()", True),
-        ("p.read_text(errors='replace')", True),
-        ("p.write_text('x')", True),
-        ("NamedTemporaryFile(mode='w')", True),
-        ("open('a', 'rb')", False),
-        ("open('a', encoding='utf-8')", False),
-        ("p.open(mode='wb')", False),
-        ("p.read_text('utf-8')", False),
-        ("p.write_text('x', 'utf-8')", False),
-        ("sensor.open(profiles)", False),
-        ("TemporaryFile(dir=d)", False),
-    ],
+    cases(
+        "open('a') | open('a', 'w') | p.open() | p.open('a+') | p.read_text() | "
+        "p.read_text(errors='replace') | p.write_text('x') | NamedTemporaryFile(mode='w')",
+        "open('a', 'rb') | open('a', encoding='utf-8') | p.open(mode='wb') | p.read_text('utf-8') "
+        "| p.write_text('x', 'utf-8') | sensor.open(profiles) | TemporaryFile(dir=d)",
+    ),
 )
 def test_the_search_for_encodings_finds_what_it_should(code: str, fault: bool) -> None:
     assert without_encoding(ast.parse(code, mode="eval").body) is fault
@@ -191,14 +187,10 @@ def test_paths_are_put_together_by_pathlib() -> None:
 
 @pytest.mark.parametrize(
     ("code", "fault"),
-    [
-        ("os.path.join(a, b)", True),
-        ("folder + '/b.csv'", True),
-        (r"Path('data\\b.csv')", True),
-        (r"folder / 'data\\b.csv'", True),
-        ("folder / 'data' / 'b.csv'", False),
-        ("a + 'b'", False),
-    ],
+    cases(
+        r"os.path.join(a, b) | folder + '/b.csv' | Path('data\\b.csv') | folder / 'data\\b.csv'",
+        "folder / 'data' / 'b.csv' | a + 'b'",
+    ),
 )
 def test_the_search_for_glue_finds_what_it_should(code: str, fault: bool) -> None:
     assert glued(ast.parse(code, mode="eval").body) is fault

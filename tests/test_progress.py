@@ -9,7 +9,7 @@ import pytest
 
 import coursekit as ck
 from coursekit import lessons, results
-from coursekit.lessons.checkpoints import Choice
+from coursekit.lessons.questions import Choice
 from coursekit.results import Quantity
 
 CAMERA = SimpleNamespace(source="live", name="D435 on the bench")
@@ -27,14 +27,14 @@ def right_letter(choice: Choice) -> str:
 def test_a_beginner() -> None:
     now = ck.progress()
     assert [s.notebook for s in now.standings][0::4] == ["01_pinhole", "05_error_budget"]
-    assert sum(s.checkpoints for s in now.standings) == len(lessons.checkpoints())
-    assert sum(s.exercises[1] for s in now.standings) == len(lessons.exercises())
+    assert sum(s.checkpoints for s in now.standings) == len(lessons.CHECKPOINTS)
+    assert sum(s.exercises[1] for s in now.standings) == len(lessons.EXERCISES)
     assert now.next.startswith("Begin with notebook 01_pinhole")
     assert "0 of" in repr(now)
 
 
 def test_first_tries_later_ones_and_results() -> None:
-    choices = [c for n, c in lessons.checkpoints().items() if isinstance(c, Choice)]
+    choices = [c for n, c in lessons.CHECKPOINTS.items() if isinstance(c, Choice)]
     one, two, three = choices[:3]
     one.answer(right_letter(one))
     two.answer(next(letter for letter in "ABC" if letter != right_letter(two)))

@@ -17,7 +17,6 @@ from coursekit.simulation.corner_sessions import (
     corner_session,
     rolling_shutter,
 )
-from coursekit.simulation.diagnosis_power import power
 
 LENS = Intrinsics(
     640, 480, 612.0, 610.0, 322.0, 238.0, "brown_conrady", (-0.12, 0.08, 0.001, -0.0008, 0.02)
@@ -212,5 +211,3 @@ def test_sessions_that_cannot_be_are_refused() -> None:
         corner_session(CHARUCO, LENS, seed=0, noise_px=-1)
     with pytest.raises(ValueError, match=r"board: 3\.000 x 2\.100 m does not fit"):
         corner_session(Board("checkerboard", (10, 7), 0.3), LENS, seed=0, views=3)
-    with pytest.raises(ValueError, match="name: got 'blur'"):
-        power("blur", [1.0], CHARUCO, LENS)

@@ -1,8 +1,10 @@
 """The static pages: complete, legible, and in need of nothing from anywhere else."""
 
+import ast
 import base64
 import copy
 import itertools
+import posixpath
 import re
 from collections import Counter
 
@@ -11,7 +13,7 @@ from bs4 import BeautifulSoup
 
 import coursekit as ck
 from coursekit.plots.style import COLORS
-from tools import build_notebooks, build_site
+from tools import build_notebooks, build_site, reference
 from tools.build_notebooks import ROOT, code_cells, joined, read, role
 from tools.mathematics import mathml
 
@@ -57,7 +59,8 @@ def a_page():
 
 
 def test_there_is_a_page_for_each_notebook(pages):
-    assert [*pages] == ["index.html", *(f"{p.stem}.html" for p in NOTEBOOKS), "corrections.html"]
+    names = [name for name in pages if not name.startswith("reference/")]
+    assert names == ["index.html", *(f"{p.stem}.html" for p in NOTEBOOKS), "corrections.html"]
     for page in pages.values():
         assert page.html["lang"] == "en"
         assert page.title.string
@@ -97,15 +100,74 @@ def test_index_leads_to_every_notebook_and_they_to_each_other(pages):
         assert pages[after].find("a", rel="prev")["href"] == before
 
 
+def from_page(name, address):
+    """Where an address on a page leads, as a path in the site."""
+    return posixpath.normpath(posixpath.join(posixpath.dirname(name), address))
+
+
 def test_links_lead_somewhere(files, pages):
     for name, page in pages.items():
         for link in page.find_all("a", href=True):
             target, _, fragment = link["href"].partition("#")
             if target.startswith(("http:", "https:")):
                 continue
-            assert not target or target in files, (name, target)
+            target = from_page(name, target) if target else name
+            assert target in files, (name, target)
             if fragment:
-                assert pages[target or name].find(id=fragment), (name, link["href"])
+                assert pages[target].find(id=fragment), (name, link["href"])
+
+
+# ---- the reference ------------------------------------------------------------------------------
+
+
+def test_the_reference_has_what_the_notebooks_name_and_nothing_else(pages):
+    """Each name that a code cell takes from the package, found in another way than it is made."""
+    named = set()
+    for path in NOTEBOOKS:
+        for cell in code_cells(read(path)):
+            for node in ast.walk(ast.parse(joined(cell["source"]))):
+                if re.fullmatch(r"ck(\.\w+)+", chain := ast.unparse(node)):
+                    named.add(chain.removeprefix("ck."))
+    shown = {
+        f"{name.removeprefix('reference/').removesuffix('.html').replace('/', '.')}.{tag['id']}"
+        for name, page in pages.items()
+        if name.startswith("reference/")
+        for tag in page.select("h2[id], h3[id]")
+    }
+    ends = {name.removeprefix("coursekit.") for name in shown}
+    rooms = {name.rsplit(".", 1)[0] for name in ends}
+    attributes = {name for name in named if name.startswith(tuple(f"{end}." for end in ends))}
+    assert named - ends - rooms - attributes == set()
+    assert "coursekit.cameras.Camera.record_set" in shown
+    assert "coursekit.stereo.fit_noise" in shown
+    assert not any("._" in name for name in shown)
+    assert not any(name.startswith("coursekit.cameras.capture.") for name in shown)  # guidance ...
+
+
+def test_the_reference_begins_with_the_map(pages):
+    first = pages["reference/coursekit.html"]
+    for paragraph in ck.__doc__.split("\n\n")[:1]:
+        assert " ".join(paragraph.split()) in " ".join(first.text.split())
+    listed = [link["href"] for link in first.select("#rooms + ul a")]
+    assert [f"reference/{href}" for href in listed] == sorted(
+        name for name in pages if name.startswith("reference/coursekit/")
+    )
+    assert pages["index.html"].find("a", href="reference/coursekit.html")
+
+
+def test_a_signature_stands_as_it_is_written(pages):
+    page = pages["reference/coursekit/geometry.html"]
+    signature = page.find(id="deproject_image").find_next("pre").text
+    assert "intrinsics: Intrinsics" in signature
+    assert "'" not in signature
+    example = pages["reference/coursekit.html"].find(id="open_camera").find_next_siblings("div")[1]
+    assert '>>> camera = open_camera("simulated")' in example.text
+
+
+def test_a_name_that_nothing_has_is_refused(monkeypatch):
+    monkeypatch.setattr(reference, "named", lambda: {"stereo.no_such_thing"})
+    with pytest.raises(ValueError, match=r"coursekit\.stereo\.no_such_thing is named, but"):
+        reference.pages()
 
 
 # ---- nothing from elsewhere, nothing of this computer -------------------------------------------
@@ -117,7 +179,7 @@ def test_nothing_is_loaded_from_another_host(files, pages):
         loaded = [tag["src"] for tag in page.find_all(src=True)]
         loaded += [tag["href"] for tag in page.find_all("link")]
         assert loaded
-        assert set(loaded) <= set(files), name
+        assert {from_page(name, address) for address in loaded} <= set(files), name
         assert not page.find_all(srcset=True)
         assert "url(" not in str(page)
     style = files["style.css"].decode()
@@ -211,12 +273,12 @@ def test_a_hidden_source_is_collapsed():
 
 
 def test_every_checkpoint_keeps_its_explanation_closed(pages):
-    text = "".join(str(page) for page in pages.values())
-    for name, checkpoint in ck.lessons.checkpoints().items():
+    text = "".join(str(page) for name, page in pages.items() if not name.startswith("reference/"))
+    for name, checkpoint in ck.lessons.CHECKPOINTS.items():
         assert text.count(f'ck.checkpoint("{name}").answer(') == 1, name
         assert checkpoint.explanation().headline.split(":")[0] in text.replace("&amp;", "&")
     closed = [d for p in pages.values() for d in p.select(".output details")]
-    assert len(closed) == len(ck.lessons.checkpoints())
+    assert len(closed) == len(ck.lessons.CHECKPOINTS)
     assert not any(details.has_attr("open") for details in closed)
 
 

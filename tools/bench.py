@@ -34,10 +34,8 @@ from coursekit.geometry import Intrinsics
 from coursekit.simulation.arm_sessions import hand_eye_session
 from coursekit.simulation.corner_sessions import corner_session
 from coursekit.submission.batch import grade_folder
-from coursekit.submission.bundle import bundle_bytes
-from coursekit.submission.contents import Stack, Submission
-from coursekit.submission.reader import read_bundle
-from coursekit.submission.worker import grade_file
+from coursekit.submission.format import Stack, Submission, bundle_bytes, read_bundle
+from coursekit.submission.report import grade_file
 
 ROUNDS = 300
 CAMERA = Intrinsics(848, 480, 431.1, 431.1, 436.6, 242.4)

@@ -1,5 +1,7 @@
 """`python3 course.py site`: the notebooks as web pages in build/site, to be read without running.
 
+Beside them is a reference of the helper package, from its docstrings (`reference.py`).
+
 The pages are made from the stored outputs; nothing is executed. They open from disk, run no script
 and ask no other computer for anything. The same notebooks give the same bytes.
 """
@@ -24,6 +26,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from nbconvert.filters.highlight import Highlight2HTML
 from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
 
+from tools import reference
 from tools.build_notebooks import ROOT, Cell, find, joined, read, role
 from tools.mathematics import mathml
 
@@ -258,7 +261,8 @@ def site() -> dict[str, bytes]:
     files = {name: (PARTS / name).read_bytes() for name in COPIED}
     for page in (start, *notebooks, corrections):
         files |= page.files
-    return files | {name: text.encode("utf-8") for name, text in rendered.items()}
+    files |= {name: text.encode("utf-8") for name, text in rendered.items()}
+    return files | reference.files()
 
 
 # ---- the command line ---------------------------------------------------------------------------

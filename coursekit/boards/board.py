@@ -1,12 +1,15 @@
-"""What a calibration board is: its pattern, its corners in metres, its exact picture.
+"""What a calibration board is (its pattern, its corners in metres, its exact picture), and what an
+image or many of them show of it.
 
-What was seen of a board in one image, and in many.
+    p_camera = T_camera_board @ p_board
+
+A `Board` is printed once. A `Detection` holds the corners that one image shows, `Detections` those
+of a session; whoever calibrates with them asks `check_detections` first.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any, Literal, get_args, overload
@@ -14,16 +17,22 @@ from typing import Any, Literal, get_args, overload
 import cv2
 import numpy as np
 
-from coursekit.arrays import Floats, NDArray
+from coursekit.arrays import AnyArray, Bools, Floats, Grey, NDArray
+from coursekit.checks import array, choice, instance, number, want, whole
+from coursekit.geometry import invert_transform, make_transform, transform_points
+from coursekit.words import counted
 
-Kind = Literal["checkerboard", "charuco"]
-FEWEST_SQUARES = 3
-FEWEST_CHECKERBOARD = 4  # OpenCV finds none with fewer than 3x3 inner corners
-SMALLEST_M, LARGEST_M = 0.0005, 1.0  # of a square or marker: who gives millimetres is told so
+BoardKind = Literal["checkerboard", "charuco"]
+FEWEST_SQUARES = {"checkerboard": 4, "charuco": 3}  # OpenCV finds none with fewer corners than 3x3
+SMALLEST_SQUARE_M, LARGEST_SQUARE_M = 0.0005, 1.0  # who gives millimetres is told so
 MARKER_SHARE = 0.75  # of a square's side, unless the board says otherwise
 DICTIONARIES = tuple(
     name for name in sorted(vars(cv2.aruco)) if name.startswith("DICT_") and name == name.upper()
 )
+LISTED, LISTED_SKIPPED = 6, 20  # lines that a repr shows at most
+
+
+# --- the board ---
 
 
 @dataclass(frozen=True)
@@ -47,9 +56,13 @@ class Board:
     can know which origin is meant.
 
     Raises ValueError for fields that make no board.
+
+    >>> board = Board("charuco", (9, 6), 0.025)
+    >>> board.corners, board.marker_m, board.points[0].tolist()
+    ((8, 5), 0.01875, [0.025, 0.025, 0.0])
     """
 
-    kind: Kind
+    kind: BoardKind
     squares: tuple[int, int]
     square_m: float
     marker_m: float | None = None
@@ -57,27 +70,31 @@ class Board:
     old_origin: bool = False
 
     def __post_init__(self) -> None:
-        if self.kind not in get_args(Kind):
-            raise ValueError(f"kind: got {self.kind!r}, want 'checkerboard' or 'charuco'")
-        object.__setattr__(self, "squares", _squares(self.squares, self.kind))
-        object.__setattr__(self, "square_m", _length("square_m", self.square_m))
+        fewest = FEWEST_SQUARES[choice("kind", self.kind, get_args(BoardKind))]
+        squares = np.asarray(self.squares)
+        want(
+            squares.dtype.kind in "iu" and squares.shape == (2,) and squares.min() >= fewest,
+            "squares",
+            self.squares,
+            f"(columns, rows) of squares, at least {fewest} each (inner corners are one fewer)",
+        )
+        object.__setattr__(self, "squares", tuple(squares.tolist()))
+        object.__setattr__(self, "square_m", _side("square_m", self.square_m))
         if self.kind == "checkerboard":
-            if self.marker_m is not None or self.old_origin:
-                raise ValueError("marker_m, old_origin: a checkerboard has neither, leave them out")
+            extras = (self.marker_m, self.old_origin)
+            want(extras == (None, False), "marker_m, old_origin", extras, "none on a checkerboard")
             return
         default = round(MARKER_SHARE * self.square_m, 9)  # 0.01875, not 0.018750000000000003
-        marker_m = default if self.marker_m is None else self.marker_m
-        object.__setattr__(self, "marker_m", _length("marker_m", marker_m))
-        if self.marker_m >= self.square_m:  # type: ignore[operator]
-            raise ValueError(
-                f"marker_m: got {self.marker_m}, want less than the square's {self.square_m} m"
-            )
-        held = len(_dictionary(self.dictionary).bytesList)
-        if self._marker_count > held:
-            raise ValueError(
-                f"dictionary: {self.dictionary} holds {held} markers, a board of {self.text} needs "
-                f"{self._marker_count}"
-            )
+        marker_m = _side("marker_m", default if self.marker_m is None else self.marker_m)
+        object.__setattr__(self, "marker_m", marker_m)
+        want(marker_m < self.square_m, "marker_m", marker_m, f"less than {self.square_m} m")
+        held, needed = len(_dictionary(self.dictionary).bytesList), int(self.white.sum())
+        want(
+            needed <= held,
+            "dictionary",
+            self.dictionary,
+            f"one of {needed} markers or more for {self.text}, this one holds {held}",
+        )
 
     @property
     def corners(self) -> tuple[int, int]:
@@ -90,12 +107,10 @@ class Board:
         columns, rows = self.corners
         first = 0 if self.kind == "checkerboard" else 1
         y, x = np.mgrid[first : first + rows, first : first + columns]
-        points = self.square_m * np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
-        points.flags.writeable = False
-        return points
+        return _frozen(self.square_m * np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3))
 
     @cached_property
-    def falling(self) -> NDArray[np.bool_]:
+    def falling(self) -> Bools:
         """(N,): whether the two white squares at a corner lie towards (-x, -y) and (+x, +y).
 
         Otherwise the white ones lie towards (-x, +y) and (+x, -y). Neighbours differ.
@@ -109,17 +124,29 @@ class Board:
         return self.squares[0] * self.square_m, self.squares[1] * self.square_m
 
     @property
-    def turns(self) -> int:
-        """How many ways of turning the board in its plane look the same: 1, 2 or 4.
+    def middle(self) -> Floats:
+        """The middle of the pattern in the board frame, (3,) m, wherever the origin is."""
+        return self.points.mean(axis=0)
 
-        The markers of a ChArUco board tell its turns apart. So do the colours of a checkerboard
-        with one even and one odd number of squares; with two odd or two even numbers it looks the
-        same after half a turn, with equal odd ones after a quarter.
+    @property
+    def T_board_sheet(self) -> Floats:
+        """Sheet frame to board frame, (4, 4).
+
+        The sheet's frame is the same for all boards: its origin in the pattern's top-left outer
+        corner, x right, y down, z into the paper.
         """
-        columns, rows = self.squares
-        if self.kind == "charuco" or (columns + rows) % 2:
-            return 1
-        return 4 if columns == rows and columns % 2 else 2
+        image_from_board = self.image_from_board(1)
+        right, down = np.sign(np.diag(image_from_board)[:2])
+        offset = self.square_m * (image_from_board[:2, 2] + 0.5)
+        turn = np.diag([right, down, right * down])
+        return invert_transform(make_transform(turn, (*offset, 0.0)))
+
+    @property
+    def outline(self) -> Floats:
+        """The pattern's outer corners in the board frame, (4, 3) m, clockwise from its top left."""
+        wide, high = self.size_m
+        sheet = [[0.0, 0.0, 0.0], [wide, 0.0, 0.0], [wide, high, 0.0], [0.0, high, 0.0]]
+        return transform_points(self.T_board_sheet, sheet)
 
     @property
     def text(self) -> str:
@@ -127,26 +154,19 @@ class Board:
         inner = "{}x{}".format(*self.corners)
         return "{}x{} squares ({} inner corners)".format(*self.squares, inner)
 
-    def image(self, pixels_per_square: int) -> NDArray[np.uint8]:
+    def image(self, pixels_per_square: int) -> Grey:
         """The pattern without a border, (rows, columns) x pixels_per_square, 0 black, 255 white.
 
         A pixel that the edge of a marker's cell cuts gets the grey of its areas; edges of squares
         fall between pixels. `image_from_board` says where a point of the board lies in it.
         Raises ValueError for fewer than one pixel.
         """
-        if (
-            isinstance(pixels_per_square, bool)
-            or not isinstance(pixels_per_square, (int, np.integer))
-            or pixels_per_square < 1
-        ):
-            raise ValueError(f"pixels_per_square: got {pixels_per_square!r}, want at least 1 px")
-        squares = np.kron(self.white, np.ones((pixels_per_square, pixels_per_square)))
+        n = whole("pixels_per_square", pixels_per_square)
+        squares = np.kron(self.white, np.ones((n, n)))
         for left, top, cells in self.markers:
-            side = self._marker_share / len(cells)
-            columns = _cover(left, side, len(cells), pixels_per_square)
-            rows = _cover(top, side, len(cells), pixels_per_square)
-            x, y = int(left) * pixels_per_square, int(top) * pixels_per_square
-            square = squares[y : y + pixels_per_square, x : x + pixels_per_square]
+            columns, rows = (_cover(at, self.marker_share, len(cells), n) for at in (left, top))
+            x, y = int(left) * n, int(top) * n
+            square = squares[y : y + n, x : x + n]
             square -= rows.T @ (1.0 - cells) @ columns
         return np.rint(255.0 * squares).astype(np.uint8)
 
@@ -168,15 +188,13 @@ class Board:
         if self.kind == "checkerboard":
             return ()
         dictionary = _dictionary(self.dictionary)
-        margin = 0.5 * (1.0 - self._marker_share)
-        return tuple(
-            (
-                column + margin,
-                row + margin,
-                _cells(dictionary, number),
-            )
-            for number, (row, column) in enumerate(np.argwhere(self.white).tolist())
-        )
+        n = dictionary.markerSize + 2
+        margin = 0.5 * (1.0 - self.marker_share)
+        markers = []
+        for marker_id, (row, column) in enumerate(np.argwhere(self.white).tolist()):
+            image = cv2.aruco.generateImageMarker(dictionary, marker_id, n, borderBits=1)
+            markers.append((column + margin, row + margin, (image > 0).astype(float)))
+        return tuple(markers)
 
     @cached_property
     def marker_centres(self) -> Floats:
@@ -194,70 +212,43 @@ class Board:
         return board
 
     @cached_property
-    def white(self) -> NDArray[np.bool_]:
+    def white(self) -> Bools:
         """(rows, columns): which squares are white, from the pattern's top-left corner."""
         columns, rows = self.squares
         first_white = self.old_origin and rows % 2 == 0
         return (np.add.outer(np.arange(rows), np.arange(columns)) + first_white) % 2 == 1
 
     @property
-    def _marker_count(self) -> int:
-        return int(self.white.sum())
-
-    @property
-    def _marker_share(self) -> float:
-        """The marker's side in squares."""
+    def marker_share(self) -> float:
+        """The marker's side in squares, 0 on a checkerboard."""
         return self.marker_m / self.square_m if self.marker_m else 0.0
 
 
-def _cover(first: float, side: float, cells: int, pixels: int) -> Floats:
+def _cover(first: float, share: float, cells: int, pixels: int) -> Floats:
     """(cells, pixels): the share of each pixel of a square's row that each cell covers.
 
-    first: where the first cell starts, side: its width, both in squares.
+    first: where a marker's first cell starts, share: the marker's width, both in squares.
     """
-    edges = pixels * (first - int(first) + side * np.arange(cells + 1))[:, None]
+    edges = pixels * (first - int(first) + share / cells * np.arange(cells + 1))[:, None]
     inside = np.clip(edges - np.arange(pixels), 0.0, 1.0)  # of the pixel, left of the edge
     return inside[:-1] - inside[1:]
 
 
-def _cells(dictionary: Any, number: int) -> Floats:
-    """The cells of a marker with its black frame, 0 black and 1 white."""
-    n = dictionary.markerSize + 2
-    return (cv2.aruco.generateImageMarker(dictionary, number, n, borderBits=1) > 0).astype(float)
-
-
 @cache
 def _dictionary(name: str) -> Any:
-    if name not in DICTIONARIES:
-        raise ValueError(f"dictionary: got {name!r}, want one of {', '.join(DICTIONARIES)}")
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+    """OpenCV's dictionary of a name; ValueError for an unknown one."""
+    return cv2.aruco.getPredefinedDictionary(
+        getattr(cv2.aruco, choice("dictionary", name, DICTIONARIES))
+    )
 
 
-def _squares(value: object, kind: Kind) -> tuple[int, int]:
-    """`value` as (columns, rows); ValueError with the commonest mistake in mind."""
-    fewest = FEWEST_CHECKERBOARD if kind == "checkerboard" else FEWEST_SQUARES
-    counts = list(value) if isinstance(value, (tuple, list, np.ndarray)) else []
-    whole = all(isinstance(n, (int, np.integer)) and not isinstance(n, bool) for n in counts)
-    if len(counts) != 2 or not whole or min(counts) < fewest:
-        raise ValueError(
-            f"squares: got {value!r}, want (columns, rows) of squares, at least {fewest} each "
-            "(inner corners are one fewer)"
-        )
-    return int(counts[0]), int(counts[1])
+def _side(name: str, value: object) -> float:
+    """The side of a square or marker, m."""
+    wanted = f"{SMALLEST_SQUARE_M} to {LARGEST_SQUARE_M} m (25 mm is 0.025)"
+    return number(name, value, wanted, least=SMALLEST_SQUARE_M, most=LARGEST_SQUARE_M)
 
 
-def _length(name: str, value: object) -> float:
-    number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
-    if not number or not math.isfinite(value) or value <= 0:  # type: ignore[arg-type,operator]
-        raise ValueError(f"{name}: got {value!r}, want a positive number of metres")
-    if not SMALLEST_M <= value <= LARGEST_M:  # type: ignore[operator]
-        raise ValueError(
-            f"{name}: got {value!r} m; want {SMALLEST_M} to {LARGEST_M} m (25 mm is 0.025)"
-        )
-    return float(value)  # type: ignore[arg-type]
-
-
-LISTED, LISTED_SKIPPED = 6, 20  # lines that a repr shows at most
+# --- what images show of it ---
 
 
 class BoardNotFound(ValueError):
@@ -286,20 +277,15 @@ class Detection:
 
     def __post_init__(self) -> None:
         ids = np.array(self.ids)
-        if ids.ndim != 1 or not (np.issubdtype(ids.dtype, np.integer) or ids.size == 0):
-            raise ValueError(f"ids: got {ids.dtype} of shape {ids.shape}, want (N,) whole numbers")
-        pixels = np.array(self.pixels, np.float64)
-        if pixels.shape != (len(ids), 2):
-            raise ValueError(f"pixels: got shape {pixels.shape}, want ({len(ids)}, 2)")
+        counts = ids.ndim == 1 and (np.issubdtype(ids.dtype, np.integer) or ids.size == 0)
+        want(counts, "ids", self.ids, "(N,) whole numbers")
+        pixels = array("pixels", self.pixels, (len(ids), 2)).copy()
         width, height = self.size
         object.__setattr__(self, "ids", _frozen(ids.astype(np.intp)))
         object.__setattr__(self, "pixels", _frozen(pixels))
         object.__setattr__(self, "size", (int(width), int(height)))
         if self.blur is not None:
-            blur = np.array(self.blur, np.float64)
-            if blur.shape != (2, 2):
-                raise ValueError(f"blur: got shape {blur.shape}, want (2, 2)")
-            object.__setattr__(self, "blur", _frozen(blur))
+            object.__setattr__(self, "blur", _frozen(array("blur", self.blur, (2, 2)).copy()))
 
     def __len__(self) -> int:
         """How many corners."""
@@ -340,8 +326,7 @@ class Detections(Sequence[Detection]):
         self._views = tuple(views)
         self.skipped = tuple(skipped)
         for view in self._views:
-            if not isinstance(view, Detection):
-                raise ValueError(f"views: got a {type(view).__name__}, want Detection")
+            instance("views", view, Detection)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -349,10 +334,10 @@ class Detections(Sequence[Detection]):
         if not self._views:
             raise ValueError("detections: there are none, so there is no image size")
         first = self._views[0]
-        for number, view in enumerate(self._views):
+        for index, view in enumerate(self._views):
             if view.size != first.size:
                 raise ValueError(
-                    f"detections: view {number} ({view.name}) is {_times(view.size)} px, the first "
+                    f"detections: view {index} ({view.name}) is {_times(view.size)} px, the first "
                     f"{_times(first.size)}: one calibration is for one size"
                 )
         return first.size
@@ -375,10 +360,8 @@ class Detections(Sequence[Detection]):
 
     def __repr__(self) -> str:
         corners = sum(len(view) for view in self._views)
-        heads = [f"{len(self)} view{'s' * (len(self) != 1)} with {corners} corners"]
-        if self.skipped:
-            heads.append(f"{len(self.skipped)} not used")
-        lines = [", ".join(heads)]
+        unused = f", {len(self.skipped)} not used" if self.skipped else ""
+        lines = [f"{counted(len(self), 'view')} with {corners} corners{unused}"]
         lines += [f"  {view!r}" for view in self._views[:LISTED]]
         if len(self) > LISTED:
             lines.append(f"  and {len(self) - LISTED} more")
@@ -388,10 +371,67 @@ class Detections(Sequence[Detection]):
         return "\n".join(lines)
 
 
+def check_detections(
+    detections: Sequence[Detection],
+    board: Board,
+    least_corners: int,
+    least_views: int = 1,
+    *,
+    size: tuple[int, int] | None = None,
+    name: str = "detections",
+) -> None:
+    """ValueError unless each of these views can fix a pose of `board`.
+
+    least_corners: of each view. least_views: of all of them. size: (width, height) that each image
+    must have, px, the first one's by default. name: what the message calls the argument; it also
+    says which view cannot be used, and which of six faults that view has: another size, too few
+    corners, a pixel that is not finite, a corner that the board does not have, the same corner
+    twice, or all corners on one line.
+
+    >>> board = Board("checkerboard", (10, 7), 0.025)
+    >>> check_detections([Detection([0, 1, 2], np.zeros((3, 2)), (640, 480), "a.png")], board, 4)
+    Traceback (most recent call last):
+    ValueError: detections[0] (a.png): has 3 corners, want at least 4
+    """
+    if len(detections) < least_views:
+        skipped = getattr(detections, "skipped", ())
+        unused = f"; {len(skipped)} not used, the first: {skipped[0]!r}" if skipped else ""
+        raise ValueError(
+            f"{name}: got {counted(len(detections), 'view')}, want at least {least_views}{unused}"
+        )
+    for index, view in enumerate(detections):
+        fault = next(_faults(view, board, least_corners, size or detections[0].size), "")
+        if fault:
+            called = f" ({view.name})" if view.name else ""
+            raise ValueError(f"{name}[{index}]{called}: {fault}")
+
+
+def _faults(
+    view: Detection, board: Board, least_corners: int, size: tuple[int, int]
+) -> Iterator[str]:
+    """What is wrong with one view, the first thing first; later checks rely on earlier ones."""
+    ids, last = view.ids, len(board.points) - 1
+    if view.size != size:
+        yield f"is {view.size} px, not {size}: one calibration is for one size"
+    if len(ids) < least_corners:
+        yield f"has {len(ids)} corners, want at least {least_corners}"
+    if not np.isfinite(view.pixels).all():
+        yield "has corners that are not finite"
+    if ids.min() < 0 or ids.max() > last:
+        yield f"has corner {ids.max()}, the board has 0 to {last}: another board?"
+    if len(np.unique(ids)) < len(ids):
+        yield "has the same corner twice"
+    flat = board.points[ids, :2]
+    spread = np.linalg.svd(flat - flat.mean(axis=0), compute_uv=False)
+    if spread[1] < 1e-6 * spread[0]:
+        yield "has all its corners on one line, which fixes no pose"
+
+
 def _times(size: tuple[int, int]) -> str:
     return f"{size[0]}x{size[1]}"
 
 
-def _frozen(array: NDArray[np.generic]) -> NDArray[np.generic]:
-    array.flags.writeable = False
-    return array
+def _frozen(values: AnyArray) -> AnyArray:
+    """The same array, read-only from now on."""
+    values.flags.writeable = False
+    return values

@@ -1,4 +1,4 @@
-"""Corners to a fraction of a pixel, and how far the image's noise moves them.
+"""Corners to a fraction of a pixel, how far the image's noise moves them, and how blurred it is.
 
 A corner q is where all edges around it point to: at a pixel p with the brightness gradient g, g is
 at right angles to the edge, so g . (p - q) = 0. The weighted least-squares answer is
@@ -12,14 +12,13 @@ the next corner; where a ChArUco board has a marker in the window, its pixels ge
 image is smoothed by a pixel first, which halves the error of gradients taken from a sharp image's
 samples (0.03 px without) and costs no noise, since the differences smooth anyway.
 
-How blurred an image is, and in which direction, from the edges between a board's corners.
-
-Let C be the blur's covariance, px^2. An edge with the unit normal n turns into a step of standard
-deviation w with w^2 = n' C n: a board's two directions of edges give two of C's three numbers. The
-third is in the corners. There two edges cross, and the grey at the crossing would be half-way if
-the blur were round; a blur along a diagonal mixes in more of the squares on that diagonal. For a
-Gaussian blur it is off by a share (2 / pi) arcsin(rho) of half the contrast (Sheppard 1899), rho
-being the correlation of the blur across the two edges: n1' C n2 = rho w1 w2.
+The blur is measured at the edges between the corners. Let C be its covariance, px^2. An edge with
+the unit normal n turns into a step of standard deviation w with w^2 = n' C n: a board's two
+directions of edges give two of C's three numbers. The third is in the corners. There two edges
+cross, and the grey at the crossing would be half-way if the blur were round; a blur along a
+diagonal mixes in more of the squares on that diagonal. For a Gaussian blur it is off by a share
+(2 / pi) arcsin(rho) of half the contrast (Sheppard 1899), rho being the correlation of the blur
+across the two edges: n1' C n2 = rho w1 w2.
 """
 
 from __future__ import annotations
@@ -30,36 +29,38 @@ import cv2
 import numpy as np
 from scipy.special import ndtr
 
-from coursekit.arrays import Floats, Grey, NDArray
+from coursekit.arrays import Bools, Floats, Grey, NDArray
 from coursekit.boards.board import Board
 
 Patch = NDArray[np.float32]
 
+# --- corners ---
+
 REACH = 0.4  # half the window's side, in squares
-LEAST_PX = 2.0  # ... and at least this
+LEAST_REACH_PX = 2.0  # ... and at least this
 SMOOTH_PX = 1.0  # standard deviation of the smoothing
 KERNEL = (7, 7)
 RIM_PX = 4  # beside the image's rim, what smoothing and differences made up from outside
 MARKER_MARGIN_PX = 2.5  # the blur of a marker's edge stays out of the window
 MAX_STEPS = 10
 NEAR_PX = 0.02  # a step this short is near enough for Newton's method
-NEWTON_STEPS = 2
+LAST_STEPS = 2
 PROBE_PX = 0.25  # to measure how the window pulls back
 LEAST_PULL = 0.3  # per px; less than this and something else than one corner is in the window
-FARTHEST = 0.3  # squares from where the search began: what moves farther found something else
-BLOCK = 4  # px; noise is measured in blocks,
-BLOCKS = 30_000  # at most so many
-FLAT = 0.04  # of the image's contrast: a block as bright as its neighbours within this has no edge
+FARTHEST_MOVE = 0.3  # squares from where the search began; farther away is something else
+BLOCK_PX = 4  # px; noise is measured in blocks,
+MOST_BLOCKS = 30_000  # at most so many
+FLAT_SHARE = 0.04  # of the contrast: a block as bright as its neighbours within this has no edge
 CLIPPED = (3.0, 252.0)  # grey levels at which noise may be cut off
 BINS = 12  # of brightness
-LEAST_BLOCKS = 30  # in a bin
+FEWEST_BLOCKS = 30  # in a bin
 # About its plane, a block of pure noise has the noise's variance times chi2(13) / 13:
 QUANTILE, QUANTILE_AT = 0.25, 0.715  # this share of blocks lies below that,
-HIGHEST = 2.5  # and next to none above this
+HIGHEST_RATIO = 2.5  # and next to none above this
 
 
 @dataclass(frozen=True)
-class Window:
+class _Window:
     """A corner's window at its whole-pixel size: weights and offsets from the centre.
 
     weight (h, w); dx (w,), dy (h,): px.
@@ -70,8 +71,8 @@ class Window:
     dy: Patch
 
 
-def refine(
-    grey: NDArray[np.uint8], start: Floats, steps: Floats, ids: NDArray[np.intp], board: Board
+def refine_corners(
+    grey: Grey, start: Floats, steps: Floats, ids: NDArray[np.intp], board: Board
 ) -> tuple[Floats, Floats]:
     """Corners near `start` and the covariance of each.
 
@@ -84,7 +85,7 @@ def refine(
     covariances = np.full((len(start), 2, 2), np.nan)
     for k, (centre, step) in enumerate(zip(start, steps, strict=True)):
         window = _window(step, bool(board.falling[ids[k]]), board)
-        found = _corner(image, centre, window, FARTHEST * np.linalg.norm(step, axis=0).min())
+        found = _corner(image, centre, window, FARTHEST_MOVE * np.linalg.norm(step, axis=0).min())
         if found is None:
             continue
         pixels[k], pull = found
@@ -92,26 +93,27 @@ def refine(
     return pixels, covariances
 
 
-def noise_levels(grey: NDArray[np.uint8]) -> tuple[Floats, Floats]:
+def noise_levels(grey: Grey) -> tuple[Floats, Floats]:
     """The variance of an image's noise at several grey levels, (M,) each, for `np.interp`.
 
     Measured in blocks of 4x4 px without an edge, about the plane through each. Noise counts as
     independent from pixel to pixel: what compression or demosaicing has smoothed away is not seen.
     """
-    rows, columns = (size // BLOCK for size in grey.shape)
-    blocks = grey[: rows * BLOCK, : columns * BLOCK].reshape(rows, BLOCK, columns, BLOCK)
+    n = BLOCK_PX
+    rows, columns = (size // n for size in grey.shape)
+    blocks = grey[: rows * n, : columns * n].reshape(rows, n, columns, n)
     level = blocks.mean(axis=(1, 3), dtype=np.float32)
     contrast = np.subtract(*np.quantile(level, [0.99, 0.01]))
-    flat = _is_flat(level, FLAT * contrast) & (level > CLIPPED[0]) & (level < CLIPPED[1])
-    if flat.sum() < LEAST_BLOCKS:  # nothing but edges: all blocks, whose lowest are still noise
+    flat = _is_flat(level, FLAT_SHARE * contrast) & (level > CLIPPED[0]) & (level < CLIPPED[1])
+    if flat.sum() < FEWEST_BLOCKS:  # nothing but edges: all blocks, whose lowest are still noise
         flat = np.ones_like(flat)
     row, column = np.nonzero(flat)
-    some = slice(None, None, -(-len(row) // BLOCKS))
+    some = slice(None, None, -(-len(row) // MOST_BLOCKS))
     row, column = row[some], column[some]
     level, variance = level[row, column], _plane_residual(blocks[row, :, column])
     edges = np.linspace(level.min(), level.max() + 1e-3, BINS + 1)
     bins = np.digitize(level, edges)
-    groups = [bins == k for k in range(1, BINS + 1) if (bins == k).sum() >= LEAST_BLOCKS]
+    groups = [bins == k for k in range(1, BINS + 1) if (bins == k).sum() >= FEWEST_BLOCKS]
     groups = groups or [np.ones(len(level), bool)]
     return (
         np.array([level[group].mean() for group in groups], np.float64),
@@ -119,7 +121,7 @@ def noise_levels(grey: NDArray[np.uint8]) -> tuple[Floats, Floats]:
     )
 
 
-def _is_flat(level: Patch, most: float) -> NDArray[np.bool_]:
+def _is_flat(level: Patch, most: float) -> Bools:
     """(rows, columns): blocks whose four neighbours are as bright within `most` grey levels."""
     down = np.abs(np.diff(level, axis=0)) <= most
     right = np.abs(np.diff(level, axis=1)) <= most
@@ -128,25 +130,26 @@ def _is_flat(level: Patch, most: float) -> NDArray[np.bool_]:
     return flat
 
 
-def _plane_residual(blocks: NDArray[np.uint8]) -> Patch:
+def _plane_residual(blocks: Grey) -> Patch:
     """Variance (M,) of blocks (M, 4, 4) about their planes."""
-    v, u = np.mgrid[:BLOCK, :BLOCK]
-    planes, _ = np.linalg.qr(np.stack([np.ones(BLOCK**2), u.ravel(), v.ravel()], axis=1))
-    flat = blocks.reshape(-1, BLOCK**2).astype(np.float32)
+    v, u = np.mgrid[:BLOCK_PX, :BLOCK_PX]
+    planes, _ = np.linalg.qr(np.stack([np.ones(BLOCK_PX**2), u.ravel(), v.ravel()], axis=1))
+    flat = blocks.reshape(-1, BLOCK_PX**2).astype(np.float32)
     flat = flat - flat.mean(axis=1, keepdims=True)
     squares = (flat**2).sum(axis=1) - ((flat @ planes.astype(np.float32)) ** 2).sum(axis=1)
-    return np.maximum(squares, 0.0) / (BLOCK**2 - 3)
+    return np.maximum(squares, 0.0) / (BLOCK_PX**2 - 3)
 
 
 def _noise_variance(variance: Patch) -> float:
     """The noise's variance from blocks, some of which may have texture."""
     noise = float(np.quantile(variance, QUANTILE)) / QUANTILE_AT
-    return float(variance[variance <= HIGHEST * noise].mean())
+    return float(variance[variance <= HIGHEST_RATIO * noise].mean())
 
 
-def _window(step: Floats, falling: bool, board: Board) -> Window:
+def _window(step: Floats, falling: bool, board: Board) -> _Window:
     """Weights exp(-(x^2 + y^2) / reach^2) in the board's directions, none on a marker."""
-    reach = np.maximum(REACH, LEAST_PX / np.linalg.norm(step, axis=0))  # squares along x and y
+    square_px = np.linalg.norm(step, axis=0)  # along x and y
+    reach = np.maximum(REACH, LEAST_REACH_PX / square_px)  # squares
     half = np.ceil(np.abs(step) @ reach).astype(int)
     dx = np.arange(-half[0], half[0] + 1, dtype=np.float32)
     dy = np.arange(-half[1], half[1] + 1, dtype=np.float32)
@@ -156,11 +159,11 @@ def _window(step: Floats, falling: bool, board: Board) -> Window:
     weight = np.exp(-((x / reach[0]) ** 2) - (y / reach[1]) ** 2)
     weight[(np.abs(x) > reach[0]) | (np.abs(y) > reach[1])] = 0.0
     if board.marker_m is not None:
-        weight[_marker(x, y, step, falling, board.marker_m / board.square_m)] = 0.0
-    return Window(weight.astype(np.float32), dx, dy)
+        weight[_marker(x, y, step, falling, board.marker_share)] = 0.0
+    return _Window(weight.astype(np.float32), dx, dy)
 
 
-def _marker(x: Floats, y: Floats, step: Floats, falling: bool, share: float) -> NDArray[np.bool_]:
+def _marker(x: Floats, y: Floats, step: Floats, falling: bool, share: float) -> Bools:
     """Which pixels at (x, y) squares from a corner lie on a marker or in the blur of its edge."""
     px = np.linalg.norm(step, axis=0)
     gap = 0.5 * (1.0 - share)
@@ -170,7 +173,7 @@ def _marker(x: Floats, y: Floats, step: Floats, falling: bool, share: float) -> 
 
 
 def _corner(
-    image: Patch, start: Floats, window: Window, farthest: float
+    image: Patch, start: Floats, window: _Window, farthest: float
 ) -> tuple[Floats, Floats] | None:
     """The corner (2,) in the window that begins at `start`, and how the window pulls towards it.
 
@@ -192,12 +195,12 @@ def _corner(
     pull = np.stack(change, axis=1) / (2 * PROBE_PX)
     if not np.isfinite(pull).all() or np.linalg.svd(pull)[1][-1] < LEAST_PULL:
         return None
-    for _ in range(NEWTON_STEPS):
+    for _ in range(LAST_STEPS):
         q = q - np.linalg.solve(pull, _step(image, q, window))
     return (q, pull) if np.hypot(*(q - start)) <= farthest else None
 
 
-def _step(image: Patch, q: Floats, window: Window) -> Floats:
+def _step(image: Patch, q: Floats, window: _Window) -> Floats:
     """From q to where the edges in the window around it point; NaN when they are all parallel."""
     gx, gy, weight = _gradients(image, q, window)
     A = _structure(gx, gy, weight)
@@ -207,7 +210,7 @@ def _step(image: Patch, q: Floats, window: Window) -> Floats:
     return np.linalg.solve(A, [np.vdot(weight * gx, along), np.vdot(weight * gy, along)])
 
 
-def _gradients(image: Patch, q: Floats, window: Window) -> tuple[Patch, Patch, Patch]:
+def _gradients(image: Patch, q: Floats, window: _Window) -> tuple[Patch, Patch, Patch]:
     """Twice the gradient (h, w) around q, and the weights: 0 at the image's rim and outside."""
     patch = _patch(image, q, window)
     gx = patch[1:-1, 2:] - patch[1:-1, :-2]
@@ -222,7 +225,7 @@ def _gradients(image: Patch, q: Floats, window: Window) -> tuple[Patch, Patch, P
     return gx, gy, window.weight * inside
 
 
-def _patch(image: Patch, q: Floats, window: Window) -> Patch:
+def _patch(image: Patch, q: Floats, window: _Window) -> Patch:
     """The image around q, a pixel wider than the window on each side, bilinear."""
     size = (len(window.dx) + 2, len(window.dy) + 2)
     return np.asarray(cv2.getRectSubPix(image, size, (float(q[0]), float(q[1]))), np.float32)
@@ -235,7 +238,7 @@ def _structure(gx: Patch, gy: Patch, weight: Patch) -> Floats:
 
 
 def _covariance(
-    image: Patch, q: Floats, pull: Floats, window: Window, levels: Floats, variances: Floats
+    image: Patch, q: Floats, pull: Floats, window: _Window, levels: Floats, variances: Floats
 ) -> Floats:
     """Covariance (2, 2) of a corner from the noise of the pixels, px^2.
 
@@ -285,6 +288,8 @@ def _transposed(on_gx: Patch, on_gy: Patch, q: Floats) -> Floats:
     return np.asarray(smoothed, np.float64)
 
 
+# --- blur ---
+
 ALONG = np.linspace(0.3, 0.7, 9)  # where an edge is sampled, as shares of its length
 ACROSS = np.linspace(-1.0, 1.0, 27)  # ... and in units of the reach
 BLUR_REACH = 0.35  # squares from the edge,
@@ -292,11 +297,11 @@ REACH_PX = 13.0  # no more than this,
 REACH_CELLS = 0.5  # and so far into a marker's black frame
 FIRST_PX = 1.0  # where the fit of a width begins
 FIT_STEPS = 12
-DAMPING = 1e-3
+FIT_DAMPING = 1e-3
 LONGEST_STEP = 0.5  # px, or in the logarithm of the width
 WIDTHS_PX = (0.1, 10.0)  # what a fit may find
 LEAST_CONTRAST = 10.0  # grey levels
-FEWEST = 4  # edges in each direction
+FEWEST_EDGES = 4  # edges in each direction
 BILINEAR = 1.0 / 6.0  # px^2: the mean variance that bilinear interpolation adds
 
 
@@ -333,7 +338,7 @@ def blur_covariance(
     where fewer than four edges in either direction can be measured.
     """
     sets = [_fit(_edges(grey, pixels, ids, steps, board, axis)) for axis in (0, 1)]
-    if min(len(profiles.width) for profiles in sets) < FEWEST:
+    if min(len(profiles.width) for profiles in sets) < FEWEST_EDGES:
         return None
     rows = [_products(p.normal, p.normal) / p.width[:, None] ** 2 for p in sets]
     values = [np.ones(len(p.width)) for p in sets]
@@ -365,7 +370,7 @@ def _across(steps: Floats, axis: int) -> Floats:
     return normal * np.sign((normal * other).sum(axis=1, keepdims=True))
 
 
-def _correlation(shifts: Floats, falling: NDArray[np.bool_]) -> float:
+def _correlation(shifts: Floats, falling: Bools) -> float:
     """Correlation of the blur across the two edges, from the grey at the corners.
 
     shifts (N,): -1 black, 1 white. The two kinds of corners move apart; what they have in common
@@ -379,24 +384,14 @@ def _correlation(shifts: Floats, falling: NDArray[np.bool_]) -> float:
 
 def _at(grey: Grey, pixels: Floats) -> Floats:
     """Grey levels (N,) at pixels (N, 2), bilinear."""
-    maps = pixels.astype(np.float32)
-    values = cv2.remap(
-        grey.astype(np.float32),
-        maps[:, :1],
-        maps[:, 1:],
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
+    u, v = np.hsplit(pixels.astype(np.float32), 2)
+    rim = cv2.BORDER_REPLICATE
+    values = cv2.remap(grey.astype(np.float32), u, v, cv2.INTER_LINEAR, borderMode=rim)
     return np.asarray(values, np.float64).ravel()
 
 
 def _edges(
-    grey: Grey,
-    pixels: Floats,
-    ids: NDArray[np.intp],
-    steps: Floats,
-    board: Board,
-    axis: int,
+    grey: Grey, pixels: Floats, ids: NDArray[np.intp], steps: Floats, board: Board, axis: int
 ) -> _Edges:
     """Samples of the edges between neighbours along the board's x (axis 0) or y (axis 1).
 
@@ -430,9 +425,8 @@ def _marker_and_reach(square: Floats, board: Board) -> tuple[Floats, Floats]:
     reach = np.minimum(BLUR_REACH * square, REACH_PX)
     if board.marker_m is None:
         return np.full(len(square), np.inf), reach
-    share = board.marker_m / board.square_m
-    gap = 0.5 * (1.0 - share)
-    cell = share / len(board.markers[0][2])
+    gap = 0.5 * (1.0 - board.marker_share)
+    cell = board.marker_share / len(board.markers[0][2])
     return gap * square, np.minimum(reach, (gap + REACH_CELLS * cell) * square)
 
 
@@ -451,7 +445,7 @@ def _fit(edges: _Edges) -> _Profiles:
     for _ in range(FIT_STEPS):
         model, J = _profile(edges, *p)
         normal = np.einsum("iem,jem->eij", J, J)
-        normal += DAMPING * normal * np.eye(4) + 1e-9 * np.eye(4)
+        normal += FIT_DAMPING * normal * np.eye(4) + 1e-9 * np.eye(4)
         step = np.linalg.solve(normal, np.einsum("iem,em->ei", J, edges.grey - model)[..., None])
         step = step[..., 0].T
         step[2:] = np.clip(step[2:], -LONGEST_STEP, LONGEST_STEP)

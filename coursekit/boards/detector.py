@@ -1,6 +1,9 @@
-"""Find a board in an image, to a fraction of a pixel.
+"""Find a board in an image, to a fraction of a pixel, and in many: a folder, files, arrays, frames.
 
-Find a board in many images: a folder, a list of files, arrays or a camera's frames.
+    find_corners (to a pixel)  ->  refine_corners (to 0.05 px)  ->  Detection
+
+What cannot be used is never dropped silently: `detect` says why it finds no board, `detect_all`
+lists the images that it skipped, with the reason.
 """
 
 from __future__ import annotations
@@ -8,56 +11,62 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from coursekit.arrays import NDArray
+from coursekit.arrays import Grey, NDArray
 from coursekit.boards.board import Board, BoardNotFound, Detection, Detections, Skipped
-from coursekit.boards.corners import blur_covariance, refine
+from coursekit.boards.corners import blur_covariance, refine_corners
 from coursekit.boards.explain import explain
-from coursekit.boards.find import find, steps
+from coursekit.boards.find import find_corners, steps
+from coursekit.checks import want
 
 FEWEST_CORNERS = 6
-SMALLEST_PX = 40  # shorter side of an image in which a board can be told
+SMALLEST_IMAGE_PX = 40  # shorter side of an image in which a board can be told
+SESSION = "session.json"  # written beside the images by the course itself
+
+
+# --- one image ---
 
 
 def detect(image: NDArray[np.uint8], board: Board, name: str = "") -> Detection:
     """The corners of `board` in one image, with their noise and the image's blur.
 
     image: (H, W) grey or (H, W, 3) RGB, uint8. A checkerboard must be seen whole, a ChArUco board
-    in part. Corners are refined in a window of 0.4 of a square (module `refine`). On a
+    in part. Corners are refined in a window of 0.4 of a square (module `corners`). On a
     checkerboard the colours of the squares tell which corner is the first, as in `Board.image`;
-    where they cannot (`board.turns` is not 1) it is the turn whose x axis points most to the
-    right, which may change from view to view: harmless for K, not for what needs the pose.
+    where they cannot (two odd or two even numbers of squares) it is the turn whose x axis points
+    most to the right, which may change from view to view: harmless for K, not for what needs the
+    pose.
 
     Raises BoardNotFound, which says what is there instead, and ValueError for what is no image.
+
+    >>> board = Board("charuco", (5, 4), 0.03)
+    >>> seen = detect(np.pad(board.image(42), 40, constant_values=255), board)
+    >>> len(seen), seen.pixels[0].round(1).tolist()
+    (12, [81.5, 81.5])
     """
     grey = _grey(image)
-    if min(grey.shape) < SMALLEST_PX:
+    if min(grey.shape) < SMALLEST_IMAGE_PX:
         raise BoardNotFound(
             f"the picture is {grey.shape[1]}x{grey.shape[0]} px: too small to show a board"
         )
-    found = find(grey, board)
+    found = find_corners(grey, board)
     if found is None or not _usable(found[0], board):
         raise BoardNotFound(explain(grey, board, 0 if found is None else len(found[0])))
     ids, start = found
-    pixels, covariances = refine(grey, start, steps(start, ids, board), ids, board)
+    pixels, covariances = refine_corners(grey, start, steps(start, ids, board), ids, board)
     good = np.isfinite(pixels[:, 0])
     ids, pixels, covariances = ids[good], pixels[good], covariances[good]
     if not _usable(ids, board):
         raise BoardNotFound(explain(grey, board, len(ids)))
-    return Detection(
-        ids=ids,
-        pixels=pixels,
-        size=(grey.shape[1], grey.shape[0]),
-        name=name,
-        noise_px=float(np.sqrt(np.trace(covariances, axis1=1, axis2=2).mean() / 2)),
-        blur=blur_covariance(grey, pixels, ids, steps(pixels, ids, board), board),
-    )
+    noise_px = float(np.sqrt(np.trace(covariances, axis1=1, axis2=2).mean() / 2))
+    blur = blur_covariance(grey, pixels, ids, steps(pixels, ids, board), board)
+    return Detection(ids, pixels, (grey.shape[1], grey.shape[0]), name, noise_px, blur)
 
 
 def _usable(ids: NDArray[np.intp], board: Board) -> bool:
@@ -68,23 +77,19 @@ def _usable(ids: NDArray[np.intp], board: Board) -> bool:
     return bool(np.linalg.matrix_rank(plane - plane[0], tol=0.1 * board.square_m) == 2)
 
 
-def _grey(image: object) -> NDArray[np.uint8]:
+def _grey(image: object) -> Grey:
     """The image as a contiguous (H, W) array; ValueError for what is no image."""
-    array = np.asarray(image)
-    if array.dtype != np.uint8 or not (array.ndim == 2 or array.shape[2:] == (3,)):
-        raise ValueError(
-            f"image: got {array.dtype} of shape {array.shape}, want uint8 (H, W) grey or "
-            "(H, W, 3) RGB"
-        )
-    if array.size == 0:
-        raise ValueError(f"image: got shape {array.shape}, want at least one pixel")
-    if array.ndim == 3:
-        grey = cv2.cvtColor(np.ascontiguousarray(array), cv2.COLOR_RGB2GRAY)
-        return np.asarray(grey, np.uint8)
-    return np.ascontiguousarray(array)
+    pixels = np.asarray(image)
+    shape = pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] == 3)
+    if pixels.dtype != np.uint8 or not shape or pixels.size == 0:
+        got = f"{pixels.dtype} of shape {pixels.shape}"
+        raise ValueError(f"image: got {got}, want uint8 (H, W) grey or (H, W, 3) RGB")
+    if pixels.ndim == 3:
+        pixels = np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), cv2.COLOR_RGB2GRAY))
+    return np.ascontiguousarray(pixels)
 
 
-SESSION = "session.json"  # written beside the images by the course itself
+# --- many images ---
 
 
 def detect_all(
@@ -103,11 +108,14 @@ def detect_all(
     Raises ValueError when there is no such folder, when it is empty, or for anything else than
     images in a sequence.
     """
+    from tqdm.auto import tqdm
+
     sources = _sources(images)
+    quiet = not progress or len(sources) < 10
     views: list[Detection] = []
     skipped: list[Skipped] = []
     try:
-        for name, source in _with_bar(sources, progress):
+        for name, source in tqdm(sources, unit="image", leave=False, disable=quiet):
             try:
                 views.append(detect(_read(source), board, name))
             except (BoardNotFound, _Unreadable) as reason:
@@ -126,26 +134,23 @@ def _sources(images: Any) -> list[tuple[str, Any]]:
     """Name and source (a path or an array) of each image."""
     if isinstance(images, (str, os.PathLike)):
         folder = Path(images)
-        if not folder.is_dir():
-            raise ValueError(f"images: got {os.fspath(images)!r}, want a folder that exists")
-        files = [path for path in folder.iterdir() if path.is_file()]
+        want(folder.is_dir(), "images", os.fspath(images), "a folder that exists")
+        files = [p for p in folder.iterdir() if p.is_file()]
         files = [p for p in files if p.name != SESSION and not p.name.startswith(".")]
         if not files:
             raise ValueError(f"images: {os.fspath(images)!r} holds no files")
         return [(path.name, path) for path in sorted(files, key=_natural)]
-    try:
-        items = list(images)
-    except TypeError:
-        raise ValueError(
-            f"images: got a {type(images).__name__}, want a folder, or a sequence of paths, arrays "
-            "or frames"
-        ) from None
+    if not isinstance(images, Iterable):
+        kind = type(images).__name__
+        raise ValueError(f"images: got a {kind}, want a folder, or paths, arrays or frames")
+    items = list(images)
     if not items:
         raise ValueError("images: got none")
     return [_named(number, item) for number, item in enumerate(items)]
 
 
 def _named(number: int, item: Any) -> tuple[str, Any]:
+    """Name and source of one of a sequence."""
     if isinstance(item, (str, os.PathLike)):
         return Path(item).name, Path(item)
     if isinstance(item, np.ndarray):
@@ -165,15 +170,8 @@ def _natural(path: Path) -> list[Any]:
     return [int(part) if part.isdecimal() else part for part in parts]
 
 
-def _with_bar(sources: list[tuple[str, Any]], progress: bool) -> Iterator[tuple[str, Any]]:
-    from tqdm.auto import tqdm
-
-    with tqdm(sources, unit="image", leave=False, disable=not progress or len(sources) < 10) as bar:
-        yield from bar
-
-
 def _read(source: Any) -> NDArray[np.uint8]:
-    """The grey image of a path, or the array itself."""
+    """The grey image of a path, or the array itself; `_Unreadable` where there is none."""
     if isinstance(source, np.ndarray):
         return source
     try:
@@ -212,19 +210,11 @@ def _is_cut_off(data: bytes) -> bool:
 
 def _of_one_size(views: list[Detection], skipped: list[Skipped], names: list[str]) -> Detections:
     """The views of the commonest size; the others join the skipped, in the order of the images."""
-    if views:
-        counts = Counter(view.size for view in views)
-        size = max(counts, key=lambda s: (counts[s], s))
-        width, height = size
-        skipped = skipped + [
-            Skipped(
-                view.name,
-                f"{view.size[0]}x{view.size[1]} px, where most are {width}x{height}: one "
-                "calibration is for one size",
-            )
-            for view in views
-            if view.size != size
-        ]
-        views = [view for view in views if view.size == size]
-        skipped.sort(key=lambda skip: names.index(skip.name))
-    return Detections(views, skipped)
+    counts = Counter(view.size for view in views)
+    common = max(counts, key=lambda size: (counts[size], size), default=(0, 0))
+    for view in views:
+        if view.size != common:
+            reason = "{}x{} px, where most are {}x{}: one calibration is for one size"
+            skipped.append(Skipped(view.name, reason.format(*view.size, *common)))
+    skipped.sort(key=lambda skip: names.index(skip.name))
+    return Detections([view for view in views if view.size == common], skipped)

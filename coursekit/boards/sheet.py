@@ -7,12 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.path import Path as Outline
 
-from coursekit.arrays import NDArray
+from coursekit.arrays import Floats
 from coursekit.boards.board import Board
-
-Boxes = NDArray[np.float64]
+from coursekit.checks import want, whole
 
 PAPERS_MM = {  # short and long side
     "A4": (210.0, 297.0),
@@ -28,7 +26,6 @@ MARGIN_MM = 6.0  # printers leave about 5 mm blank
 FOOT_MM = 18.0  # bar and text below the board
 BAR_MM = 100.0
 MM_PER_INCH = 25.4
-DPI = (72, 2400)
 ADVICE = """\
 Print at 100 % (no "fit to page"). The bar must measure 100 mm; if not, use the measured square.
 Glue it dead flat to glass or aluminium: 1 mm of bow spoils fx by 2 %."""
@@ -50,21 +47,31 @@ def save_sheet(
     Raises ValueError for a path that ends in neither .pdf nor .png or that exists (unless
     `overwrite`), an unknown paper, or a board that does not fit (which says what would).
     """
+    import matplotlib as mpl
+
     target = Path(path)
-    if target.suffix.lower() not in (".pdf", ".png"):
-        raise ValueError(f"path: got {os.fspath(path)!r}, want a name that ends in .pdf or .png")
-    if isinstance(dpi, bool) or not isinstance(dpi, int) or not DPI[0] <= dpi <= DPI[1]:
-        raise ValueError(f"dpi: got {dpi!r}, want a whole number from {DPI[0]} to {DPI[1]}")
+    kind = target.suffix[1:].lower()
+    want(kind in ("pdf", "png"), "path", os.fspath(path), "a name that ends in .pdf or .png")
+    whole("dpi", dpi, "a whole number from 72 to 2400", least=72, most=2400)
     page_mm = _page(board, paper)
     if target.exists() and not overwrite:
         raise ValueError(f"path: {target} exists already: choose another name or overwrite=True")
-    if not target.parent.is_dir():
-        raise ValueError(f"path: the folder {target.parent} does not exist")
-    _write(board, page_mm, target, dpi)
+    want(target.parent.is_dir(), "path", os.fspath(path), "a name in a folder that exists")
+    part = target.with_name(f".{target.name}.{os.getpid()}.part")  # renamed: never half a file
+    with mpl.rc_context():
+        mpl.rcdefaults()  # a reader's own style may crop or colour figures
+        mpl.rcParams["pdf.fonttype"] = 42
+        figure = _draw(board, page_mm)
+        date = {"CreationDate": None} if kind == "pdf" else {}
+        try:
+            figure.savefig(part, format=kind, dpi=dpi, metadata=date)
+            part.replace(target)
+        finally:
+            part.unlink(missing_ok=True)
     return target
 
 
-def describe(board: Board) -> str:
+def caption(board: Board) -> str:
     """The board in one line: kind, squares, millimetres, dictionary."""
     text = f"{'ChArUco board' if board.kind == 'charuco' else 'Checkerboard'}, {board.text}, "
     text += f"square {1000 * board.square_m:g} mm"
@@ -77,23 +84,25 @@ def describe(board: Board) -> str:
 def _page(board: Board, paper: str) -> tuple[float, float]:
     """(width, height) of the sheet in mm, upright or lying; ValueError for too big a board."""
     names = {name.lower(): name for name in PAPERS_MM}
-    if not isinstance(paper, str) or paper.lower() not in names:
-        raise ValueError(f"paper: got {paper!r}, want one of {', '.join(PAPERS_MM)}")
-    sides = PAPERS_MM[names[paper.lower()]]
-    for page in (sides, sides[::-1]):
-        if _largest_square_mm(board, page) >= 1000 * board.square_m * (1 - 1e-9):
-            return page
+    want(str(paper).lower() in names, "paper", paper, f"one of {', '.join(PAPERS_MM)}")
+    name = names[paper.lower()]
+    if pages := _fitting(board, name):
+        return pages[0]
+    sides = PAPERS_MM[name]
     square = max(_largest_square_mm(board, page) for page in (sides, sides[::-1]))
-    larger = (name for name, mm in PAPERS_MM.items() if _fits(board, mm))
+    larger = next((other for other in PAPERS_MM if _fitting(board, other)), "a print shop")
     width, height = (1000 * side for side in board.size_m)
     raise ValueError(
-        f"paper: a board of {width:g} x {height:g} mm does not fit on {names[paper.lower()]}: take "
-        f"{next(larger, 'a print shop')}, or squares of at most {np.floor(10 * square) / 10:g} mm"
+        f"paper: a board of {width:g} x {height:g} mm does not fit on {name}: take {larger}, or "
+        f"squares of at most {np.floor(10 * square) / 10:g} mm"
     )
 
 
-def _fits(board: Board, sides: tuple[float, float]) -> bool:
-    return any(_largest_square_mm(board, p) >= 1000 * board.square_m for p in (sides, sides[::-1]))
+def _fitting(board: Board, paper: str) -> list[tuple[float, float]]:
+    """The ways to turn a paper, (width, height) in mm, upright first, that hold the board."""
+    sides = PAPERS_MM[paper]
+    least = 1000 * board.square_m * (1 - 1e-9)
+    return [page for page in (sides, sides[::-1]) if _largest_square_mm(board, page) >= least]
 
 
 def _largest_square_mm(board: Board, page: tuple[float, float]) -> float:
@@ -104,28 +113,11 @@ def _largest_square_mm(board: Board, page: tuple[float, float]) -> float:
     return min((page[0] - 2 * MARGIN_MM) / columns, (page[1] - 2 * MARGIN_MM - FOOT_MM) / rows)
 
 
-def _write(board: Board, page_mm: tuple[float, float], target: Path, dpi: int) -> None:
-    """Draw and save under another name, then rename: never half a file."""
-    import matplotlib as mpl
-
-    part = target.with_name(f".{target.name}.{os.getpid()}.part")
-    kind = target.suffix[1:].lower()
-    date = {"CreationDate": None} if kind == "pdf" else {}
-    with mpl.rc_context():
-        mpl.rcdefaults()  # a reader's own style may crop or colour figures
-        mpl.rcParams["pdf.fonttype"] = 42
-        figure = _draw(board, page_mm)
-        try:
-            figure.savefig(part, format=kind, dpi=dpi, metadata=date)
-            part.replace(target)
-        finally:
-            part.unlink(missing_ok=True)
-
-
 def _draw(board: Board, page_mm: tuple[float, float]) -> Any:
     """The sheet as a Matplotlib figure whose axes are millimetres, y down from the top."""
     from matplotlib.figure import Figure
     from matplotlib.patches import PathPatch
+    from matplotlib.path import Path as Outline
 
     width, height = page_mm
     figure = Figure(figsize=(width / MM_PER_INCH, height / MM_PER_INCH), facecolor="white")
@@ -137,41 +129,30 @@ def _draw(board: Board, page_mm: tuple[float, float]) -> Any:
     black = _black_boxes(board) * 1000 * board.square_m + [left, top, left, top]
     foot = height - MARGIN_MM - FOOT_MM + 4.0
     bar = np.array([[MARGIN_MM, foot, MARGIN_MM + BAR_MM, foot + 1.5]])
-    for boxes in (black, bar):
-        patch = PathPatch(_outline(boxes), facecolor="black", linewidth=0)
+    for boxes in (black, bar):  # each as one path: boxes that touch leave no hairline between
+        x0, y0, x1, y1 = boxes.T
+        around = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)]).transpose(2, 0, 1)
+        codes = [Outline.MOVETO, *3 * [Outline.LINETO], Outline.CLOSEPOLY] * len(boxes)
+        outline = Outline(around.reshape(-1, 2), codes)
+        patch = PathPatch(outline, facecolor="black", linewidth=0)
         patch.set_snap(False)  # edges of a PNG keep their place between pixels
         axes.add_patch(patch)
     right = MARGIN_MM + BAR_MM + 2.0
     axes.text(right, foot + 0.75, "100 mm", fontsize=8, va="center")
-    words = f"{describe(board)}.\n{ADVICE}"
+    words = f"{caption(board)}.\n{ADVICE}"
     axes.text(MARGIN_MM, foot + 3.0, words, fontsize=6.5, va="top", linespacing=1.25)
     return figure
 
 
-def _black_boxes(board: Board) -> Boxes:
-    """What is black, as boxes (left, top, right, bottom) in squares from the top-left corner."""
+def _black_boxes(board: Board) -> Floats:
+    """What is black, (N, 4): left, top, right, bottom in squares from the top-left corner."""
     rows, columns = np.nonzero(~board.white)
-    boxes = [np.stack([columns, rows, columns + 1, rows + 1], axis=1).astype(np.float64)]
+    boxes = np.stack([columns, rows, columns + 1, rows + 1], axis=1).tolist()
     for left, top, cells in board.markers:
-        side = board.marker_m / board.square_m / len(cells)  # type: ignore[operator]
+        side = board.marker_share / len(cells)
         for row, line in enumerate(cells):
             edges = np.flatnonzero(np.diff(np.r_[1.0, line, 1.0]))  # white to black, and back
             y = top + side * row
-            boxes += [
-                np.array([[left + side * a, y, left + side * b, y + side]])
-                for a, b in edges.reshape(-1, 2)
-            ]
-    return np.concatenate(boxes)
-
-
-def _outline(boxes: Boxes) -> Outline:
-    """All boxes as one path: filled at once, boxes that touch leave no hairline between them."""
-    from matplotlib.path import Path as Outline
-
-    x0, y0, x1, y1 = boxes.T
-    corners = np.stack(
-        [np.stack(pair, axis=1) for pair in ((x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0))],
-        axis=1,
-    )
-    codes = [Outline.MOVETO, Outline.LINETO, Outline.LINETO, Outline.LINETO, Outline.CLOSEPOLY]
-    return Outline(corners.reshape(-1, 2), np.tile(codes, len(boxes)))
+            runs = edges.reshape(-1, 2)
+            boxes += [[left + side * a, y, left + side * b, y + side] for a, b in runs]
+    return np.array(boxes, np.float64)

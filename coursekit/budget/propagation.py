@@ -17,7 +17,8 @@ import numpy as np
 
 from coursekit.arrays import ArrayLike, Floats
 from coursekit.budget.view import View, positive
-from coursekit.geometry import check_transform, cross_matrix, distortion_jacobian
+from coursekit.checks import transform
+from coursekit.geometry import cross_matrix, distortion_jacobian
 from coursekit.hand_eye.poses import Mount
 
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
@@ -46,9 +47,7 @@ class Chain:
         if self.mount == "eye_in_hand":
             if self.T_base_gripper is None:
                 raise ValueError("T_base_gripper: eye_in_hand wants the arm's pose at the picture")
-            T = check_transform("T_base_gripper", self.T_base_gripper)
-            if T.shape != (4, 4):
-                raise ValueError(f"T_base_gripper: got shape {T.shape}, want (4, 4)")
+            T = transform("T_base_gripper", self.T_base_gripper)
             object.__setattr__(self, "T_base_gripper", T)
 
     @property

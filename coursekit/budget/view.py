@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from coursekit.arrays import Floats
-from coursekit.geometry import Intrinsics, check_transform, undistort
+from coursekit.checks import transform
+from coursekit.geometry import Intrinsics, undistort
 
 AXES = ("closing", "approach", "lateral")
 MAX_DISPARITY_PX = 126  # the vendor's search range: nearer than fx baseline / 126 nothing is seen
@@ -55,9 +56,7 @@ class View:
             if not np.isfinite(value):
                 raise ValueError(f"{name}: got {value!r}, want a pixel coordinate")
             object.__setattr__(self, name, float(value))
-        T = check_transform("T_base_camera", self.T_base_camera)
-        if T.shape != (4, 4):
-            raise ValueError(f"T_base_camera: got shape {T.shape}, want one (4, 4) transform")
+        T = transform("T_base_camera", self.T_base_camera)
         object.__setattr__(self, "T_base_camera", T)
         object.__setattr__(self, "_ray", ray(self.intrinsics, *self.pixel))
 

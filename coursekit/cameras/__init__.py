@@ -6,7 +6,11 @@ import os
 from pathlib import Path
 
 from coursekit.cameras import conventions
-from coursekit.cameras.camera import Camera, CameraError, Frame, Frames, place
+from coursekit.cameras.camera import Camera, place
+from coursekit.cameras.frames import CameraError, Frame, Frames
+from coursekit.cameras.librealsense import LibraryMissing, connected_realsenses
+from coursekit.cameras.realsense import RealSense, RecordedSet
+from coursekit.cameras.simulated import SimulatedCamera
 
 __all__ = ["Camera", "CameraError", "Frame", "Frames", "conventions", "open_camera", "place"]
 
@@ -27,43 +31,38 @@ def open_camera(which: str | os.PathLike[str] = "auto", infrared: bool = False) 
     frame; the others give them when they have them. Raises ValueError when `which` is none of
     these, and CameraError with what to do when the camera or file does not open: a RealSense that
     is plugged in but does not work is never replaced silently.
+
+    >>> camera = open_camera("simulated")
+    >>> camera.depth.size, camera.baseline_m
+    ((848, 480), 0.0501707)
     """
+    argument = "which"
     if isinstance(which, str) and which == "auto":
-        named = os.environ.get(VARIABLE, "auto")
-        if named == "auto":
+        which, argument = os.environ.get(VARIABLE, "auto"), VARIABLE
+        if which == "auto":
             return _connected_or_simulated(infrared)
-        return _open(named, VARIABLE, infrared)
-    return _open(which, "which", infrared)
-
-
-def _open(which: str | os.PathLike[str], argument: str, infrared: bool) -> Camera:
     if isinstance(which, os.PathLike):
-        return _recording(os.fspath(which))
-    if not isinstance(which, str):
-        raise ValueError(f"{argument}: got {which!r}, {WANTED}")
-    if which == "simulated":
-        return _simulated()
-    if which.isdecimal():
-        return _live(which, infrared)
-    if Path(which).suffix or "/" in which or os.sep in which or (which and Path(which).is_dir()):
-        return _recording(which)
+        return _recording(Path(which))
+    if isinstance(which, str):
+        if which == "simulated":
+            return SimulatedCamera()
+        if which.isdecimal():
+            return _live(which, infrared)
+        path = Path(which)
+        if path.suffix or "/" in which or os.sep in which or (which and path.is_dir()):
+            return _recording(path)
     raise ValueError(f"{argument}: got {which!r}, {WANTED}")
 
 
 def _connected_or_simulated(infrared: bool) -> Camera:
-    from coursekit.cameras.librealsense import LibraryMissing, connected_realsenses
-
     try:
         serials = connected_realsenses()
     except LibraryMissing as missing:
-        return _simulated(f"The reason: {missing}.")
-    return _live(min(serials), infrared) if serials else _simulated()
+        return SimulatedCamera(advice=f"The reason: {missing}.")
+    return RealSense(min(serials), infrared=infrared) if serials else SimulatedCamera()
 
 
 def _live(serial: str, infrared: bool) -> Camera:
-    from coursekit.cameras.librealsense import connected_realsenses
-    from coursekit.cameras.realsense import RealSense
-
     present = connected_realsenses()  # librealsense waits 15 s for a camera that is not there
     if serial not in present:
         found = ", ".join(f"{number} ({name})" for number, name in present.items())
@@ -71,18 +70,9 @@ def _live(serial: str, infrared: bool) -> Camera:
             f"there is no RealSense with serial number {serial} on USB; "
             + (f"there is {found}: open that one" if found else "there is none: plug it in")
         )
-    return RealSense(serial=serial, infrared=infrared)
+    return RealSense(serial, infrared=infrared)
 
 
-def _recording(name: str) -> Camera:
-    from coursekit.cameras.realsense import RealSense
-    from coursekit.cameras.recorded_set import RecordedSet
-
-    path = Path(name).expanduser()
+def _recording(path: Path) -> Camera:
+    path = path.expanduser()
     return RecordedSet(path) if path.is_dir() else RealSense(path=path)
-
-
-def _simulated(advice: str | None = None) -> Camera:
-    from coursekit.cameras.simulated import PLUG_IN, SimulatedCamera
-
-    return SimulatedCamera(advice=PLUG_IN if advice is None else advice)

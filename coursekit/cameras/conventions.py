@@ -6,16 +6,16 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING
+from importlib.metadata import version
 
 import numpy as np
 
 from coursekit import geometry, results
+from coursekit.arrays import Floats
+from coursekit.cameras.librealsense import LibraryMissing, load_librealsense
+from coursekit.cameras.recording import realsense_intrinsics
 from coursekit.geometry import Intrinsics
 from coursekit.specifications import DATA
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 STORED = DATA / "vendor_models.json"
 POINTS = 2000
@@ -50,26 +50,22 @@ class Agreement:
     round_trip_px: float
 
     def __str__(self) -> str:
-        return (
-            f"{self.model:23} {self.coefficients:22} {self.project_px:8.3f} px"
-            f" {self.round_trip_px:8.3f} px"
-        )
+        errors = f"{self.project_px:8.3f} px {self.round_trip_px:8.3f} px"
+        return f"{self.model:23} {self.coefficients:22} {errors}"
 
 
 def measure() -> list[Agreement]:
-    """Each distortion model of librealsense, over random points all over the image."""
+    """Each distortion model of librealsense, over random points all over the image.
+
+    Raises LibraryMissing without pyrealsense2.
+    """
     rng = np.random.default_rng(1)
     pixels = rng.uniform([0, 0], [CAMERA.width - 1, CAMERA.height - 1], (POINTS, 2))
     depths = rng.uniform(0.2, 4.0, POINTS)
     return [_measure(model, name, pixels, depths) for model, name in CASES]
 
 
-def _measure(
-    model: str, name: str, pixels: NDArray[np.float64], depths: NDArray[np.float64]
-) -> Agreement:
-    from coursekit.cameras.librealsense import load_librealsense
-    from coursekit.cameras.recording import realsense_intrinsics
-
+def _measure(model: str, name: str, pixels: Floats, depths: Floats) -> Agreement:
     rs = load_librealsense()
     camera = Intrinsics(**CAMERA.to_dict() | {"model": model, "coeffs": COEFFS[name]})
     theirs = realsense_intrinsics(rs, camera)
@@ -85,7 +81,7 @@ def _measure(
     return Agreement(model, name, _largest(projected - ours), _largest(again - projected))
 
 
-def _largest(difference: NDArray[np.float64]) -> float:
+def _largest(difference: Floats) -> float:
     return float(np.linalg.norm(difference, axis=1).max())
 
 
@@ -96,8 +92,6 @@ def stored() -> list[Agreement]:
 
 def table() -> tuple[list[Agreement], str]:
     """The rows, measured here or else the stored ones, and a sentence that says which."""
-    from coursekit.cameras.librealsense import LibraryMissing
-
     try:
         return measure(), "measured on this computer"
     except LibraryMissing:
@@ -106,7 +100,5 @@ def table() -> tuple[list[Agreement], str]:
 
 def store() -> None:
     """Measure and write data/vendor_models.json (called by tools/make_data.py)."""
-    from importlib.metadata import version
-
     note = f"coursekit.cameras.conventions, pyrealsense2 {version('pyrealsense2')}"
     results.write_json(STORED, {"source": note, "rows": [asdict(row) for row in measure()]})

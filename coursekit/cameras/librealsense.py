@@ -6,12 +6,10 @@ import contextlib
 import ctypes
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import ModuleType
+from typing import Any
 
-from coursekit.cameras.camera import CameraError
-
-if TYPE_CHECKING:
-    from types import ModuleType
+from coursekit.cameras.frames import CameraError
 
 USB_DEVICES = Path("/sys/bus/usb/devices")  # Linux only
 

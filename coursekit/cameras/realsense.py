@@ -1,39 +1,44 @@
-"""RealSense cameras on USB, and recordings of them: one class, because librealsense plays both."""
+"""RealSense cameras on USB, recordings of them, and sets of recordings, which a folder holds.
+
+Cameras and recordings are one class, because librealsense plays both.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import functools
 import itertools
+import re
 import threading
-import time
 import weakref
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from coursekit import specifications
-from coursekit.cameras.camera import (
-    Camera,
-    CameraError,
-    Frame,
+from coursekit.arrays import AnyArray, Image
+from coursekit.cameras.camera import Camera
+from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Description, Frame
+from coursekit.cameras.librealsense import device_info, load_librealsense, start_problem
+from coursekit.cameras.recording import (
+    Index,
+    RecordedScene,
     check_depth_scale,
     check_distance,
+    check_recording,
+    depth_frame_numbers,
 )
-from coursekit.cameras.librealsense import device_info, load_librealsense, start_problem
-from coursekit.cameras.recording import check_recording, depth_frame_numbers
 from coursekit.geometry import Intrinsics, make_transform
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-DEPTH_SIZE, COLOR_SIZE, FRAMES_PER_S = (848, 480), (640, 480), 30
+DEPTH_SIZE, COLOR_SIZE = (848, 480), (640, 480)
 WARM_UP_FRAMES = 30  # automatic exposure settles in about a second
 SETTLE_FRAMES = 6  # a new exposure shows up to five frames later (librealsense issue 11228)
 POLL_MS = 50  # a recording's last wait always runs out, so it is short
-SILENCE_S = 5.0  # without a frame for so long, the camera is gone
+# Without a frame in so many waits (5 s) the camera is gone. Waits are counted, because a busy
+# computer can let any time pass between two of them.
+MOST_POLLS = 100
 
 UNPLUGGED = "is it still plugged in? Plug it in again, directly and with its own cable, and reopen"
 
@@ -147,9 +152,15 @@ class RealSense(Camera):
     def _has_pair(self, profiles: Any) -> bool:
         """Whether there are a left and a right infrared stream of grey pixels."""
         rs = self._rs
-        eyes = {p.stream_index() for p in profiles if p.stream_type() == rs.stream.infrared
-                and p.format() == rs.format.y8}  # fmt: skip
-        return eyes >= {1, 2}
+        grey = (p for p in profiles if p.format() == rs.format.y8)
+        return {p.stream_index() for p in grey if p.stream_type() == rs.stream.infrared} >= {1, 2}
+
+    def _check_open(self) -> None:
+        if self._pipeline is None:
+            raise CameraError(f"{self._what} is closed: open it again with open_camera()")
+
+    def _depth_sensor(self) -> Any:
+        return self._profile.get_device().first_depth_sensor()
 
     def close(self) -> None:
         """Stop the camera, or close the file; a second call does nothing."""
@@ -163,8 +174,7 @@ class RealSense(Camera):
     # --- what the device says about itself -----------------------------------------------------
 
     def _query(self) -> None:
-        rs, device = self._rs, self._profile.get_device()
-        sensor = device.first_depth_sensor()
+        rs, device, sensor = self._rs, self._profile.get_device(), self._depth_sensor()
         self.name = device_info(rs, device, "name") or "RealSense"
         self.serial = device_info(rs, device, "serial_number")
         self.depth_scale_m = _decimal(sensor.get_depth_scale())
@@ -194,9 +204,8 @@ class RealSense(Camera):
 
     # --- frames --------------------------------------------------------------------------------
 
-    def _stream(self) -> Generator[Frame, None, None]:
-        if self._pipeline is None:
-            raise CameraError(f"{self._what} is closed: open it again with open_camera()")
+    def stream(self) -> Generator[Frame, None, None]:
+        self._check_open()
         if self._path is not None:
             self.close()
             self._start()
@@ -239,8 +248,8 @@ class RealSense(Camera):
 
     def _next_frameset(self, playback: Any) -> Any:
         """The next group of images; None once a recording has ended."""
-        rs, ended, deadline = self._rs, False, time.monotonic() + SILENCE_S
-        while time.monotonic() < deadline:
+        ended = False
+        for _ in range(MOST_POLLS):
             if self._pipeline is None:
                 raise CameraError(f"{self._what} was closed while it was giving frames")
             try:
@@ -253,8 +262,9 @@ class RealSense(Camera):
                 return frameset
             if ended:
                 return None
-            ended = playback and playback.current_status() == rs.playback_status.stopped
-        raise CameraError(f"no frame came from {self._what} for {SILENCE_S:g} s: {UNPLUGGED}")
+            ended = playback and playback.current_status() == self._rs.playback_status.stopped
+        silence_s = MOST_POLLS * POLL_MS / 1000
+        raise CameraError(f"no frame came from {self._what} for {silence_s:g} s: {UNPLUGGED}")
 
     def _frame(self, group: _Group) -> Frame:
         depth, color, infrared = group
@@ -271,7 +281,7 @@ class RealSense(Camera):
         )
 
     def _skip(self, n: int) -> None:
-        for _ in itertools.islice(self._stream(), n):
+        for _ in itertools.islice(self.stream(), n):
             pass
 
     # --- placing and settings ------------------------------------------------------------------
@@ -281,15 +291,9 @@ class RealSense(Camera):
             super().place(name, distance_m)
             return
         check_distance(distance_m)
+        device = specified(self.name)
+        glass_m = device.nominal.glass_m if device else 0.0
         what = PLACING.get(name, f"Put the {name}")
-        glass_m = next(
-            (
-                device.nominal.glass_m
-                for device in map(specifications.device, specifications.device_names())
-                if device.name in self.name
-            ),
-            0.0,
-        )
         print(
             f"{what} {1000 * (distance_m - glass_m):.0f} mm from the camera's front glass by tape "
             f"measure: Z = {distance_m:.3f} m begins {1000 * glass_m:.1f} mm behind the glass."
@@ -311,19 +315,14 @@ class RealSense(Camera):
         if exposure is not None:
             said.append("exposure stays: lock() fixes it where automatic exposure has put it")
         if depth_scale_m is not None:
-            check_depth_scale(depth_scale_m)
-            said.append(self._set_depth_scale(depth_scale_m))
+            said.append(self._set_depth_scale(check_depth_scale(depth_scale_m)))
         sentence = "; ".join(said or ["nothing to change"])
         return sentence[0].upper() + sentence[1:] + "."
 
     def _set_depth_scale(self, depth_scale_m: float) -> str:
         """Set the depth unit with the camera stopped, as some firmware wants, and start again."""
-        if self._pipeline is None:
-            raise CameraError(f"{self._what} is closed: open it again with open_camera()")
-        option, sensor = (
-            self._rs.option.depth_units,
-            self._profile.get_device().first_depth_sensor(),
-        )
+        self._check_open()
+        option, sensor = self._rs.option.depth_units, self._depth_sensor()
         if not sensor.supports(option) or sensor.is_option_read_only(option):
             return f"depth unit stays {1000 * self.depth_scale_m:g} mm: this camera has no other"
         self.close()
@@ -352,8 +351,7 @@ class RealSense(Camera):
         """
         if self._path is not None:
             return "A recording cannot be changed: exposure and focus are as they were recorded."
-        if self._pipeline is None:
-            raise CameraError(f"{self._what} is closed: open it again with open_camera()")
+        self._check_open()
         rs, locked = self._rs, []
         try:
             for sensor in self._profile.get_device().query_sensors():
@@ -385,16 +383,16 @@ class RealSense(Camera):
 
     def _depth_exposure(self, sensor: Any) -> tuple[float, float]:
         """Exposure (us) and gain of the newest depth image, which automatic exposure chose."""
-        rs, option = self._rs, self._rs.option
         depth = next(self._groups()).depth
-        return tuple(
-            depth.get_frame_metadata(value)
-            if depth.supports_frame_metadata(value)
-            else sensor.get_option(setting)
-            for value, setting in (
-                (rs.frame_metadata_value.actual_exposure, option.exposure),
-                (rs.frame_metadata_value.gain_level, option.gain),
-            )
+
+        def chosen(value: Any, setting: Any) -> float:
+            known = depth.supports_frame_metadata(value)
+            return depth.get_frame_metadata(value) if known else sensor.get_option(setting)
+
+        values, option = self._rs.frame_metadata_value, self._rs.option
+        return (
+            chosen(values.actual_exposure, option.exposure),
+            chosen(values.gain_level, option.gain),
         )
 
 
@@ -433,7 +431,7 @@ def _time_apart(group: _Group) -> float:
     return sum(abs(moment - image.get_timestamp()) if image else np.inf for image in others)
 
 
-def _pixels(infrared: tuple[Any, ...]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]] | None:
+def _pixels(infrared: tuple[Any, ...]) -> tuple[Image, Image] | None:
     """Left and right (H, W), None unless both are there."""
     if not infrared or not all(infrared):
         return None
@@ -441,7 +439,7 @@ def _pixels(infrared: tuple[Any, ...]) -> tuple[NDArray[np.uint8], NDArray[np.ui
     return left, right
 
 
-def _rgb_converter(form: str) -> Callable[[NDArray[Any]], NDArray[np.uint8]]:
+def _rgb_converter(form: str) -> Callable[[AnyArray], Image]:
     """The function that makes (h, w, 3) RGB of a colour image in librealsense's format `form`."""
     slices = {
         "rgb8": np.s_[..., :3],
@@ -459,10 +457,78 @@ def _rgb_converter(form: str) -> Callable[[NDArray[Any]], NDArray[np.uint8]]:
     raise ValueError(f"colour is stored as {form}, want {', '.join(slices)}, yuyv or uyvy")
 
 
-def _two_bytes_a_pixel(image: NDArray[Any]) -> NDArray[np.uint8]:
+def _two_bytes_a_pixel(image: AnyArray) -> Image:
     return np.ascontiguousarray(image).view(np.uint8).reshape(*image.shape[:2], 2)
 
 
 def _decimal(value: float) -> float:
     """The shortest decimal number that is the same in float32: 0.001, not 0.0010000000475."""
     return float(str(np.float32(value)))
+
+
+def specified(name: str) -> specifications.Device | None:
+    """The device of data/devices.toml that a camera of this name is, or a variant of, or None.
+
+    >>> specified("Intel RealSense D435i").nominal.baseline_m
+    0.05
+    """
+    devices = (d for d in specifications.device_names() if re.search(rf"\b{d}", name))
+    found = next(devices, None)
+    return specifications.device(found) if found else None
+
+
+# --- sets of recordings ------------------------------------------------------------------------
+
+
+class RecordedSet(Camera):
+    """The recordings in a folder that `record_set` wrote, as one camera; the first is open.
+
+    Raises CameraError for a folder without a set, and for recordings that do not open.
+    """
+
+    can_place = True
+
+    def __init__(self, folder: Path) -> None:
+        self._index = Index.read(folder)
+        self._turn_to(self._index.scenes[0])
+
+    def _turn_to(self, scene: RecordedScene, before: RealSense | None = None) -> None:
+        """Open a recording, and say what it says; CameraError if another camera took it."""
+        played = RealSense(path=self._index.folder / scene.file)
+        if before is not None and played.serial != before.serial:
+            played.close()
+            raise CameraError(
+                f"{scene.file} was recorded by another camera ({played.serial}, not "
+                f"{before.serial}): record one set with one camera"
+            )
+        if before is not None:
+            before.close()
+        self._played, self._scene = played, scene
+        for name in set(Description.__annotations__) - {"can_place"}:
+            setattr(self, name, getattr(played, name))
+
+    def __repr__(self) -> str:
+        return (
+            f"{self.name} (recorded set {self._index.folder.name}, now {self._scene}), "
+            f"which holds {self._index}"
+        )
+
+    def place(self, name: str, distance_m: float) -> None:
+        check_distance(distance_m)
+        scene = next((s for s in self._index.scenes if s.is_at(name, distance_m)), None)
+        if scene is None:
+            raise CameraError(
+                f"the set {self._index.folder.name} has no {name} at {distance_m:.3f} m: it holds "
+                f"{self._index}"
+            )
+        if scene != self._scene:
+            self._turn_to(scene, before=self._played)
+
+    def lock(self) -> str:
+        return self._played.lock()
+
+    def close(self) -> None:
+        self._played.close()
+
+    def stream(self) -> Generator[Frame, None, None]:
+        return self._played.stream()

@@ -1,4 +1,6 @@
-"""Recordings as files: the one writer of .db3, and the checks before and after librealsense."""
+"""Recordings as files, one at a time and in sets: the checks before librealsense plays one, the
+only writer of .db3, and the index of a folder with one recording for each scene that was placed.
+"""
 
 from __future__ import annotations
 
@@ -7,23 +9,28 @@ import os
 import re
 import sqlite3
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import ModuleType
+from typing import Any
 
-from coursekit.cameras.camera import Camera, CameraError, Frame
+from coursekit import checks, results
+from coursekit.arrays import AnyArray
+from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Description, Frame
 from coursekit.cameras.librealsense import load_librealsense
 from coursekit.geometry import Intrinsics
 
-if TYPE_CHECKING:
-    from types import ModuleType
-
-    import numpy as np
-    from numpy.typing import NDArray
-
 FILE_STARTS = {".db3": b"SQLite format 3\0", ".bag": b"#ROSBAG V2.0\n"}
-FRAMES_PER_S = 30
 EYES = ("left", "right")
+STREAMS = {  # by our name: librealsense's kind and format, bytes a pixel, index and id
+    "depth": ("depth", "z16", 2, 0, 0),
+    "color": ("color", "rgb8", 3, 0, 1),
+    "left": ("infrared", "y8", 1, 1, 2),
+    "right": ("infrared", "y8", 1, 2, 3),
+}
+INDEX = "index.json"
+SAME_PLACE_M = 0.0005  # distances closer than this are one place
 
 
 # --- reading -----------------------------------------------------------------------------------
@@ -88,7 +95,7 @@ def _database(path: Path, mode: str = "ro") -> Iterator[sqlite3.Connection]:
 
 def write_recording(
     path: str | os.PathLike[str],
-    camera: Camera,
+    camera: Description,
     frames: Iterator[Frame],
     overwrite: bool = False,
     infrared: bool = False,
@@ -98,52 +105,43 @@ def write_recording(
     infrared: whether to write the infrared images too if the first frame has them. The file
     appears under its name when it is complete. When Ctrl-C or the camera ends `frames` early it
     holds those so far: Ctrl-C then prints one line, the CameraError is raised again with the
-    file's name. Raises ValueError for a bad path.
+    file's name. Raises ValueError for a bad path, and CameraError when the disk is full.
     """
     target = _check_target(path, overwrite)
     rs = load_librealsense()
-    problem: CameraError | None = None
-    interrupted, given = False, 0
+    stopped: KeyboardInterrupt | CameraError | None = None
+    given, writer = 0, None
     with tempfile.TemporaryDirectory(prefix=".recording-", dir=target.parent) as folder:
         unfinished = Path(folder) / "recording.db3"
-        writer: _Writer | None = None
         try:
             for frame in frames:
                 if writer is None:  # playback would wait for the images of a stream that has none
                     pair = infrared and frame.infrared is not None
-                    writer = _Writer(rs, unfinished, camera, pair)
+                    writer = Writer(rs, unfinished, camera, pair)
                 given += 1
                 writer.add(frame)
-        except KeyboardInterrupt:
-            interrupted = True
-        except CameraError as error:
-            problem = error
+        except (KeyboardInterrupt, CameraError) as error:
+            stopped = error
         finally:
             if writer is not None:
                 writer.close()
         if writer is not None:
-            _restore_order(unfinished)
-        if interrupted or problem:
-            given = len(depth_frame_numbers(unfinished)) if given else 0
+            restore_order(unfinished)
+            if stopped:
+                given = len(depth_frame_numbers(unfinished))
         if given == 0:
-            raise (
-                KeyboardInterrupt()
-                if interrupted
-                else problem
-                or CameraError(f"no frame came from the {camera.name}: nothing written")
-            )
+            raise stopped or CameraError(f"no frame came from the {camera.name}: nothing written")
         _publish(unfinished, target, given)
-    if problem:
-        raise CameraError(f"{problem} (its {given} frames so far are in {target})") from problem
-    if interrupted:
+    if isinstance(stopped, CameraError):
+        raise CameraError(f"{stopped} (its {given} frames so far are in {target})") from stopped
+    if stopped:
         print(f"Stopped: {target.name} holds the {given} frames so far.")
     return target
 
 
 def _check_target(path: str | os.PathLike[str], overwrite: bool) -> Path:
     target = Path(path).expanduser()
-    if target.suffix != ".db3":
-        raise ValueError(f"path: got {str(target)!r}, want a name that ends in .db3")
+    checks.want(target.suffix == ".db3", "path", str(target), "a name that ends in .db3")
     if not target.parent.is_dir():
         raise ValueError(f"path: there is no folder {target.parent}: make it first")
     if target.is_dir():
@@ -153,7 +151,7 @@ def _check_target(path: str | os.PathLike[str], overwrite: bool) -> Path:
     return target
 
 
-def _restore_order(path: Path) -> None:
+def restore_order(path: Path) -> None:
     """Make the messages' times in the file ascend in the order in which they were written.
 
     The recorder takes the time spent in a pause off its clock a little late, so a message after a
@@ -185,34 +183,35 @@ def _publish(unfinished: Path, target: Path, given: int) -> None:
         ) from error
 
 
-class _Writer:
-    """librealsense's recorder, fed frame by frame through a software device."""
+class Writer:
+    """librealsense's recorder, fed frame by frame through a software device.
 
-    def __init__(self, rs: ModuleType, path: Path, camera: Camera, infrared: bool = False) -> None:
+    infrared: whether it writes the two infrared images of each frame. The file is complete, but for
+    `restore_order`, once it is closed.
+    """
+
+    def __init__(
+        self, rs: ModuleType, path: Path, camera: Description, infrared: bool = False
+    ) -> None:
         self._rs = rs
+        self._streams: dict[str, tuple[Any, Any]] = {}  # sensor and profile by name
         device = rs.software_device()
         device.register_info(rs.camera_info.name, camera.name)
         device.register_info(rs.camera_info.serial_number, camera.serial)
-        depth_sensor = device.add_sensor("Stereo Module")
-        depth_sensor.add_read_only_option(rs.option.depth_units, camera.depth_scale_m)
+        sensor = device.add_sensor("Stereo Module")
+        sensor.add_read_only_option(rs.option.depth_units, camera.depth_scale_m)
         if camera.baseline_m is not None:
-            depth_sensor.add_read_only_option(rs.option.stereo_baseline, 1000 * camera.baseline_m)
-        depth = depth_sensor.add_video_stream(
-            _video_stream(rs, rs.stream.depth, rs.format.z16, 2, camera.depth)
-        )
-        self._streams = {"depth": (depth_sensor, depth.as_video_stream_profile())}
-        for eye, name in enumerate(EYES if infrared else (), start=1):
-            stream = _video_stream(rs, rs.stream.infrared, rs.format.y8, 1, camera.depth)
-            stream.index, stream.uid = eye, 1 + eye
-            profile = depth_sensor.add_video_stream(stream)
-            self._streams[name] = (depth_sensor, profile.as_video_stream_profile())
+            sensor.add_read_only_option(rs.option.stereo_baseline, 1000 * camera.baseline_m)
+        depth = self._add_stream("depth", sensor, camera.depth)
+        for name in EYES if infrared else ():
+            self._add_stream(name, sensor, camera.depth)
         if camera.color is not None:
-            color_sensor = device.add_sensor("RGB Camera")
-            color = color_sensor.add_video_stream(
-                _video_stream(rs, rs.stream.color, rs.format.rgb8, 3, camera.color)
-            )
-            depth.register_extrinsics_to(color, _extrinsics(rs, camera))
-            self._streams["color"] = (color_sensor, color.as_video_stream_profile())
+            color = self._add_stream("color", device.add_sensor("RGB Camera"), camera.color)
+            if camera.T_color_depth is not None:
+                extrinsics = rs.extrinsics()
+                extrinsics.rotation = camera.T_color_depth[:3, :3].ravel(order="F").tolist()
+                extrinsics.translation = camera.T_color_depth[:3, 3].tolist()
+                depth.register_extrinsics_to(color, extrinsics)
         self._recorder = rs.recorder(str(path), device)
         self._sensors = self._recorder.query_sensors()
         self._queue = rs.frame_queue(1)  # the recorder sees only sensors that stream somewhere
@@ -220,19 +219,33 @@ class _Writer:
             sensor.open(sensor.get_stream_profiles())
             sensor.start(self._queue)
 
+    def _add_stream(self, name: str, sensor: Any, intrinsics: Intrinsics) -> Any:
+        """Give a sensor the stream that frames have images for under this name of STREAMS."""
+        kind, form, bpp, index, uid = STREAMS[name]
+        stream = self._rs.video_stream()
+        stream.type, stream.fmt = getattr(self._rs.stream, kind), getattr(self._rs.format, form)
+        stream.bpp, stream.index, stream.uid, stream.fps = bpp, index, uid, FRAMES_PER_S
+        stream.width, stream.height = intrinsics.size
+        stream.intrinsics = realsense_intrinsics(self._rs, intrinsics)
+        profile = sensor.add_video_stream(stream)
+        self._streams[name] = (sensor, profile.as_video_stream_profile())
+        return profile
+
     def add(self, frame: Frame) -> None:
+        """Write the images of a frame; returns once they are written."""
         # Depth last: a Ctrl-C in between leaves an image over, which playback ignores, and not a
         # depth image with the wrong colour.
         if frame.color is not None:
-            self._add("color", frame.color, frame)
+            self.add_image("color", frame.color, frame)
         for name, image in zip(EYES, frame.infrared or (), strict=False):
             if name in self._streams:
-                self._add(name, image, frame)
-        self._add("depth", frame.depth, frame)
+                self.add_image(name, image, frame)
+        self.add_image("depth", frame.depth, frame)
         self._recorder.pause()  # waits until all is written: else memory grows with each frame
         self._recorder.resume()
 
-    def _add(self, stream: str, pixels: NDArray[np.generic], frame: Frame) -> None:
+    def add_image(self, stream: str, pixels: AnyArray, frame: Frame) -> None:
+        """Write one image of a frame to the stream of this name."""
         sensor, profile = self._streams[stream]
         image = self._rs.software_video_frame()
         image.pixels = pixels
@@ -254,15 +267,6 @@ class _Writer:
         del self._sensors, self._recorder, self._streams, self._queue
 
 
-def _video_stream(rs: ModuleType, kind: Any, form: Any, bpp: int, intrinsics: Intrinsics) -> Any:
-    stream = rs.video_stream()
-    stream.type, stream.fmt, stream.bpp, stream.fps = kind, form, bpp, FRAMES_PER_S
-    stream.index, stream.uid = 0, 0 if kind == rs.stream.depth else 1
-    stream.width, stream.height = intrinsics.size
-    stream.intrinsics = realsense_intrinsics(rs, intrinsics)
-    return stream
-
-
 def realsense_intrinsics(rs: ModuleType, intrinsics: Intrinsics) -> Any:
     """The `pyrealsense2.intrinsics` of `intrinsics`; `Intrinsics.from_realsense` undoes it."""
     result = rs.intrinsics()
@@ -274,9 +278,104 @@ def realsense_intrinsics(rs: ModuleType, intrinsics: Intrinsics) -> Any:
     return result
 
 
-def _extrinsics(rs: ModuleType, camera: Camera) -> Any:
-    result = rs.extrinsics()
-    if camera.T_color_depth is not None:
-        result.rotation = camera.T_color_depth[:3, :3].ravel(order="F").tolist()
-        result.translation = camera.T_color_depth[:3, 3].tolist()
-    return result
+# --- sets --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RecordedScene:
+    """One recording of a set: what stood how far away, m, and the file in the set's folder."""
+
+    name: str
+    distance_m: float
+    file: str
+
+    def is_at(self, name: str, distance_m: float) -> bool:
+        """Whether this is the thing called `name` at this distance, to half a millimetre."""
+        return self.name == name and abs(self.distance_m - distance_m) < SAME_PLACE_M
+
+    def __str__(self) -> str:
+        return f"{self.name} at {self.distance_m:.3f} m"
+
+
+class Index:
+    """Which scenes a set of recordings holds: what stands in the index.json of its folder."""
+
+    def __init__(self, folder: Path, scenes: Sequence[RecordedScene]) -> None:
+        self.folder, self.scenes = folder, list(scenes)
+
+    @classmethod
+    def read(cls, folder: Path) -> Index:
+        """The index of a set; CameraError for a folder without one, and for a damaged one."""
+        path = folder / INDEX
+        if not path.exists():
+            raise CameraError(
+                f"{folder} is a folder: name the .db3 or .bag file in it, "
+                "or a folder that camera.record_set() wrote"
+            )
+        try:
+            scenes = [RecordedScene(**entry) for entry in results.read_json(path)["scenes"]]
+            for scene in scenes:
+                check_distance(scene.distance_m)
+                in_folder = Path(scene.file).name == scene.file
+                checks.want(in_folder, "file", scene.file, "a name in the set's own folder")
+            if not scenes:
+                raise ValueError("it lists no scenes")
+        except (KeyError, TypeError, ValueError) as error:
+            raise CameraError(f"{path} is damaged ({error}): record the set anew") from error
+        return cls(folder, scenes)
+
+    @classmethod
+    def to_extend(
+        cls, folder: Path, name: str, distances_m: Sequence[float], overwrite: bool
+    ) -> Index:
+        """The index of a folder, made if need be, that is to hold `name` at these distances, m.
+
+        Raises ValueError for a bad distance, for a folder that cannot be made, and for a set that
+        holds one of these scenes already unless `overwrite`.
+        """
+        for distance_m in distances_m:
+            check_distance(distance_m)
+        index = cls.read(folder) if (folder / INDEX).exists() else cls(folder, [])
+        held = [scene for scene in index.scenes if any(scene.is_at(name, d) for d in distances_m)]
+        if held and not overwrite:
+            raise ValueError(
+                f"distances_m: the set {folder} holds {cls(folder, held)} already: choose another "
+                "folder or overwrite=True"
+            )
+        try:
+            folder.mkdir(exist_ok=True)
+        except OSError as error:
+            raise ValueError(f"folder: {folder} cannot be made ({error.strerror})") from error
+        return index
+
+    def add(self, scene: RecordedScene) -> None:
+        """Write the index with one more scene, in place of an older one at the same place."""
+        others = [old for old in self.scenes if not old.is_at(scene.name, scene.distance_m)]
+        self.scenes = [*others, scene]
+        content = {"scenes": [asdict(scene) for scene in self.scenes]}
+        results.write_json(self.folder / INDEX, content)
+
+    def __str__(self) -> str:
+        """What the set holds: "60 mm block at 0.300, 0.450 m; wall at 1.000 m"."""
+        places: dict[str, list[float]] = {}
+        for scene in self.scenes:
+            places.setdefault(scene.name, []).append(scene.distance_m)
+        texts = (f"{k} at {', '.join(f'{d:.3f}' for d in sorted(v))} m" for k, v in places.items())
+        return "; ".join(texts)
+
+
+def scene_to_record(name: str, distance_m: float) -> RecordedScene:
+    """A scene, and a file name for it that every system takes: "60-mm-block_0.450m.db3"."""
+    slug = re.sub("[^A-Za-z0-9]+", "-", name).strip("-")
+    return RecordedScene(name, float(distance_m), f"{slug}_{distance_m:.3f}m.db3")
+
+
+def check_distance(distance_m: object) -> None:
+    """ValueError unless `distance_m` is a positive, finite number."""
+    checks.positive("distance_m", distance_m, "a positive number of metres")
+
+
+def check_depth_scale(depth_scale_m: object) -> float:
+    """Metres per depth count; ValueError for a number that no D4xx takes."""
+    wanted = "metres per count from 0.000001 to 0.01"
+    return checks.number("depth_scale_m", depth_scale_m, wanted, least=1e-6, most=0.01)

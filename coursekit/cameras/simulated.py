@@ -4,31 +4,23 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Generator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
-from coursekit import specifications
-from coursekit.cameras.camera import (
-    Camera,
-    CameraError,
-    Frame,
-    check_depth_scale,
-    check_distance,
-)
+from coursekit import checks, specifications
+from coursekit.arrays import ArrayLike, Floats, Image
+from coursekit.boards import Board
+from coursekit.cameras.camera import Camera, HiddenTruth
+from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Frame
+from coursekit.cameras.recording import check_depth_scale, check_distance
 from coursekit.geometry import Intrinsics, invert_transform
-from coursekit.simulation import Rig, Scene, artefact_scene, render, tabletop, wall_scene
+from coursekit.simulation import Rig, RigView, Scene, artefact_scene, render, tabletop, wall_scene
+from coursekit.simulation.board_images import board_scene, check_pose, render_board
+from coursekit.specifications import Unit
 
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    from coursekit.boards import Board
-    from coursekit.simulation import View
-    from coursekit.specifications import Unit
-
-FRAMES_PER_S = 30
 PLUG_IN = (
     'Plug in a RealSense and run this cell again, or name a recording: ck.open_camera("file.bag")'
 )
@@ -48,41 +40,6 @@ FOCAL_ERROR, ASPECT_ERROR, CENTRE_ERROR_PX = 0.003, 0.0002, 1.5
 RADIAL = ((0.020, 0.003), (-0.030, 0.005))  # k1 and k2 that the factory's lack: mean and std
 TANGENTIAL = 3e-4
 DRIFT_PX, DRIFT_TIME_S = 0.008, 3.0  # a wall at 0.5 m then varies as published ones do
-
-
-@dataclass(frozen=True)
-class HiddenTruth:
-    """What a simulated camera really is, and does not report.
-
-    baseline_m: the true one. reported_baseline_m: the one its depth is computed with.
-    disparity_offset_px: by which disparities come out too large. drift_px, drift_time_s: standard
-    deviation and correlation time of a slow change of that offset. color_lens: of the colour image,
-    coefficients in OpenCV's sense. reported_color_lens: what the device says of it.
-    """
-
-    baseline_m: float
-    reported_baseline_m: float
-    disparity_offset_px: float
-    drift_px: float
-    drift_time_s: float
-    color_lens: Intrinsics
-    reported_color_lens: Intrinsics
-
-    @property
-    def scale_error(self) -> float:
-        """By which part all depths come out too large (negative: too small) for the baseline."""
-        return self.reported_baseline_m / self.baseline_m - 1.0
-
-    def __repr__(self) -> str:
-        return (
-            f"true baseline {1000 * self.baseline_m:.3f} mm, reported "
-            f"{1000 * self.reported_baseline_m:.3f} mm: depth scale error "
-            f"{100 * self.scale_error:+.2f} %\n"
-            f"disparity offset {self.disparity_offset_px:+.3f} px, drifting by "
-            f"{self.drift_px:.3f} px with a correlation time of {self.drift_time_s:g} s\n"
-            f"true colour lens {_lens_text(self.color_lens)}\n"
-            f"        reported {_lens_text(self.reported_color_lens)}"
-        )
 
 
 class SimulatedCamera(Camera):
@@ -116,25 +73,30 @@ class SimulatedCamera(Camera):
         depth_scale_m: float | None = None,
         advice: str = PLUG_IN,
     ) -> None:
-        if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
-            raise ValueError(f"seed: got {seed!r}, want a whole number of at least 0")
+        self._seed, self._advice, self._closed = checks.whole("seed", seed, least=0), advice, False
         profile = specifications.device(device)
         unit = profile.unit
         self.name, self.source, self.serial = f"Simulated {device}", "simulated", f"seed-{seed}"
-        self.depth = unit.depth
-        self.color = unit.color
+        self.depth, self.color, self.T_color_depth = unit.depth, unit.color, unit.T_color_depth
         self.baseline_m, self.depth_scale_m = unit.baseline_m, unit.depth_scale_m
-        self.T_color_depth = unit.T_color_depth
-        self._device, self._projector = device, profile.projector
-        self._seed, self._advice, self._closed = int(seed), advice, False
-        self._truth = _hidden_truth(self._seed, unit)
-        self._given = 0
+        self._device, self._given = device, 0
+        self._truth = truth = _hidden_truth(self._seed, unit)
+        self._rig = Rig(
+            self.depth,
+            truth.reported_baseline_m,
+            projector=profile.projector,
+            baseline_error=truth.baseline_m / truth.reported_baseline_m - 1.0,
+            disparity_offset_px=truth.disparity_offset_px,
+            drift_px=truth.drift_px,
+            drift_time_s=truth.drift_time_s,
+            ambient=ambient,
+            exposure=exposure,
+            seed=self._seed,
+        )
         self._place_name, self._distance_m = ("60 mm block", 0.45) if scene is None else ("", 0.0)
         self.scene = _scene(self._place_name, self._distance_m) if scene is None else scene
-        self._view: View | None = None
-        self._shown: tuple[Board, NDArray[np.float64]] | None = None
-        self._ambient, self._exposure = ambient, exposure
-        self.set(ambient, exposure, depth_scale_m)
+        self._shown: tuple[Board, Floats] | None = None
+        self.set(depth_scale_m=depth_scale_m)
 
     def __repr__(self) -> str:
         return f"{self.name}, seed {self._seed}: no real camera in use.\n{self._advice}"
@@ -143,11 +105,7 @@ class SimulatedCamera(Camera):
 
     def place(self, name: str, distance_m: float) -> None:
         check_distance(distance_m)
-        if name not in SCENES:
-            raise ValueError(f"name: got {name!r}, want one of {', '.join(SCENES)}")
-        scene = _scene(name, float(distance_m))
-        if scene is not self.scene:
-            self.scene, self._view = scene, None
+        self.scene = _scene(checks.choice("name", name, SCENES), float(distance_m))
         self._shown = None
         self._place_name, self._distance_m = name, float(distance_m)
         self._start_afresh()
@@ -159,12 +117,10 @@ class SimulatedCamera(Camera):
         what `render_board` makes with the true lens, grey and with noise; the depth image that of a
         plain plate of the board's size. Raises ValueError for a pose that does not face the camera.
         """
-        from coursekit.simulation.board_images import board_scene, check_pose
-
         T = check_pose(board, T_camera_board)
         T_color_depth = specifications.device(self._device).unit.T_color_depth
         self.scene = board_scene(board, invert_transform(T_color_depth) @ T)
-        self._view, self._shown = None, (board, T)
+        self._shown = board, T
         # Rounded: the last bits of a pose differ between machines, the pictures must not.
         name = f"{board.kind} {board.squares} {board.square_m:.6f} {np.rint(1e6 * T).astype(int)}"
         self._place_name, self._distance_m = name, float(T[2, 3])
@@ -176,27 +132,26 @@ class SimulatedCamera(Camera):
         exposure: float | Literal["auto"] | None = None,
         depth_scale_m: float | None = None,
     ) -> str:
+        rig, scale_m = self._rig, self.depth_scale_m
         if depth_scale_m is not None:
-            check_depth_scale(depth_scale_m)
-        self._rig = self._rig_with(
-            self._ambient if ambient is None else ambient,
-            self._exposure if exposure is None else exposure,
+            scale_m = check_depth_scale(depth_scale_m)
+        self._rig = replace(
+            rig,
+            ambient=rig.ambient if ambient is None else ambient,
+            exposure=rig.exposure if exposure is None else exposure,
         )
-        self._ambient, self._exposure = self._rig.ambient, self._rig.exposure
-        if depth_scale_m is not None:
-            self.depth_scale_m = float(depth_scale_m)
-        self._view = None
+        self.depth_scale_m = scale_m
         self._start_afresh()
-        shutter = self._exposure if self._exposure == "auto" else f"{self._exposure:.3g} ms"
+        fixed = self._rig.exposure
         return (
-            f"Ambient infrared {self._ambient:g}, exposure {shutter}, "
-            f"depth unit {1000 * self.depth_scale_m:g} mm."
+            f"Ambient infrared {self._rig.ambient:g}, exposure "
+            f"{fixed if fixed == 'auto' else f'{fixed:.3g} ms'}, depth unit {1000 * scale_m:g} mm."
         )
 
     def lock(self) -> str:
         """Fix the exposure at what it is now, as on a real camera; one sentence that says so."""
         self._check_open()
-        exposure_ms = self._look().exposure_ms
+        exposure_ms = _view(self._rig, self.scene).exposure_ms
         self.set(exposure=exposure_ms)
         return f"Locked infrared exposure at {exposure_ms:.3g} ms; focus and colour are fixed."
 
@@ -209,24 +164,26 @@ class SimulatedCamera(Camera):
 
     # --- frames --------------------------------------------------------------------------------
 
-    def _stream(self) -> Generator[Frame, None, None]:
+    def stream(self) -> Generator[Frame, None, None]:
         self._check_open()
         while not self._closed:
-            view, color = self._look(), self.color_image()
+            view, color = _view(self._rig, self.scene), self.color_image()
             shot = view.frame(self._rng, self._drift_from_s + self._since_placed_s)
+            scale_m, number, eyes = self.depth_scale_m, self._given, (shot.left, shot.right)
+            depth, time_s = view.depth(shot, scale_m), number / FRAMES_PER_S
             yield Frame(
-                view.depth(shot, self.depth_scale_m),
+                depth,
                 color,
-                self.depth_scale_m,
-                self._given / FRAMES_PER_S,
-                self._given,
+                scale_m,
+                time_s,
+                number,
                 self.depth,
                 self.color,
                 self.T_color_depth,
-                (shot.left, shot.right),
+                eyes,
             )
 
-    def color_image(self) -> NDArray[np.uint8]:
+    def color_image(self) -> Image:
         """The colour image (h, w, 3) of the next frame alone, which needs no stereo matching."""
         self._check_open()
         self._given += 1
@@ -234,8 +191,6 @@ class SimulatedCamera(Camera):
         lens = self._truth.color_lens
         if self._shown is None:
             return _color_image(self.scene, self._device, lens).copy()
-        from coursekit.simulation.board_images import render_board
-
         grey = render_board(*self._shown, lens, self._color_rng)
         return np.repeat(grey[..., None], 3, axis=2)
 
@@ -243,33 +198,14 @@ class SimulatedCamera(Camera):
         if self._closed:
             raise CameraError(f"the {self.name} is closed: open it again with open_camera()")
 
-    def _rig_with(self, ambient: float, exposure: float | Literal["auto"]) -> Rig:
-        truth = self._truth
-        return Rig(
-            self.depth,
-            truth.reported_baseline_m,
-            projector=self._projector,
-            baseline_error=truth.baseline_m / truth.reported_baseline_m - 1.0,
-            disparity_offset_px=truth.disparity_offset_px,
-            drift_px=truth.drift_px,
-            drift_time_s=truth.drift_time_s,
-            ambient=ambient,
-            exposure=exposure,
-            seed=self._seed,
-        )
-
     def _start_afresh(self) -> None:
         """Start the named stream of random numbers, and the drift at a moment that it names."""
-        name = f"{self._place_name} {self._distance_m:.6f} {self._ambient:.6g} {self._exposure}"
+        light = f"{self._rig.ambient:.6g} {self._rig.exposure}"
+        name = f"{self._place_name} {self._distance_m:.6f} {light}"
         self._rng = np.random.default_rng([self._seed, zlib.crc32(name.encode())])
         self._color_rng = np.random.default_rng([self._seed, zlib.crc32(name.encode()), 1])
         self._drift_from_s = self._rng.uniform(0.0, 1000.0 * DRIFT_TIME_S)
         self._since_placed_s = 0.0
-
-    def _look(self) -> View:
-        if self._view is None:
-            self._view = self._rig.look_at(self.scene)
-        return self._view
 
 
 @lru_cache(maxsize=32)
@@ -278,8 +214,14 @@ def _scene(name: str, distance_m: float) -> Scene:
     return SCENES[name](distance_m)
 
 
+@lru_cache(maxsize=6)
+def _view(rig: Rig, scene: Scene) -> RigView:
+    """The rig before a scene, 8 MB: who goes back to a distance does not wait for it again."""
+    return rig.look_at(scene)
+
+
 @lru_cache(maxsize=4)
-def _color_image(scene: Scene, device: str, lens: Intrinsics) -> NDArray[np.uint8]:
+def _color_image(scene: Scene, device: str, lens: Intrinsics) -> Image:
     """The colour image (h, w, 3) of a scene through this lens, without noise."""
     T_color_depth = specifications.device(device).unit.T_color_depth
     return render(scene, lens, invert_transform(T_color_depth)).color
@@ -289,15 +231,9 @@ def _hidden_truth(seed: int, unit: Unit) -> HiddenTruth:
     rng = np.random.default_rng([seed, zlib.crc32(b"hidden truth")])
     error = rng.choice([-1.0, 1.0]) * rng.uniform(*BASELINE_ERROR)
     offset_px = OFFSET_PX * rng.standard_normal()
-    return HiddenTruth(
-        unit.baseline_m * (1.0 + error),
-        unit.baseline_m,
-        float(offset_px),
-        DRIFT_PX,
-        DRIFT_TIME_S,
-        _true_lens(seed, unit.color),
-        unit.color,
-    )
+    baselines_m = unit.baseline_m * (1.0 + error), unit.baseline_m
+    lenses = _true_lens(seed, unit.color), unit.color
+    return HiddenTruth(*baselines_m, float(offset_px), DRIFT_PX, DRIFT_TIME_S, *lenses)
 
 
 def _true_lens(seed: int, reported: Intrinsics) -> Intrinsics:
@@ -315,13 +251,4 @@ def _true_lens(seed: int, reported: Intrinsics) -> Intrinsics:
         cy=reported.cy + dy,
         model="brown_conrady",
         coeffs=tuple(np.add(reported.coeffs, missed).tolist()),
-    )
-
-
-def _lens_text(lens: Intrinsics) -> str:
-    names = ("k1", "k2", "p1", "p2", "k3")
-    coeffs = ", ".join(f"{n} {c:+.4f}" for n, c in zip(names, lens.coeffs, strict=True) if c)
-    return (
-        f"fx {lens.fx:.2f}, fy {lens.fy:.2f}, cx {lens.cx:.2f}, cy {lens.cy:.2f} px, "
-        f"{coeffs or 'no distortion'}"
     )

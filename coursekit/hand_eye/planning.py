@@ -9,13 +9,14 @@ import numpy as np
 from coursekit.arm import Arm
 from coursekit.arrays import ArrayLike, Floats, NDArray
 from coursekit.boards import Board
-from coursekit.geometry import Intrinsics, project
+from coursekit.boards.view import seen
+from coursekit.geometry import Intrinsics
 from coursekit.hand_eye.poses import camera_board, check_poses
 from coursekit.hand_eye.refinement import PixelViews, by_X_and_Y
 from coursekit.hand_eye.result import POSITION_M, ROTATION_RAD, HandEyeResult, units
 
 CORNER_PX = 0.1  # corner noise where no images have told
-BORDER_PX = 10.0
+ROOM_PX = 10.0
 LEAST_FACING = 0.5  # cosine between the board's normal and the line of sight: 60 deg
 NEARER, FARTHER = 0.6, 1.5  # times the nearest and farthest view so far
 STEP_RAD, DRAWN, MOST = 0.35, 4000, 400  # of the candidates
@@ -124,14 +125,11 @@ def in_view(
 ) -> NDArray[np.bool_]:
     """(m,): whether the camera would see the whole board well from arm poses (m, 4, 4)."""
     C = camera_board(T_base_gripper, result.X, result.Y, result.mount)
-    at = board.points @ np.swapaxes(C[:, :3, :3], 1, 2) + C[:, None, :3, 3]
-    pixels = project(at, intrinsics.K, intrinsics.dist)
-    inside = (pixels > BORDER_PX) & (pixels < np.array(intrinsics.size) - 1 - BORDER_PX)
     facing, away = _facing(C, board)
     facing_so_far, away_so_far = _facing(result.T_camera_board, board)
     side = np.sign(np.median(facing_so_far))  # z may point into the board or out of it
     return (
-        inside.all(axis=(1, 2))
+        seen(board.points, C, intrinsics, ROOM_PX).all(axis=1)
         & (side * facing > LEAST_FACING)
         & (away > NEARER * away_so_far.min())
         & (away < FARTHER * away_so_far.max())
@@ -140,7 +138,7 @@ def in_view(
 
 def _facing(C: Floats, board: Board) -> tuple[Floats, Floats]:
     """Cosine between the board's z axis and the line of sight (n,), and the distance (n,), m."""
-    centre = C[:, :3, :3] @ board.points.mean(axis=0) + C[:, :3, 3]
+    centre = C[:, :3, :3] @ board.middle + C[:, :3, 3]
     away = np.linalg.norm(centre, axis=1)
     return np.einsum("ni,ni->n", C[:, :3, 2], centre) / away, away
 

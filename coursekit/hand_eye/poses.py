@@ -26,7 +26,8 @@ from typing import Literal
 import numpy as np
 
 from coursekit.arrays import ArrayLike, Floats
-from coursekit.geometry import check_transform, invert_transform
+from coursekit.checks import transform
+from coursekit.geometry import invert_transform
 
 Mount = Literal["eye_in_hand", "eye_to_hand"]
 MOUNTS = ("eye_in_hand", "eye_to_hand")
@@ -121,10 +122,7 @@ def nearest_rotation(matrix: Floats) -> Floats:
 
 def check_one(name: str, value: ArrayLike) -> Floats:
     """`value` as one (4, 4) rigid transform."""
-    T = check_transform(name, value)
-    if T.ndim != 2:
-        raise ValueError(f"{name}: got shape {T.shape}, want one (4, 4) transform")
-    return T
+    return transform(name, value)
 
 
 def same_number(arm_poses: int, seen: int) -> None:

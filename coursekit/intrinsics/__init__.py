@@ -1,9 +1,9 @@
 """Intrinsic calibration: fit K and distortion, know how well they are known, and judge the fit.
 
 A small reprojection error proves nothing: the poses absorb what is wrong with K. What counts is
-how far the fitted camera may be wrong about where a point is seen (`projection_sigma_px`,
-`uncertainty_map`), whether the corners cover the image and the boards are tilted (`coverage`,
-`tilts`), and whether two independent halves of the views agree (`halves`).
+how far the fitted camera may be wrong about where a point is seen (`projection_covariance` and
+`uncertainty_map` of what `calibrate` returns), whether the corners cover the image and the boards
+are tilted (`coverage`, `tilts`), and whether two independent halves of the views agree (`halves`).
 
 Intervals are 95 %. Pixels, metres and radians; a pose is T_camera_board, (4, 4).
 """
@@ -11,14 +11,7 @@ Intervals are 95 %. Pixels, metres and radians; a pose is T_camera_board, (4, 4)
 from __future__ import annotations
 
 from coursekit.intrinsics.causes import Bow, fit_bow
-from coursekit.intrinsics.comparison import (
-    Comparison,
-    HalvesDifference,
-    HeldOut,
-    compare,
-    halves,
-    held_out,
-)
+from coursekit.intrinsics.comparison import Comparison, HalvesDifference, compare, halves
 from coursekit.intrinsics.diagnosis import diagnose, stored_power
 from coursekit.intrinsics.fit import (
     MODELS,
@@ -39,7 +32,6 @@ __all__ = [
     "Comparison",
     "Coverage",
     "HalvesDifference",
-    "HeldOut",
     "IntrinsicsResult",
     "Tilts",
     "calibrate",
@@ -48,7 +40,6 @@ __all__ = [
     "diagnose",
     "fit_bow",
     "halves",
-    "held_out",
     "image_grid",
     "stored_power",
     "tilts",

@@ -33,16 +33,13 @@ from coursekit.geometry import Intrinsics
 from coursekit.intrinsics.derivatives import (
     NormalEquations,
     moved,
-    project_with_derivatives,
-    twist_columns,
-)
-from coursekit.intrinsics.fit import (
-    MIN_CORNERS,
-    IntrinsicsResult,
-    evaluate,
     parameter_vector,
+    project_with_derivatives,
+    selection,
+    twist_columns,
     with_parameters,
 )
+from coursekit.intrinsics.fit import MIN_CORNERS, IntrinsicsResult, evaluate
 from coursekit.words import p_text
 
 BOW, FOCUS, SHUTTER, LENS = "bowed_board", "focus_drift", "rolling_shutter", "lens_model"
@@ -130,11 +127,12 @@ class Calibration:
         ids = np.concatenate([d.ids for d in detections])
         pixels = np.concatenate([d.pixels for d in detections])
         view = np.repeat(np.arange(n), [len(d.ids) for d in detections])
-        left_out = int((~result.selection[4:].any(axis=1)).sum())
+        estimated = selection(result.names)
+        left_out = int((~estimated[4:].any(axis=1)).sum())
         values = {BOW: np.zeros(3), LENS: np.zeros(5 + left_out)}
         return cls(
             camera=result.intrinsics,
-            estimated=result.selection,
+            estimated=estimated,
             poses=result.T_camera_board,
             corners=Corners(points[ids], pixels, view, ids),
             names=tuple(d.name or f"view {i}" for i, d in enumerate(detections)),

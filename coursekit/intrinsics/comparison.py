@@ -1,4 +1,4 @@
-"""Two cameras compared: two halves of one session, views held out, the factory's K.
+"""How different two cameras are: two halves of one session, or the fit and the factory's K.
 
 Two calibrations of one camera place its frame differently, by a small rotation and translation
 that every pose, and every hand-eye transform after it, absorbs. So the difference over the image
@@ -16,29 +16,28 @@ import numpy as np
 
 from coursekit.arrays import Floats
 from coursekit.boards import Board, Detection
+from coursekit.checks import want
 from coursekit.geometry import Intrinsics, deproject, project
 from coursekit.intrinsics.derivatives import (
     moved,
+    parameter_vector,
     project_with_derivatives,
     scaled_inverse,
+    selection,
     twist_columns,
 )
 from coursekit.intrinsics.fit import (
+    MAP_SHAPE,
     IntrinsicsResult,
     calibrate,
-    check_range,
     image_grid,
-    one_thread,
-    p_text,
-    parameter_vector,
+    points_at,
     projection_columns,
-    uncertainty_map,
     worst_direction,
 )
+from coursekit.words import p_text
 
-SHAPE = (30, 40)
-STEPS = 20
-FOLDS = 5
+_GAUSS_NEWTON_STEPS = 20
 
 
 # --- two halves ---
@@ -86,36 +85,39 @@ def halves(
     model: str = "brown_conrady",
     same_focal: bool = False,
     range_m: float | None = None,
-    shape: tuple[int, int] = SHAPE,
+    shape: tuple[int, int] = MAP_SHAPE,
 ) -> HalvesDifference:
     """Calibrate the even and the odd views apart and compare.
 
     range_m: where to compare, m; None takes the boards' median distance. shape: (rows, columns)
     of the map. Raises ValueError where a half is too small to fit, and as `calibrate`.
+
+    >>> halves([], Board("checkerboard", (10, 7), 0.025))
+    Traceback (most recent call last):
+    ValueError: detections: got 0 views, halves need at least 6
     """
     if len(detections) < 6:
         raise ValueError(f"detections: got {len(detections)} views, halves need at least 6")
     first, second = (
-        calibrate([detections[i] for i in range(start, len(detections), 2)], board, model=model,
-                  same_focal=same_focal)
-        for start in (0, 1)
-    )  # fmt: skip
-    distance = check_range(first.board_range_m if range_m is None else range_m)
+        calibrate([detections[i] for i in part], board, model, same_focal)
+        for part in (range(0, len(detections), 2), range(1, len(detections), 2))
+    )
+    range_m = first.board_range_m if range_m is None else float(range_m)
     grid = image_grid(first.intrinsics, shape).reshape(-1, 2)
-    sigmas = [uncertainty_map(r, distance, shape).ravel() for r in (first, second)]
-    weights = 1.0 / np.hypot(*sigmas)
+    weights = 1.0 / np.hypot(*(r.uncertainty_map(range_m, shape).ravel() for r in (first, second)))
     weights[~np.isfinite(weights)] = 0.0  # where a half's distortion has no inverse
-    difference = difference_px(first.intrinsics, second.intrinsics, grid, distance, weights)
-    columns = projection_columns(first.intrinsics, grid, distance, first.selection)
+    difference = difference_px(first.intrinsics, second.intrinsics, grid, range_m, weights)
+    columns = projection_columns(first.intrinsics, grid, range_m, first.names)
     spread = _without_motion(columns, weights)
     total = first.covariance + second.covariance
+    apart = np.array([second.value(name) - first.value(name) for name in first.names])
     return HalvesDifference(
         first=first,
         second=second,
-        range_m=distance,
+        range_m=range_m,
         difference_px=difference.reshape(*shape, 2),
         expected_px=worst_direction(spread @ total @ np.swapaxes(spread, -1, -2)).reshape(shape),
-        p_value=_wald(_estimates(second) - _estimates(first), total, min(first.dof, second.dof)),
+        p_value=_wald(apart, total, min(first.dof, second.dof)),
     )
 
 
@@ -133,16 +135,13 @@ def difference_px(
     pixel's residual; None weighs all alike. Gauss-Newton. NaN where the first camera's distortion
     has no inverse.
     """
-    distance = check_range(range_m)
-    rays = deproject(pixels, np.ones(len(pixels)), first.K, first.dist)
-    points = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    points *= distance if math.isfinite(distance) else 1.0
+    points = points_at(pixels, range_m, first)
     weights = np.ones(len(pixels)) if weights is None else weights
     known = np.isfinite(points).all(axis=1) & (weights > 0)
     weight = weights[known, None]
-    free = 6 if math.isfinite(distance) else 3
+    free = 6 if math.isfinite(range_m) else 3
     T = np.eye(4)
-    for _ in range(STEPS):
+    for _ in range(_GAUSS_NEWTON_STEPS):
         at = points[known] @ T[:3, :3].T + T[:3, 3]
         seen, _, by_point = project_with_derivatives(at, second)
         columns = (weight[..., None] * twist_columns(at, by_point)[..., :free]).reshape(-1, free)
@@ -170,86 +169,12 @@ def _without_motion(columns: Floats, weights: Floats) -> Floats:
     return parameters - motion @ (scaled_inverse(A.T @ A) @ (A.T @ b))
 
 
-def _estimates(result: IntrinsicsResult) -> Floats:
-    return np.array([result.value(name) for name in result.names])
-
-
 def _wald(difference: Floats, covariance: Floats, dof: int) -> float:
     """The p-value of a difference (p,) whose covariance (p, p) was estimated with `dof`."""
     from scipy.stats import f
 
     squares = float(difference @ scaled_inverse(covariance) @ difference)
     return float(f.sf(squares / len(difference), len(difference), dof))
-
-
-# --- views held out ---
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class HeldOut:
-    """Residuals of views that the intrinsics were not fitted to.
-
-    rms_px: over all views, each held out once; 2-D. per_view_rms_px (n,). fitted_rms_px: of the
-    fit to all views.
-    """
-
-    rms_px: float
-    per_view_rms_px: Floats
-    fitted_rms_px: float
-
-    def __repr__(self) -> str:
-        return (
-            f"rms {self.rms_px:.3f} px (2-D) on views held out, {self.fitted_rms_px:.3f} px on "
-            "views fitted.\nThis proves little: the pose of a held-out view is fitted to it and "
-            "absorbs a wrong K,\nand what no view shows (tilt, the image's border) is missing "
-            "from the test too."
-        )
-
-
-def held_out(
-    detections: Sequence[Detection],
-    board: Board,
-    model: str = "brown_conrady",
-    same_focal: bool = False,
-    folds: int = FOLDS,
-) -> HeldOut:
-    """How well views are explained by intrinsics fitted to the others.
-
-    Every `folds`-th view is held out in turn; its pose is fitted with the intrinsics held.
-    Raises ValueError for fewer than 2 folds or fewer than 3 views left to fit, and as `calibrate`.
-    """
-    if not 2 <= folds <= len(detections):
-        raise ValueError(f"folds: got {folds!r}, want 2 to {len(detections)}, the views")
-    everything = calibrate(detections, board, model=model, same_focal=same_focal)
-    squares, per_view, corners = 0.0, np.zeros(len(detections)), 0
-    for fold in range(folds):
-        rest = [d for i, d in enumerate(detections) if i % folds != fold]
-        lens = calibrate(rest, board, model=model, same_focal=same_focal).intrinsics
-        for index in range(fold, len(detections), folds):
-            residuals = _pose_residuals(lens, detections[index], board)
-            squares += float(np.sum(residuals**2))
-            corners += len(residuals)
-            per_view[index] = math.sqrt(float(np.sum(residuals**2)) / len(residuals))
-    return HeldOut(math.sqrt(squares / corners), per_view, everything.rms_px)
-
-
-def _pose_residuals(lens: Intrinsics, detection: Detection, board: Board) -> Floats:
-    """Residuals (N, 2) of one view whose pose alone is fitted, px."""
-    import cv2
-
-    dist = np.array(lens.coeffs)
-    points, pixels = board.points[detection.ids], detection.pixels
-    with one_thread():
-        found, rotation, translation = cv2.solvePnP(
-            points, pixels, lens.K, dist, flags=cv2.SOLVEPNP_IPPE
-        )
-        if not found:
-            raise ValueError(f"detections: no pose explains {detection.name or 'a view'}")
-        rotation, translation = cv2.solvePnPRefineLM(
-            points, pixels, lens.K, dist, rotation, translation
-        )
-    seen, _ = cv2.projectPoints(points, rotation, translation, lens.K, dist)
-    return pixels - seen[:, 0]
 
 
 # --- the factory's K ---
@@ -303,35 +228,42 @@ def compare(
     result: IntrinsicsResult,
     factory: Intrinsics,
     range_m: float = 0.45,
-    shape: tuple[int, int] = SHAPE,
+    shape: tuple[int, int] = MAP_SHAPE,
 ) -> Comparison:
     """A fitted camera against the factory's intrinsics, in sigmas, pixels and metres.
 
     factory: its coefficients in OpenCV's sense (`Intrinsics.dist`). range_m: Z, m.
     Raises ValueError where the two are for images of different sizes.
+
+    >>> from coursekit.intrinsics.fit import evaluate
+    >>> lens = Intrinsics(640, 480, 600, 600, 320, 240)
+    >>> board = Board("checkerboard", (10, 7), 0.025)
+    >>> pose = np.array([[1, 0, 0, -0.1], [0, 0.8, -0.6, 0], [0, 0.6, 0.8, 0.5], [0, 0, 0, 1]])
+    >>> seen = project(board.points @ pose[:3, :3].T + pose[:3, 3], lens.K)
+    >>> views = [Detection(np.arange(54), seen + [[0.1], [-0.1]] * 27, lens.size)]
+    >>> fit = evaluate(lens, pose[None], views, board, board.points, ("fx", "fy"), "none")
+    >>> print(compare(fit, Intrinsics(640, 480, 590, 600, 320, 240)).differences)
+    [10.  0.]
     """
-    ours = result.intrinsics
-    if factory.size != ours.size:
-        raise ValueError(f"factory: made for {factory.size} px, the fit is for {ours.size}")
+    ours, names = result.intrinsics, result.names
+    want(factory.size == ours.size, "factory", factory.size, f"the fit's size, {ours.size} px")
     grid = image_grid(ours, shape).reshape(-1, 2)
-    distance = check_range(range_m)
-    weights = 1.0 / uncertainty_map(result, distance, shape).ravel()
-    pixels = difference_px(ours, factory, grid, distance, weights).reshape(*shape, 2)
-    depth = np.full(len(grid), distance)
+    weights = 1.0 / result.uncertainty_map(range_m, shape).ravel()
+    pixels = difference_px(ours, factory, grid, range_m, weights).reshape(*shape, 2)
+    depth = np.full(len(grid), float(range_m))
     theirs = deproject(grid, depth, factory.K, factory.dist)
     shift = np.linalg.norm(deproject(grid, depth, ours.K, ours.dist) - theirs, axis=1)
-    names = result.names
     full = parameter_vector(ours) - parameter_vector(factory)
-    difference = np.linalg.pinv(result.selection) @ full  # "f" against the mean of fx and fy
-    sigma_px = result.uncertainty_map(distance, shape, "camera")
+    difference = np.linalg.pinv(selection(names)) @ full  # "f" against the mean of fx and fy
+    sigma_px = result.uncertainty_map(range_m, shape, "camera")
     return Comparison(
         names=names,
         differences=difference,
         sigmas=np.sqrt(np.diag(result.covariance)),
         p_value=_wald(difference, result.covariance, result.dof),
-        range_m=distance,
+        range_m=float(range_m),
         difference_px=np.linalg.norm(pixels, axis=-1),
         shift_m=shift.reshape(shape),
-        expected_shift_m=sigma_px * distance / result.value("fx"),
+        expected_shift_m=sigma_px * range_m / result.value("fx"),
         size=ours.size,
     )

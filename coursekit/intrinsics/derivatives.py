@@ -9,15 +9,46 @@ columns, and the pose that several boards have in common is the mean of their xi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from coursekit.arrays import Floats
 from coursekit.geometry import Intrinsics, distort, distortion_jacobian
 
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+
+
+# --- a camera as a vector ---
+
+
+def parameter_vector(intrinsics: Intrinsics) -> Floats:
+    """(fx, fy, cx, cy, k1, k2, p1, p2, k3) of a camera, (9,), in the order of `PARAMETERS`."""
+    i = intrinsics
+    return np.array([i.fx, i.fy, i.cx, i.cy, *i.coeffs])
+
+
+def with_parameters(intrinsics: Intrinsics, parameters: Floats) -> Intrinsics:
+    """The camera with other `PARAMETERS` (9,)."""
+    fx, fy, cx, cy, *coeffs = parameters.tolist()
+    model = "brown_conrady" if any(coeffs) else intrinsics.model
+    return replace(intrinsics, fx=fx, fy=fy, cx=cx, cy=cy, model=model, coeffs=tuple(coeffs))
+
+
+def selection(names: Sequence[str]) -> Floats:
+    """d `PARAMETERS` / d the parameters of these names, (9, p); "f" stands for fx = fy.
+
+    >>> print(selection(["f", "cx"])[:4].T)
+    [[1. 1. 0. 0.]
+     [0. 0. 1. 0.]]
+    """
+    both = [("fx", "fy") if name == "f" else (name,) for name in names]
+    return np.array([[float(full in ones) for ones in both] for full in PARAMETERS])
+
+
+# --- derivatives ---
 
 
 def project_with_derivatives(
@@ -64,12 +95,13 @@ def twist_columns(points: Floats, by_point: Floats) -> Floats:
 
 def moved(T: Floats, twists: Floats) -> Floats:
     """exp(xi) T for transforms (n, 4, 4) and twists (n, 6), with R = exp(omega), t = v."""
-    from scipy.spatial.transform import Rotation
-
     step = np.broadcast_to(np.eye(4), T.shape).copy()
     step[:, :3, :3] = Rotation.from_rotvec(twists[:, :3]).as_matrix()
     step[:, :3, 3] = twists[:, 3:]
     return step @ T
+
+
+# --- least squares ---
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +123,11 @@ class NormalEquations:
         ends = np.cumsum([len(block) for block in self.poses])
         return [slice(e - len(b), e) for e, b in zip(ends, self.poses, strict=True)]
 
+    @property
+    def dof(self) -> int:
+        """Degrees of freedom of the residuals, all poses counted as fitted."""
+        return len(self.residuals) - self.shared.shape[1] - 6 * len(self.poses)
+
     @cached_property
     def pose_covariances(self) -> Floats:
         """(B_i' B_i)^-1 of each view, (n, 6, 6): of its pose where the shared are known."""
@@ -99,19 +136,13 @@ class NormalEquations:
     @cached_property
     def responses(self) -> Floats:
         """Y (n, 6, g): pose i moves by -Y_i d when the shared parameters move by d."""
-        return np.stack([
-            inverse @ (block.T @ self.shared[rows])
-            for inverse, block, rows in zip(
-                self.pose_covariances, self.poses, self.slices, strict=True
-            )
-        ])  # fmt: skip
+        return self.pose_covariances @ self._by_pose(self.shared)
 
     @cached_property
     def information(self) -> Floats:
         """The Schur complement (g, g): what is known of the shared parameters, poses unknown."""
-        total = self.shared.T @ self.shared
-        for block, rows, response in zip(self.poses, self.slices, self.responses, strict=True):
-            total -= (self.shared[rows].T @ block) @ response
+        known = np.einsum("nig,nih->gh", self._by_pose(self.shared), self.responses)
+        total = self.shared.T @ self.shared - known
         return (total + total.T) / 2
 
     @cached_property
@@ -121,10 +152,7 @@ class NormalEquations:
 
     def step(self) -> tuple[Floats, Floats]:
         """The Gauss-Newton step: (g,) of the shared parameters and (n, 6) of the poses."""
-        by_pose = np.stack([
-            block.T @ self.residuals[rows]
-            for block, rows in zip(self.poses, self.slices, strict=True)
-        ])  # fmt: skip
+        by_pose = self._by_pose(self.residuals)
         reduced = self.shared.T @ self.residuals - np.einsum("nig,ni->g", self.responses, by_pose)
         shared = self.shared_covariance @ reduced
         own = np.einsum("nij,nj->ni", self.pose_covariances, by_pose)
@@ -138,6 +166,11 @@ class NormalEquations:
             change[rows] += block @ twist
         return float(change @ change)
 
+    def _by_pose(self, values: Floats) -> Floats:
+        """B_i' values_i of each view, (n, 6, ...)."""
+        views = zip(self.poses, self.slices, strict=True)
+        return np.stack([block.T @ values[rows] for block, rows in views])
+
     def covariance(self) -> Floats:
         """The covariance (g + 6n, g + 6n) of the shared parameters, then the poses in order."""
         g, n = self.shared.shape[1], len(self.poses)
@@ -146,6 +179,13 @@ class NormalEquations:
         for i, own in enumerate(self.pose_covariances):
             at = slice(g + 6 * i, g + 6 * i + 6)
             joint[at, at] += own
+        return joint
+
+    def mean_motion_covariance(self) -> Floats:
+        """The covariance (g + 6, g + 6) of the shared parameters and of the poses' mean twist."""
+        spread = np.concatenate([np.eye(self.shared.shape[1]), -self.responses.mean(axis=0)])
+        joint = spread @ self.shared_covariance @ spread.T
+        joint[-6:, -6:] += self.pose_covariances.sum(axis=0) / len(self.poses) ** 2
         return joint
 
 

@@ -119,7 +119,12 @@ def stored_power() -> dict[str, dict[str, Any]]:
 
 
 def _checked_depths(detections: Sequence[Detection], depth_m: Sequence[ArrayLike]) -> list[Floats]:
-    want(len(depth_m) == len(detections), "depth_m", len(depth_m), f"{len(detections)} views, each with its Z")
+    want(
+        len(depth_m) == len(detections),
+        "depth_m",
+        len(depth_m),
+        f"{len(detections)} views, each with its Z",
+    )
     return [
         array(f"depth_m[{number}]", z, (len(detection.ids),))
         for number, (z, detection) in enumerate(zip(depth_m, detections, strict=True))

@@ -5,8 +5,12 @@ learner who holds it would write, so a wrong function can be compared with each 
 same cases, and with each pair of them. Only an exact match is named: the nearest wrong model
 misleads as soon as there are two mistakes. To add a misconception, write the wrong step:
 
-    @PROJECT.mistake("read", "your p1 and p2 are swapped", "Which of the two multiplies r² + 2x²?")
+    @PROJECT.mistake("read")
     def p1_p2_swapped(k1, k2, p1, p2, k3):
+        '''your p1 and p2 are swapped
+
+        Which of the two multiplies r² + 2x²?
+        '''
         return k1, k2, p2, p1, k3
 """
 
@@ -22,8 +26,9 @@ from typing import Any
 
 import numpy as np
 
+from coursekit.arrays import Floats
 from coursekit.lessons import progress
-from coursekit.lessons.verdict import Verdict
+from coursekit.lessons.progress import Verdict
 
 Step = Callable[..., Any]
 Model = Callable[..., Any]
@@ -79,12 +84,12 @@ class Exercise:
     unit: str
     tolerance: float
     describe: Callable[[tuple[Any, ...]], str]
-    show: Callable[[np.ndarray], str]
+    show: Callable[[Floats], str]
     nan_answers: bool = False
     core: Core | None = None
     mistakes: list[Mistake] = field(default_factory=list)
     part_of: Exercise | None = field(default=None, repr=False)
-    _known: dict[tuple[int, ...], np.ndarray | None] = field(
+    _known: dict[tuple[int, ...], Floats | None] = field(
         default_factory=dict, init=False, repr=False
     )
 
@@ -94,12 +99,20 @@ class Exercise:
         return self.name.rpartition(".")[2]
 
     def mistake(
-        self, step: str, says: str, ask: str, name: str | None = None, alone: bool = False
+        self, step: str, same_as: Step | None = None, name: str = "", alone: bool = False
     ) -> Callable[[Step], Step]:
-        """Decorator that adds a misconception, named after the function unless `name` is given."""
+        """Decorator that adds a wrong step, whose name is the misconception's.
+
+        Its docstring is what the student reads: what is wrong, then, after an empty line, a
+        question that leads on. same_as: an earlier wrong step, where this is only another way to
+        write the same misconception; its name and words are taken. name: where the function needs
+        another one.
+        """
 
         def add(wrong: Step) -> Step:
-            self.mistakes.append(Mistake(name or wrong.__name__, step, says, ask, wrong, alone))
+            origin = same_as or wrong
+            says, ask = (" ".join(part.split()) for part in str(origin.__doc__).split("\n\n"))
+            self.mistakes.append(Mistake(name or origin.__name__, step, says, ask, wrong, alone))
             return wrong
 
         return add
@@ -110,8 +123,7 @@ class Exercise:
 
     def check(self, function: Callable[..., Any]) -> Verdict:
         """The verdict on a learner's function; never raises, and notes the attempt."""
-        verdict = self.judge(function)
-        return progress.noted(verdict) if verdict.kind != "not attempted" else verdict
+        return progress.noted(self.judge(function))
 
     def judge(self, function: Callable[..., Any]) -> Verdict:
         """The verdict on a learner's function, without noting it."""
@@ -119,7 +131,7 @@ class Exercise:
             return self._say("not attempted", f"got a {type(function).__name__}, not a function.")
         runs = [_run(function, args) for args in self.cases]
         if self.core and self._leaves_the_rest(function, runs):
-            cases = [args for args in self.cases if self._is_core(args)]
+            cases = [args for args in self.cases if self.is_core(args)]
             return replace(self, cases=cases, core=None, part_of=self).judge(function)
         unfinished = self._unfinished(runs)
         if unfinished:
@@ -127,14 +139,14 @@ class Exercise:
         expected = [np.asarray(self._answer((), args)) for args in self.cases]
         return self._compare(runs, expected)
 
-    def _is_core(self, args: tuple[Any, ...]) -> bool:
+    def is_core(self, args: tuple[Any, ...]) -> bool:
         return self.core is None or len(self.core.of(args)) == len(args)
 
     def _leaves_the_rest(self, function: Callable[..., Any], runs: list[Run]) -> bool:
         """Whether every case beyond the core gets nothing, or what it gets without the rest."""
         assert self.core is not None
         for run, args in zip(runs, self.cases, strict=True):
-            if self._is_core(args) or isinstance(run.error, NotImplementedError):
+            if self.is_core(args) or isinstance(run.error, NotImplementedError):
                 continue
             if run.error is not None:
                 return False
@@ -169,7 +181,7 @@ class Exercise:
                 )
         return None
 
-    def _compare(self, runs: list[Run], expected: list[np.ndarray]) -> Verdict:
+    def _compare(self, runs: list[Run], expected: list[Floats]) -> Verdict:
         values = [v for r in runs if (v := _as_numbers(r.value)) is not None]
         changed = any(r.changed_input for r in runs)
         turned = [
@@ -218,8 +230,8 @@ class Exercise:
 
     def _wrong(
         self,
-        values: list[np.ndarray],
-        expected: list[np.ndarray],
+        values: list[Floats],
+        expected: list[Floats],
         agree: list[bool],
         formal: list[Mistake],
     ) -> Verdict:
@@ -245,7 +257,7 @@ class Exercise:
             "case by hand, one step at a time, and compare.",
         )
 
-    def _seen_in(self, case: int, mistakes: tuple[Mistake, ...], want: np.ndarray) -> Mistake:
+    def _seen_in(self, case: int, mistakes: tuple[Mistake, ...], want: Floats) -> Mistake:
         """The first of several mistakes that by itself shows in this case."""
         for mistake in mistakes:
             value = self._answer((mistake,), self.cases[case])
@@ -284,16 +296,16 @@ class Exercise:
             if a.step != b.step:
                 yield (a, b) if order.index(a.step) < order.index(b.step) else (b, a)
 
-    def _explains(self, mistakes: tuple[Mistake, ...], values: list[np.ndarray]) -> bool:
+    def _explains(self, mistakes: tuple[Mistake, ...], values: list[Floats]) -> bool:
         """Whether a wrong model gives exactly these values.
 
         Where the model itself overflows (an iteration that diverges, say) nobody's arithmetic
         agrees, and the case is left out; so one case at least must show that the model is wrong.
         """
         shown = False
-        for value, args in zip(values, self.cases, strict=True):
+        for value, args in zip(values[::-1], self.cases[::-1], strict=True):  # the last tell most
             wrong = self._answer(mistakes, args)
-            if wrong is None or not (self.nan_answers or np.isfinite(wrong).all()):
+            if wrong is None:
                 continue
             if not self._agrees(value, wrong):
                 return False
@@ -301,17 +313,28 @@ class Exercise:
             shown = shown or right is None or not self._agrees(wrong, right)
         return shown
 
-    def _answer(self, mistakes: tuple[Mistake, ...], args: tuple[Any, ...]) -> np.ndarray | None:
-        """What a wrong model makes of a case; kept, because every check asks all of them."""
+    def _answer(self, mistakes: tuple[Mistake, ...], args: tuple[Any, ...]) -> Floats | None:
+        """What a wrong model makes of a case, None where it overflows.
+
+        It is kept, because every check asks all of them.
+        """
         key = (*map(id, mistakes), id(args))
         if key not in self._known:
-            self._known[key] = _as_numbers(_run(self.model(*mistakes), args).value)
+            value = _as_numbers(_run(self.model(*mistakes), args).value)
+            overflows = value is not None and not self.nan_answers and not np.isfinite(value).all()
+            self._known[key] = None if overflows else value
         return self._known[key]
 
-    def _agrees(self, value: np.ndarray, want: np.ndarray) -> bool:
-        return np.allclose(value, want, rtol=1e-9, atol=self.tolerance, equal_nan=True)
+    def _agrees(self, value: Floats, want: Floats) -> bool:
+        """As np.allclose says with equal_nan, in a third of its time: checks ask this often."""
+        with np.errstate(all="ignore"):
+            off = np.abs(value - want)
+            if (off > self.tolerance + 1e-9 * np.abs(want)).any():
+                return False
+        equal = (value == want) | (np.isnan(value) & np.isnan(want))
+        return bool((np.isfinite(off) | equal).all())
 
-    def _evidence(self, index: int, value: np.ndarray, want: np.ndarray) -> str:
+    def _evidence(self, index: int, value: Floats, want: Floats) -> str:
         """The first failing case, or its row that is furthest off, with its input."""
         args = self.cases[index]
         if want.ndim and self.per_row:
@@ -387,11 +410,11 @@ def _what_was_raised(error: BaseException, function: Callable[..., Any]) -> str:
     return f"{said} at `{source}`" if source else said
 
 
-def _shape(array: np.ndarray) -> str:
+def _shape(array: Floats) -> str:
     return f"an array of shape {array.shape}" if array.ndim else "one number"
 
 
-def _as_numbers(value: Any) -> np.ndarray | None:
+def _as_numbers(value: Any) -> Floats | None:
     try:
         array = np.asarray(value)
         return array.astype(float) if array.dtype.kind in "fiub" else None

@@ -1,22 +1,21 @@
-"""Notebook 04: its checkpoints, its two exercises and the mistakes that people make in them."""
+"""Notebook 04: its two exercises and the mistakes that people make in them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from coursekit.arrays import Floats
 from coursekit.geometry import make_transform
-from coursekit.lessons.checkpoints import Choice, Classic, Number, Option
 from coursekit.lessons.exercises import Exercise, Model, Step
-from coursekit.lessons.objectives import Objective
 
-Array = np.ndarray
-Pair = tuple[Array, Array]
+Pair = tuple[Floats, Floats]
 
 
-def _pose(rng: np.random.Generator, reach_m: float = 0.5) -> Array:
+def _pose(rng: np.random.Generator, reach_m: float = 0.5) -> Floats:
     turn = Rotation.from_rotvec(rng.uniform(-1.2, 1.2, 3))
     return make_transform(turn, rng.uniform(-reach_m, reach_m, 3))
 
@@ -24,30 +23,32 @@ def _pose(rng: np.random.Generator, reach_m: float = 0.5) -> Array:
 # --- motion_pair ---
 
 
-def _inverse(T: Array) -> Array:
+def _inverse(T: Floats) -> Any:
     return np.linalg.inv(T)
 
 
-def _gripper_motion(first: Array, second: Array, inverse: Step) -> Array:
+def _gripper_motion(first: Floats, second: Floats, inverse: Step) -> Floats:
     """The gripper at pose i, as the gripper at pose j sees it."""
     return inverse(second) @ first
 
 
-def _camera_motion(first: Array, second: Array, inverse: Step) -> Array:
+def _camera_motion(first: Floats, second: Floats, inverse: Step) -> Floats:
     """The camera at pose i, as the camera at pose j sees it, by way of the board."""
     return second @ inverse(first)
 
 
-def _stacked(A: Array, B: Array) -> Array:
+def _stacked(A: Floats, B: Floats) -> Floats:
     return np.stack([A, B])
 
 
-def _in_order(i: Array, j: Array) -> Pair:
+def _in_order(i: Floats, j: Floats) -> Pair:
     return i, j
 
 
 def _build_pair(steps: Mapping[str, Step]) -> Model:
-    def motion_pair(gripper_i: Array, gripper_j: Array, board_i: Array, board_j: Array) -> Array:
+    def motion_pair(
+        gripper_i: Floats, gripper_j: Floats, board_i: Floats, board_j: Floats
+    ) -> Floats:
         invert = steps["inverse"]
         A = steps["A"](*steps["A pair"](gripper_i, gripper_j), invert)
         B = steps["B"](*steps["B pair"](board_i, board_j), invert)
@@ -56,7 +57,7 @@ def _build_pair(steps: Mapping[str, Step]) -> Model:
     return motion_pair
 
 
-def _session_pair(seed: int, plain: bool = False) -> tuple[Array, ...]:
+def _session_pair(seed: int, plain: bool = False) -> tuple[Floats, ...]:
     """Two arm poses and the board as the camera saw it at each, of one and the same X."""
     rng = np.random.default_rng(seed)
     X, board = _pose(rng, 0.1), _pose(rng)
@@ -101,101 +102,100 @@ MOTION_PAIR = Exercise(
 )
 
 
-@MOTION_PAIR.mistake(
-    "inverse",
-    "the inverse of a pose is not its transpose",
-    "A rotation's inverse is its transpose. A pose also has a translation: what becomes of it?",
-)
-def transposed_pose(T: Array) -> Array:
+@MOTION_PAIR.mistake("inverse")
+def transposed_pose(T: Floats) -> Floats:
+    """the inverse of a pose is not its transpose
+
+    A rotation's inverse is its transpose. A pose also has a translation: what becomes of it?
+    """
     return T.T
 
 
-@MOTION_PAIR.mistake(
-    "inverse",
-    "in your inverse the translation only changes its sign",
-    "R^T undoes the rotation. In which frame is -t, and in which one is it wanted?",
-)
-def translation_not_turned(T: Array) -> Array:
+@MOTION_PAIR.mistake("inverse")
+def translation_not_turned(T: Floats) -> Floats:
+    """in your inverse the translation only changes its sign
+
+    R^T undoes the rotation. In which frame is -t, and in which one is it wanted?
+    """
     return make_transform(T[:3, :3].T, -T[:3, 3])
 
 
-@MOTION_PAIR.mistake(
-    "inverse",
-    "nothing is inverted",
-    "Which of the two poses must be undone so that the base frame cancels?",
-)
-def not_inverted(T: Array) -> Array:
+@MOTION_PAIR.mistake("inverse")
+def not_inverted(T: Floats) -> Floats:
+    """nothing is inverted
+
+    Which of the two poses must be undone so that the base frame cancels?
+    """
     return T
 
 
-@MOTION_PAIR.mistake(
-    "A",
-    "A is the motion seen from the base: that is the A of a camera that does not ride on the arm",
-    "X stands to the right of A, and takes camera coordinates to gripper coordinates. In which "
-    "frame must A begin and end?",
-)
-def motion_in_base(first: Array, second: Array, inverse: Step) -> Array:
+@MOTION_PAIR.mistake("A")
+def motion_in_base(first: Floats, second: Floats, inverse: Step) -> Floats:
+    """A is the motion seen from the base: that is the A of a camera that does not ride on the arm
+
+    X stands to the right of A, and takes camera coordinates to gripper coordinates. In which frame
+    must A begin and end?
+    """
     return second @ inverse(first)
 
 
-@MOTION_PAIR.mistake(
-    "A pair",
-    "in A the poses i and j are exchanged, in B they are not",
-    "The board is in the same place: T_i X B_i = T_j X B_j. Bring all arm poses to the left.",
-)
-def a_exchanged(i: Array, j: Array) -> Pair:
+@MOTION_PAIR.mistake("A pair")
+def a_exchanged(i: Floats, j: Floats) -> Pair:
+    """in A the poses i and j are exchanged, in B they are not
+
+    The board is in the same place: T_i X B_i = T_j X B_j. Bring all arm poses to the left.
+    """
     return j, i
 
 
-@MOTION_PAIR.mistake(
-    "B pair",
-    "in B the poses i and j are exchanged, in A they are not",
-    "The board is in the same place: T_i X B_i = T_j X B_j. Bring all detections to the right.",
-)
-def b_exchanged(i: Array, j: Array) -> Pair:
+@MOTION_PAIR.mistake("B pair")
+def b_exchanged(i: Floats, j: Floats) -> Pair:
+    """in B the poses i and j are exchanged, in A they are not
+
+    The board is in the same place: T_i X B_i = T_j X B_j. Bring all detections to the right.
+    """
     return j, i
 
 
-@MOTION_PAIR.mistake(
-    "B",
-    "B is the motion of the camera seen from the board",
-    "X stands to the left of B, and takes camera coordinates in. In which frame must B begin and "
-    "end?",
-)
-def motion_in_board(first: Array, second: Array, inverse: Step) -> Array:
+@MOTION_PAIR.mistake("B")
+def motion_in_board(first: Floats, second: Floats, inverse: Step) -> Floats:
+    """B is the motion of the camera seen from the board
+
+    X stands to the left of B, and takes camera coordinates in. In which frame must B begin and end?
+    """
     return inverse(second) @ first
 
 
-@MOTION_PAIR.mistake(
-    "order",
-    "both motions go from j to i: a right equation, but not the one that was asked for",
-    "A = inverse(T_j) T_i. And yours?",
-)
-def both_exchanged(A: Array, B: Array) -> Array:
+@MOTION_PAIR.mistake("order")
+def both_exchanged(A: Floats, B: Floats) -> Floats:
+    """both motions go from j to i: a right equation, but not the one that was asked for
+
+    A = inverse(T_j) T_i. And yours?
+    """
     return np.stack([np.linalg.inv(A), np.linalg.inv(B)])
 
 
-@MOTION_PAIR.mistake(
-    "order",
-    "A and B are exchanged",
-    "Which one comes from the arm?",
-)
-def b_first(A: Array, B: Array) -> Array:
+@MOTION_PAIR.mistake("order")
+def b_first(A: Floats, B: Floats) -> Floats:
+    """A and B are exchanged
+
+    Which one comes from the arm?
+    """
     return np.stack([B, A])
 
 
 # --- rotation_half ---
 
 
-def _axes(R_A: Array, R_B: Array) -> Pair:
+def _axes(R_A: Floats, R_B: Floats) -> Pair:
     return Rotation.from_matrix(R_A).as_rotvec(), Rotation.from_matrix(R_B).as_rotvec()
 
 
-def _used(a: Array, b: Array) -> Pair:
+def _used(a: Floats, b: Floats) -> Pair:
     return a, b
 
 
-def _turn(a: Array, b: Array) -> Array:
+def _turn(a: Floats, b: Floats) -> Floats:
     """The rotation that takes each b to its a: Kabsch's; the smallest one for a single pair."""
     if len(a) == 1:
         return np.asarray(Rotation.align_vectors(a, b)[0].as_matrix())
@@ -204,7 +204,7 @@ def _turn(a: Array, b: Array) -> Array:
 
 
 def _build_half(steps: Mapping[str, Step]) -> Model:
-    def rotation_half(R_A: Array, R_B: Array) -> Array:
+    def rotation_half(R_A: Floats, R_B: Floats) -> Floats:
         return steps["result"](steps["turn"](*steps["used"](*steps["axes"](R_A, R_B))))
 
     return rotation_half
@@ -242,22 +242,22 @@ ROTATION_HALF = Exercise(
 )
 
 
-@ROTATION_HALF.mistake(
-    "result",
-    "that is the inverse of R_X",
-    "R_X takes camera coordinates to gripper coordinates. Which axes did you turn into which?",
-)
-def inverse_of_x(R: Array) -> Array:
+@ROTATION_HALF.mistake("result")
+def inverse_of_x(R: Floats) -> Floats:
+    """that is the inverse of R_X
+
+    R_X takes camera coordinates to gripper coordinates. Which axes did you turn into which?
+    """
     return R.T
 
 
-@ROTATION_HALF.mistake(
-    "turn",
-    "with two motions your result is a mirror image: its determinant is -1",
-    "Two axes lie in a plane, and a plane looks the same in a mirror. Print the determinant. "
-    "What does Kabsch's method do about it?",
-)
-def mirror_image(a: Array, b: Array) -> Array:
+@ROTATION_HALF.mistake("turn")
+def mirror_image(a: Floats, b: Floats) -> Floats:
+    """with two motions your result is a mirror image: its determinant is -1
+
+    Two axes lie in a plane, and a plane looks the same in a mirror. Print the determinant. What
+    does Kabsch's method do about it?
+    """
     U, _, Vt = np.linalg.svd(a.T @ b)
     mirror = U @ Vt
     if len(a) == 2:  # the third singular direction has no sign: take the one that mirrors
@@ -265,205 +265,48 @@ def mirror_image(a: Array, b: Array) -> Array:
     return mirror
 
 
-@ROTATION_HALF.mistake(
-    "turn",
-    "that is the least-squares matrix for the axes, and it is not made a rotation",
-    "Multiply your result by its transpose. With two motions, what can a matrix not know?",
-)
-def not_a_rotation(a: Array, b: Array) -> Array:
+@ROTATION_HALF.mistake("turn")
+def not_a_rotation(a: Floats, b: Floats) -> Any:
+    """that is the least-squares matrix for the axes, and it is not made a rotation
+
+    Multiply your result by its transpose. With two motions, what can a matrix not know?
+    """
     return np.linalg.lstsq(b, a, rcond=None)[0].T
 
 
-@ROTATION_HALF.mistake(
-    "used",
-    "only the first motion is used",
-    "One axis leaves the turn about it free. How many motions fix it?",
-)
-def first_motion_only(a: Array, b: Array) -> Pair:
+@ROTATION_HALF.mistake("used")
+def first_motion_only(a: Floats, b: Floats) -> Pair:
+    """only the first motion is used
+
+    One axis leaves the turn about it free. How many motions fix it?
+    """
     return a[:1], b[:1]
 
 
-@ROTATION_HALF.mistake(
-    "result",
-    "its sign is wrong: -R solves the equation as well, and is no rotation",
-    "Print the determinant. A null vector has no sign of its own: how do you choose it?",
-)
-def negative(R: Array) -> Array:
+@ROTATION_HALF.mistake("result")
+def negative(R: Floats) -> Floats:
+    """its sign is wrong: -R solves the equation as well, and is no rotation
+
+    Print the determinant. A null vector has no sign of its own: how do you choose it?
+    """
     return -R
 
 
-@ROTATION_HALF.mistake(
-    "result",
-    "it is a rotation but for a factor",
-    "A null vector of length 1 has nine entries, and a rotation matrix has three rows of length 1. "
-    "What is missing?",
-)
-def not_scaled(R: Array) -> Array:
+@ROTATION_HALF.mistake("result")
+def not_scaled(R: Floats) -> Floats:
+    """it is a rotation but for a factor
+
+    A null vector of length 1 has nine entries, and a rotation matrix has three rows of length 1.
+    What is missing?
+    """
     return R / np.sqrt(3)
 
 
-@ROTATION_HALF.mistake(
-    "result",
-    "it is a rotation but for a factor and the sign",
-    "A null vector of length 1 has no sign of its own, and nine entries. Print the determinant of "
-    "your result, and that of a rotation.",
-)
-def not_scaled_and_negative(R: Array) -> Array:
+@ROTATION_HALF.mistake("result")
+def not_scaled_and_negative(R: Floats) -> Floats:
+    """it is a rotation but for a factor and the sign
+
+    A null vector of length 1 has no sign of its own, and nine entries. Print the determinant of
+    your result, and that of a rotation.
+    """
     return -R / np.sqrt(3)
-
-
-EXERCISES = (MOTION_PAIR, ROTATION_HALF)
-
-
-# --- checkpoints ---
-
-CHECKPOINTS = (
-    Choice(
-        name="hand_eye.eye_to_hand",
-        question="Now the camera stands on the table and the board is in the gripper. "
-        "X = T_base_camera is constant, and so is T_gripper_board. Which A makes AX = XB true, "
-        "with the same B as before?",
-        options=(
-            Option(
-                "A = inverse(T_base_gripper(j)) T_base_gripper(i), as before: AX = XB is AX = XB",
-                "The letters are the same, the frames are not. X now begins in the base, so A has "
-                "to begin and end in the base; this A begins and ends in the gripper.",
-            ),
-            Option(
-                "A = T_base_gripper(j) inverse(T_base_gripper(i))",
-                "T_gripper_board = inverse(T_i) X C_i is the same at i and j (C: the board in the "
-                "camera). Multiply by T_j from the left and by inverse(C_i) from the right. It is "
-                "the same as feeding the old equation with inverted arm poses.",
-                right=True,
-            ),
-            Option(
-                "A = T_base_gripper(i) T_base_gripper(j)",
-                "Neighbouring frames must match in a product, and gripper meets base here. One of "
-                "the two has to be inverted.",
-            ),
-            Option(
-                "None: a camera that does not move cannot be calibrated by moving the arm",
-                "What has to move is the board against the camera, and it does. B is not the "
-                "identity.",
-            ),
-        ),
-    ),
-    Choice(
-        name="hand_eye.inverted_poses",
-        question="A driver reports T_gripper_base where you expect T_base_gripper, and nobody "
-        "notices. The camera is on the wrist, the board on the table, detections are clean. What "
-        "will the solver do?",
-        options=(
-            Option(
-                "It returns the inverse of X",
-                "That would be the result if the whole equation were inverted. Here only A is "
-                "another matrix, and no X solves that equation.",
-            ),
-            Option(
-                "It returns some X, and the residuals are large: many centimetres and degrees",
-                "With inverted poses A is the motion seen from the base. That is the equation of "
-                "a camera that stands still, and no constant X solves it on these data. The "
-                "solver minimises all the same, and returns what is least wrong.",
-                right=True,
-            ),
-            Option(
-                "It stops with an error: the data contradict each other",
-                "One or the other may stop (OpenCV's Park can end in a mirror image). Most do not "
-                "look at what they leave over. You have to.",
-            ),
-            Option(
-                "Nothing: the inverse of a pose is as good as the pose",
-                "It holds the same information, for somebody who knows that it is inverted.",
-            ),
-        ),
-    ),
-    Choice(
-        name="hand_eye.translation_grid",
-        question="Twenty-five poses with the camera on the wrist: a grid of 5 x 5 places, the "
-        "wrist always turned the same way. Every detection is clean, arm and images belong "
-        "together, and yet the solved X is wildly wrong. Why?",
-        options=(
-            Option(
-                "25 poses are too few for the noise of the detections",
-                "A hundred poses on a finer grid would be as bad. It is not the number.",
-            ),
-            Option(
-                "The grid is flat: some poses should be nearer to the board than others",
-                "A third direction of translation says nothing new about t_X either. Look at what "
-                "multiplies t_X in the equation.",
-            ),
-            Option(
-                "The wrist never turns, so R_A = I and t_X drops out of the equation",
-                "(R_A - I) t_X = R_X t_B - t_A: with R_A = I the left side is zero whatever t_X "
-                "is. What remains, t_A = R_X t_B, does determine R_X. But t_X is anything.",
-                right=True,
-            ),
-            Option(
-                "The board is seen from one side only, so PnP mistakes its tilt",
-                "That makes detections noisy, and these are clean. The equation itself has a hole.",
-            ),
-        ),
-    ),
-    Number(
-        name="hand_eye.lever",
-        question="The rotation of X is wrong by 0.3 degrees. By how much, at most, is a point "
-        "0.40 m in front of the camera misplaced for that, in mm?",
-        value=1000 * 0.40 * float(np.radians(0.3)),
-        unit="mm",
-        why="An angle is a length at the end of a lever: 0.3 degrees are 5.2 mrad, times 400 mm. "
-        "So ask of every X where the point is that you need, before you ask how good X is.",
-        classics=(
-            Classic(120.0, "0.3 times 400: the angle has to be in radians before it is a slope."),
-            Classic(
-                0.12,
-                "0.3 times 0.4: the angle has to be in radians, and metres become millimetres.",
-            ),
-        ),
-        hint="Arc = angle times lever, with the angle in radians.",
-    ),
-    Choice(
-        name="hand_eye.more_poses",
-        question="The arm's joints are off by a fraction of a degree, always the same: FK is "
-        "wrong by 2 to 4 mm, in a way that depends on the pose. You take 100 poses instead of 25. "
-        "What happens to X?",
-        options=(
-            Option(
-                "Its error halves: four times the data, half the error",
-                "That is what noise does. An offset of a joint is the same in all 100 poses.",
-            ),
-            Option(
-                "Its stated sigma halves, its error falls far less",
-                "The covariance believes that residuals are independent. These are not: they "
-                "share the joints' offsets. So the interval shrinks around a wrong value, unless "
-                "the fit is told about the arm.",
-                right=True,
-            ),
-            Option(
-                "Both grow: more poses bring more FK error",
-                "More poses do not make any single one worse.",
-            ),
-            Option(
-                "Nothing, because FK errors cancel in A = inverse(T_j) T_i",
-                "Only what is the same *transform* in both poses cancels. An offset of the elbow "
-                "moves the wrist differently in each pose.",
-            ),
-        ),
-    ),
-)
-
-OBJECTIVES = (
-    Objective("derive AX = XB for both mounts", ("hand_eye.eye_to_hand",)),
-    Objective(
-        "say which poses determine X, and which part of it others leave free",
-        ("hand_eye.translation_grid",),
-    ),
-    Objective("say in millimetres how good an X is", ("hand_eye.lever",)),
-    Objective(
-        "(deeper) build A and B, and solve the equation",
-        ("hand_eye.motion_pair", "hand_eye.rotation_half"),
-    ),
-    Objective(
-        "(deeper) say what the arm's own error does, and name mistakes by their evidence",
-        ("hand_eye.more_poses", "hand_eye.inverted_poses"),
-    ),
-)

@@ -1,22 +1,124 @@
-"""Where a student stands in the whole course: `ck.progress()`."""
+"""All lessons together: every checkpoint and exercise by name, and where a student stands."""
 
 from __future__ import annotations
 
 import html
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from coursekit import results
+from coursekit.lessons import depth_noise, error_budget, hand_eye, intrinsics, pinhole
 from coursekit.lessons import progress as record
+from coursekit.lessons.exercises import Exercise
+from coursekit.lessons.progress import Verdict
+from coursekit.lessons.questions import Checkpoint, Objective, load
+from coursekit.words import html_table, table
 
-DONE = ("right", "core right")
+LESSONS = ("pinhole", "depth_noise", "intrinsics", "hand_eye", "error_budget")  # by notebook
+
+_LOADED = {lesson: load(lesson) for lesson in LESSONS}
+CHECKPOINTS: dict[str, Checkpoint] = {c.name: c for asked, _ in _LOADED.values() for c in asked}
+EXERCISES: dict[str, Exercise] = {
+    exercise.name: exercise
+    for exercise in (
+        pinhole.PROJECT,
+        pinhole.DEPROJECT,
+        depth_noise.DEPTH_NOISE,
+        depth_noise.ROBUST_DEPTH,
+        intrinsics.REPROJECTION_RMS,
+        intrinsics.FOCAL_SIGMA,
+        hand_eye.MOTION_PAIR,
+        hand_eye.ROTATION_HALF,
+        error_budget.SENSITIVITIES,
+    )
+}
+DONE = {"right", "core right"}
+WORDS = {"wrong": "not right yet", "raised": "raised an error"}
+
+
+def checkpoint(name: str) -> Checkpoint:
+    """The checkpoint `lesson.topic`, as the notebooks write it: `ck.checkpoint("pinhole.zoom")`.
+
+    Raises ValueError, with all names, for one that there is not.
+
+    >>> checkpoint("pinhole.pitch")
+    Checkpoint: commit your answer with ck.checkpoint("pinhole.pitch").answer(...)
+    """
+    return _find("name", "checkpoint", name, CHECKPOINTS)
+
+
+def check(name: str, function: Callable[..., Any]) -> Verdict:
+    """What is right or wrong with a learner's function: `ck.check("pinhole.project", project)`.
+
+    Raises ValueError, with all names, for an exercise that there is not; whatever the function
+    does is told in the verdict.
+
+    >>> check("pinhole.project", lambda points, K, dist=None: None)
+    project: not attempted yet: it returns None.
+    """
+    return _find("name", "exercise", name, EXERCISES).check(function)
+
+
+def evidence(lesson: str) -> Evidence:
+    """The objectives of a lesson and the student's own evidence: `ck.evidence("pinhole")`.
+
+    Raises ValueError, with all names, for a lesson that there is not.
+
+    >>> evidence("pinhole").objectives[3].names
+    ('pinhole.range',)
+    """
+    return Evidence(_find("lesson", "lesson", lesson, _LOADED)[1])
+
+
+def _find(argument: str, kind: str, name: str, known: dict[str, Any]) -> Any:
+    if name not in known:
+        raise ValueError(f"{argument}: there is no {kind} {name!r}; there are {', '.join(known)}")
+    return known[name]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The objectives of a lesson, each with how its checkpoints and exercises stand."""
+
+    objectives: tuple[Objective, ...]
+
+    def rows(self) -> list[tuple[str, str]]:
+        """(objective, evidence) as text; a later attempt counts, the first one is mentioned."""
+        attempts = record.read()
+
+        def state(name: str) -> str:
+            nothing = "not attempted yet" if name in EXERCISES else "not answered yet"
+            topic = name.partition(".")[2].replace("_", " ")
+            return f"{topic}: {_state(attempts.get(name, [])) or nothing}"
+
+        return [(o.text, "; ".join(map(state, o.names))) for o in self.objectives]
+
+    def __repr__(self) -> str:
+        return "\n".join(f"- {text}\n  {evidence}" for text, evidence in self.rows())
+
+    def _repr_html_(self) -> str:
+        return html_table(("I can", "what shows it"), self.rows())
+
+
+def _state(attempts: list[dict[str, str]]) -> str:
+    """The best that there was: right, and when; the core right; else how the last one stands."""
+    kinds = [a["kind"] for a in attempts]
+    if "right" in kinds:
+        tries = kinds.index("right") + 1
+        return "right" if tries == 1 else f"right at try {tries}"
+    if "core right" in kinds:
+        return "core right"
+    return WORDS.get(kinds[-1], kinds[-1]) if kinds else ""
 
 
 @dataclass(frozen=True)
 class Standing:
     """One notebook: how many checkpoints and exercises it has, and how the student's stand.
 
-    first_try, later: checkpoints answered rightly; exercises: those that are right. open: names of
-    what is not right yet, in the notebook's order. result: what `results/` holds of it, in words.
+    first_try, later: checkpoints answered rightly; exercises: those that are right, and all.
+    open: names of what is not right yet, in the notebook's order. result: what `results/` holds of
+    it, in words.
     """
 
     notebook: str
@@ -36,7 +138,7 @@ class Overview:
 
     @property
     def next(self) -> str:
-        """One sentence."""
+        """What to do next, in one sentence."""
         begun = [s for s in self.standings if s.result or s.first_try or s.later or s.exercises[0]]
         for standing in self.standings:
             if not standing.result.startswith("from"):
@@ -64,52 +166,41 @@ class Overview:
         ]
 
     def __repr__(self) -> str:
-        rows = [("notebook", "checkpoints", "exercises", "results"), *self.rows()]
-        widths = [max(len(row[i]) for row in rows) for i in range(4)]
-        lines = [
-            "  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip()
-            for row in rows
-        ]
-        return "\n".join([*lines, self.next])
+        head = ("notebook", "checkpoints", "exercises", "results")
+        return f"{table(head, self.rows())}\n{self.next}"
 
     def _repr_html_(self) -> str:
-        def row(tag: str, cells: tuple[str, ...]) -> str:
-            texts = (f"<{tag} style='text-align:left'>{html.escape(c)}</{tag}>" for c in cells)
-            return f"<tr>{''.join(texts)}</tr>"
-
-        head = row("th", ("notebook", "right checkpoints", "right exercises", "results"))
-        body = "".join(row("td", cells) for cells in self.rows())
-        return f"<table>{head}{body}</table><p>{html.escape(self.next)}</p>"
+        head = ("notebook", "right checkpoints", "right exercises", "results")
+        return f"{html_table(head, self.rows())}<p>{html.escape(self.next)}</p>"
 
 
 def progress() -> Overview:
-    """What was answered and what is in `results/`, over all notebooks."""
-    from coursekit import lessons  # which imports this module
+    """What was answered and what is in `results/`, over all notebooks.
 
-    attempts = record.read()
-    kinds = {name: [attempt["kind"] for attempt in tries] for name, tries in attempts.items()}
-    standings = []
-    for number, lesson in enumerate(lessons.LESSONS, start=1):
-        questions, tasks = (
-            [name for name in found if name.startswith(f"{lesson}.")]
-            for found in (lessons.checkpoints(), lessons.exercises())
-        )
+    >>> [standing.notebook for standing in progress().standings][:2]
+    ['01_pinhole', '02_depth_noise']
+    """
+    kinds = {name: [a["kind"] for a in attempts] for name, attempts in record.read().items()}
+
+    def standing(notebook: str, prefix: str) -> Standing:
+        questions = [name for name in CHECKPOINTS if name.startswith(prefix)]
+        tasks = [name for name in EXERCISES if name.startswith(prefix)]
         done = [name for name in questions if "right" in kinds.get(name, ())]
         first = [name for name in done if kinds[name][0] == "right"]
-        solved = [name for name in tasks if set(DONE) & set(kinds.get(name, ()))]
+        solved = [name for name in tasks if DONE.intersection(kinds.get(name, ()))]
         left = (name for name in (*questions, *tasks) if name not in (*done, *solved))
-        standings.append(
-            Standing(
-                notebook=f"{number:02d}_{lesson}",
-                checkpoints=len(questions),
-                first_try=len(first),
-                later=len(done) - len(first),
-                exercises=(len(solved), len(tasks)),
-                open=tuple(name.partition(".")[2] for name in left),
-                result=_result(f"{number:02d}_{lesson}"),
-            )
+        return Standing(
+            notebook,
+            checkpoints=len(questions),
+            first_try=len(first),
+            later=len(done) - len(first),
+            exercises=(len(solved), len(tasks)),
+            open=tuple(name.partition(".")[2] for name in left),
+            result=_result(notebook),
         )
-    return Overview(tuple(standings))
+
+    numbered = enumerate(LESSONS, start=1)
+    return Overview(tuple(standing(f"{n:02d}_{name}", f"{name}.") for n, name in numbered))
 
 
 def _result(notebook: str) -> str:

@@ -1,21 +1,69 @@
-"""Which checkpoints were answered and which exercises are right: `progress.json` in `results/`.
+"""What a checkpoint or a check says back, and the record of it: `progress.json` in `results/`.
 
-Nothing here is ever printed by a lesson, so no stored output depends on earlier runs.
+Nothing of the record is ever printed by a lesson, so no stored output depends on earlier runs.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
+import html
+import re
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 from coursekit import results
-from coursekit.lessons.verdict import Verdict
 
 FILE = "progress.json"
+Kind = Literal["right", "core right", "wrong", "raised", "not attempted"]
+
+# Okabe-Ito; the word beside it says the same, so nothing hangs on the colour.
+COLORS = {
+    "right": "#009E73",
+    "core right": "#009E73",
+    "wrong": "#D55E00",
+    "raised": "#D55E00",
+    "not attempted": "#56B4E9",
+}
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A headline and a few lines; `named` is the misconception that was recognised, if one was.
+
+    In the texts *asterisks* set emphasis and `backticks` code.
+    """
+
+    subject: str
+    kind: Kind
+    headline: str
+    lines: tuple[str, ...] = ()
+    named: str | None = None
+
+    def __repr__(self) -> str:
+        return "\n".join([self.headline, *self.lines])
+
+    def _repr_html_(self) -> str:
+        body = "".join(f"<div>{_markup(line)}</div>" for line in self.lines)
+        return (
+            f'<div style="border-left: 4px solid {COLORS[self.kind]}; padding: 2px 0 2px 12px;'
+            f' line-height: 1.4; max-width: 52em">'
+            f"<b>{_markup(self.headline)}</b>{body}</div>"
+        )
+
+
+def _markup(text: str) -> str:
+    """The text as HTML, everything in it escaped but for the two kinds of marks."""
+    text = html.escape(text, quote=False)
+    text = re.sub(r"`([^`]+)`", r"<code>\1</code>", text)
+    return re.sub(r"\*([^*\s][^*]*)\*", r"<em>\1</em>", text)
 
 
 def noted(verdict: Verdict, answer: str = "") -> Verdict:
-    """Add an attempt to the record; a verdict that cannot be saved says so in its last line."""
+    """Add an attempt to the record, unless the verdict says that there was none.
+
+    A verdict that cannot be saved says so in its last line.
+    """
+    if verdict.kind == "not attempted":
+        return verdict
     attempt = {"kind": verdict.kind, "answer": answer, "date": results.now()}
     try:
         attempts = read()
@@ -27,7 +75,10 @@ def noted(verdict: Verdict, answer: str = "") -> Verdict:
 
 
 def read() -> dict[str, list[dict[str, Any]]]:
-    """All attempts by name, oldest first; a damaged file is set aside, not overwritten."""
+    """All attempts by name, oldest first; a damaged file is set aside, not overwritten.
+
+    Each attempt has the keys kind (as in `Verdict`), answer and date.
+    """
     path = results.folder() / FILE
     if not path.exists():
         return {}

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from coursekit.plots import depth_noise, error_budget, hand_eye, intrinsics, pinhole
-from coursekit.plots.interactive import drag
-from coursekit.plots.style import COLORS, LessonFigure, figure
+from coursekit.plots.style import COLORS, LessonFigure, drag, figure
 
 __all__ = [
     "COLORS",

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.patches import Ellipse, Rectangle
 from matplotlib.ticker import MultipleLocator
-from numpy.typing import ArrayLike, NDArray
 
-from coursekit.plots.style import COLORS, LessonFigure, figure
-
-if TYPE_CHECKING:
-    from coursekit.attribution.simulate import SimulatedMisses
-    from coursekit.budget import BestDistance, Draws, ErrorBudget, Gripper, Target
+from coursekit.arrays import ArrayLike, Floats
+from coursekit.attribution import SimulatedMisses
+from coursekit.budget import BestDistance, Draws, ErrorBudget, Gripper, Target
+from coursekit.plots.style import COLORS, LessonFigure, figure, single
 
 KINDS = {"bias": "measured", "noise": "depth"}
 CHI2_95 = 5.991  # of two degrees of freedom
@@ -29,8 +27,7 @@ def bars(budget: ErrorBudget) -> LessonFigure:
     where the rows know their directions.
     """
     rows, averaged = budget.rows, budget.averaged_m
-    fig = figure(8.6, 0.5 * len(rows) + 1.3)
-    ax = fig.subplots()
+    fig, ax = single(8.6, 0.5 * len(rows) + 1.3)
     said = []
     for y, row in enumerate(rows):
         name, kind = row.term.name, row.term.kind
@@ -51,8 +48,7 @@ def bars(budget: ErrorBudget) -> LessonFigure:
     right = max(11.0, 1050 * max(row.high_m for row in rows))
     ax.set(xlabel="at the object (mm)", xlim=(0, right), ylim=(len(rows) - 0.5, -1.0))
     ax.set_ylabel(" ")
-    fig.alt = "The budget's rows at the object: " + "; ".join(said)
-    return fig
+    return fig.saying("The budget's rows at the object: " + "; ".join(said))
 
 
 def biases(draws: Draws, tolerance_m: float) -> LessonFigure:
@@ -72,11 +68,10 @@ def biases(draws: Draws, tolerance_m: float) -> LessonFigure:
     along.set(xlabel="bias along the closing axis (mm)")
     length.set_title(f"{over:.1f} % beyond ±{1000 * tolerance_m:g} mm")
     along.set_title(f"{out:.1f} % beyond ±{1000 * tolerance_m:g} mm")
-    fig.alt = (
+    return fig.saying(
         f"Bias of many rigs: mean length {norm.mean():.1f} mm, {over:.1f} % longer than "
         f"{1000 * tolerance_m:g} mm; along the closing axis {out:.1f} % beyond it."
     )
-    return fig
 
 
 def between_fingers(
@@ -113,19 +108,16 @@ def between_fingers(
     above = fig.add_subplot(grid[1])
     above.plot(others[:, 0], others[:, 2], ".", ms=2, color=COLORS["ink"], alpha=0.5)
     half = _from_above(above, width, opening, covariance[::2, ::2], bias[::2])
-    fig.alt = (
+    return fig.saying(
         f"A {width:g} mm cube between fingers that open {opening:g} mm, with the ellipsoid that "
         f"holds its centre in 95 of 100 grasps, from above {half[0]:.1f} by {half[1]:.1f} mm to "
         f"either side, its middle {np.linalg.norm(bias):.1f} mm off, {bias[0]:+.1f} mm of it "
         f"along the closing axis; the room is ±{(opening - width) / 2:.1f} mm. {len(others)} dots: "
         "the same for other rigs, without noise."
     )
-    return fig
 
 
-def _from_above(
-    ax: Any, width: float, opening: float, covariance: NDArray[Any], bias: NDArray[Any]
-) -> NDArray[Any]:
+def _from_above(ax: Any, width: float, opening: float, covariance: Floats, bias: Floats) -> Floats:
     """Fingers, cube and the 95 % ellipse of (closing, lateral), mm; its half axes (2,)."""
     room, reach = (opening - width) / 2, opening / 2 + 10
     for side in (-1, 1):
@@ -146,7 +138,7 @@ def _from_above(
     return half
 
 
-def _surface(covariance: NDArray[Any], middle: NDArray[Any]) -> NDArray[Any]:
+def _surface(covariance: Floats, middle: Floats) -> Floats:
     """The 95 % ellipsoid as x, y, z to plot, (3, 17, 25): closing, lateral, up (mm)."""
     polar, around = np.meshgrid(np.linspace(0, np.pi, 17), np.linspace(0, 2 * np.pi, 25),
                                 indexing="ij")  # fmt: skip
@@ -167,17 +159,15 @@ def _box(ax: Any, middle: tuple[float, ...], size: tuple[float, ...], color: str
 
 def distances(best: BestDistance) -> LessonFigure:
     """A figure of the budget against the mounting distance, with what limits the distance."""
-    fig = figure(8.0, 3.6)
-    ax = fig.subplots()
+    fig, ax = single(8.0, 3.6)
     ax.plot(best.distances_m, 1000 * np.asarray(best.figures_m), color=COLORS["model"])
     ax.plot(best.distance_m, 1000 * best.figure_m, "o", color=COLORS["measured"])
     ax.set(xlabel="distance Z (m)", ylabel="error along closing (mm)", ylim=(0, None))
-    fig.alt = (
+    return fig.saying(
         f"Error along the closing axis against the mounting distance: least, "
         f"{1000 * best.figure_m:.1f} mm, at {best.distance_m:.2f} m; allowed are "
         f"{best.low_m:.2f} to {best.high_m:.2f} m."
     )
-    return fig
 
 
 def misses(sets: Mapping[str, SimulatedMisses]) -> LessonFigure:
@@ -192,9 +182,11 @@ def misses(sets: Mapping[str, SimulatedMisses]) -> LessonFigure:
         ax.set(xlim=(0.05, 0.5), ylim=(-0.42, 0.42), aspect="equal", title=name,
                xlabel="x of the base (m)", ylabel="y of the base (m)")  # fmt: skip
         ax.label_outer()
-    fig.alt = "Misses from above, ten times as long, where they happened: " + "; ".join(
-        f"{name}, {len(one.misses)} trials, mean "
-        f"{1000 * np.linalg.norm(one.misses.mean(axis=0)):.1f} mm"
-        for name, one in sets.items()
+    return fig.saying(
+        "Misses from above, ten times as long, where they happened: "
+        + "; ".join(
+            f"{name}, {len(one.misses)} trials, mean "
+            f"{1000 * np.linalg.norm(one.misses.mean(axis=0)):.1f} mm"
+            for name, one in sets.items()
+        )
     )
-    return fig

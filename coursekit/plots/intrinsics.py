@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 from matplotlib.patches import Polygon
-from numpy.typing import NDArray
 
-from coursekit.plots.style import COLORS, LessonFigure, figure
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from coursekit.boards import Board, Detection
-    from coursekit.intrinsics import Comparison, IntrinsicsResult
-
-Floats = NDArray[np.float64]
+from coursekit.arrays import Floats
+from coursekit.boards import Board, Detection
+from coursekit.geometry import project, transform_points
+from coursekit.intrinsics import Comparison, IntrinsicsResult
+from coursekit.intrinsics.fit import tilts
+from coursekit.plots.style import (
+    COLORS,
+    LessonFigure,
+    cross,
+    figure,
+    image_axes,
+    panels,
+    plain_ticks,
+    single,
+)
 
 F_PX = np.linspace(300, 1200, 181)
 ARROWS = 150  # residuals are drawn so many times too long
@@ -33,8 +40,7 @@ def best_fits(X: Floats, Y: Floats, seen: Mapping[str, Floats], f_px: float) -> 
     first all u, then all v. f_px: the true focal length. The model is a board that is turned by
     `tilt` about its Y axis: u = f X cos(tilt) / (Z + X sin(tilt)), v = f Y / (Z + X sin(tilt)).
     """
-    fig = figure(8.0, 4.2)
-    ax = fig.subplots()
+    fig, ax = single(8.0, 4.2)
     texts = []
     styles = zip(("-", "--", "-.", ":"), ("model", "cube", "color", "measured"), strict=True)
     for (style, color), (name, pixels) in zip(styles, seen.items(), strict=False):
@@ -46,8 +52,7 @@ def best_fits(X: Floats, Y: Floats, seen: Mapping[str, Floats], f_px: float) -> 
     ax.set(xlim=(F_PX[0], F_PX[-1]), ylim=(0, 3), xlabel="assumed focal length f (px)",
            ylabel="smallest RMS (px)")  # fmt: skip
     fig.legend(loc="outside right upper")
-    fig.alt = f"The smallest RMS against the assumed focal length. {'; '.join(texts)}."
-    return fig
+    return fig.saying(f"The smallest RMS against the assumed focal length. {'; '.join(texts)}.")
 
 
 def _best_rms(X: Floats, Y: Floats, seen: Floats) -> Floats:
@@ -76,8 +81,7 @@ def _best_rms(X: Floats, Y: Floats, seen: Floats) -> Floats:
 
 def board(board: Board) -> LessonFigure:
     """The board's pattern with its frame and the numbers of a few corners."""
-    fig = figure(6.4, 4.4)
-    ax = fig.subplots()
+    fig, ax = single(6.4, 4.4)
     width, height = (1000 * s for s in board.size_m)
     left, top = (1000 * (c - board.square_m) for c in board.points[0, :2])
     ax.imshow(board.image(60), cmap="gray", vmin=0, vmax=255,
@@ -91,67 +95,55 @@ def board(board: Board) -> LessonFigure:
                 ha="center", va="center", bbox={"fc": "white", "ec": "none", "pad": 1})  # fmt: skip
     ax.set(xlabel="x (mm)", ylabel="y (mm)")
     columns, rows = board.corners
-    fig.alt = (
+    return fig.saying(
         f"The board: {board.squares[0]} x {board.squares[1]} squares of "
         f"{1000 * board.square_m:g} mm, {columns} x {rows} inner corners marked, and its frame: "
         "x to the right, y down, z into the board."
     )
-    return fig
 
 
 def views(folder: Path, detections: Sequence[Detection]) -> LessonFigure:
     """The images of a folder with the corners that were found in them."""
-    import cv2
-
     if not len(detections):
         raise ValueError("detections: there are none to show; print them to see why")
 
-    columns = 3
-    rows = -(-len(detections) // columns)
-    fig = figure(9.0, 2.35 * rows + 0.3)
-    axes = fig.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
-    for ax, found in zip(axes.flat, detections, strict=False):
+    fig, axes = panels(len(detections), 3, 9.0, 2.35, 0.3, shared=True)
+    for ax, found in zip(axes, detections, strict=True):
         image = cv2.imread(str(folder / found.name), cv2.IMREAD_GRAYSCALE)
         ax.imshow(image, cmap="gray", vmin=0, vmax=255)
         ax.plot(found.pixels[:, 0], found.pixels[:, 1], ".", ms=3, color=COLORS["measured"])
         ax.set_title(f"{found.name}: {len(found.ids)} corners", fontsize=10)
         ax.set(xlabel="u (px)", ylabel="v (px)")
         ax.label_outer()
-    for ax in axes.flat[len(detections) :]:
-        ax.set_visible(False)
-    fig.alt = "Views of the board: " + ", ".join(
-        f"{d.name} with {len(d.ids)} corners" for d in detections
+    return fig.saying(
+        "Views of the board: "
+        + ", ".join(f"{d.name} with {len(d.ids)} corners" for d in detections)
     )
-    return fig
 
 
 def coverage(result: IntrinsicsResult) -> LessonFigure:
     """Where the corners are in the image, and how the board was tilted."""
-    from coursekit.intrinsics.fit import tilts as tilts_of
-
     fig = figure(9.0, 3.9)
     image, tilt = fig.subplots(1, 2, width_ratios=(1.45, 1))
     width, height = result.intrinsics.size
     for found in result.detections:
         image.plot(found.pixels[:, 0], found.pixels[:, 1], ".", ms=3, color=COLORS["measured"])
-    _frame(image, width, height)
+    image_axes(image, width, height)
     image.set_title("corners of all views")
-    tilts = tilts_of(result)
-    x, y = tilts.about_x_deg, tilts.about_y_deg
-    tilt.axhline(0, color=COLORS["faint"], lw=1)
-    tilt.axvline(0, color=COLORS["faint"], lw=1)
+    turned = tilts(result)
+    x, y = turned.about_x_deg, turned.about_y_deg
+    cross(tilt)
     tilt.plot(y, x, "o", color=COLORS["measured"])
     reach = max(50.0, 5 + np.abs([x, y]).max())
     tilt.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal",
              xlabel="tilt about the vertical (deg)",
              ylabel="tilt about the horizontal (deg)")  # fmt: skip
     tilt.set_title("tilt of the board, one dot a view")
-    fig.alt = (
+    return fig.saying(
         f"Corners of {len(result.detections)} views over the image, and the tilts of the board: "
         f"{x.min():.0f} to {x.max():.0f} degrees about the horizontal, {y.min():.0f} to "
         f"{y.max():.0f} about the vertical."
     )
-    return fig
 
 
 # --- a result ---
@@ -164,7 +156,7 @@ def residuals(result: IntrinsicsResult) -> LessonFigure:
     pixels = np.concatenate([d.pixels for d in result.detections])
     errors = np.concatenate(result.residuals)
     _arrows(image, pixels, errors, ARROWS)
-    _frame(image, *result.intrinsics.size)
+    image_axes(image, *result.intrinsics.size)
     image.set_title(f"residuals, drawn {ARROWS} times too long")
     cloud.plot(errors[:, 0], errors[:, 1], ".", ms=3, alpha=0.5, color=COLORS["measured"])
     angle = np.linspace(0, 2 * np.pi, 100)
@@ -175,11 +167,10 @@ def residuals(result: IntrinsicsResult) -> LessonFigure:
     cloud.set(xlim=(-reach, reach), ylim=(reach, -reach), aspect="equal",
               xlabel="residual in u (px)", ylabel="residual in v (px)")  # fmt: skip
     cloud.set_title("circles: 1 and 2 σ per axis")
-    fig.alt = (
+    return fig.saying(
         f"Residuals of {len(errors)} corners: RMS {result.rms_u_px:.3f} px in u, "
         f"{result.rms_v_px:.3f} px in v, {result.rms_px:.3f} px in two dimensions."
     )
-    return fig
 
 
 def _arrows(
@@ -192,12 +183,6 @@ def _arrows(
 ) -> None:
     ax.quiver(*at.T, *(times * vectors.T), angles="xy", scale_units="xy", scale=1, width=width,
               color=COLORS[color])  # fmt: skip
-
-
-def _frame(ax: Any, width: int, height: int) -> None:
-    """An image's rim, v downwards."""
-    ax.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal",
-           xlabel="u (px)", ylabel="v (px)")  # fmt: skip
 
 
 def uncertainty(results: Mapping[str, IntrinsicsResult], range_m: float) -> LessonFigure:
@@ -213,11 +198,11 @@ def uncertainty(results: Mapping[str, IntrinsicsResult], range_m: float) -> Less
         shown = ax.pcolormesh(u, v, sigma, vmin=0, vmax=top, shading="gouraud", cmap="cividis")
         lines = ax.contour(u, v, sigma, levels, colors="white", linewidths=1)
         ax.clabel(lines, fmt="%g px", fontsize=9)
-        _frame(ax, width, height)
+        image_axes(ax, width, height)
         ax.label_outer()
         ax.set_title(f"{name} at {range_m:g} m" if name else f"at {range_m:g} m")
     fig.colorbar(shown, ax=list(axes), label="σ of a projected pixel (px)", shrink=0.9)
-    fig.alt = (
+    return fig.saying(
         f"Standard deviation of a projected pixel over the image, for points {range_m:g} m away: "
         + "; ".join(
             f"{name or 'this calibration'} from {m.min():.3f} to {m.max():.3f} px"
@@ -225,7 +210,6 @@ def uncertainty(results: Mapping[str, IntrinsicsResult], range_m: float) -> Less
         )
         + "."
     )
-    return fig
 
 
 def two_sessions(results: Mapping[str, IntrinsicsResult]) -> LessonFigure:
@@ -241,18 +225,18 @@ def two_sessions(results: Mapping[str, IntrinsicsResult]) -> LessonFigure:
         bars.set_title(f"{name}: RMS {result.rms_px:.3f} px, fx = {result.intrinsics.fx:.1f} px")
         for outline in outlines(result):
             image.add_patch(Polygon(outline, fill=False, ec=COLORS["measured"], lw=1))
-        _frame(image, *result.intrinsics.size)
-    fig.alt = "RMS of each view and the outlines of the boards: " + "; ".join(
-        f"session {name} has RMS {r.rms_px:.3f} px and fx {r.intrinsics.fx:.1f} px"
-        for name, r in results.items()
+        image_axes(image, *result.intrinsics.size)
+    return fig.saying(
+        "RMS of each view and the outlines of the boards: "
+        + "; ".join(
+            f"session {name} has RMS {r.rms_px:.3f} px and fx {r.intrinsics.fx:.1f} px"
+            for name, r in results.items()
+        )
     )
-    return fig
 
 
 def outlines(result: IntrinsicsResult) -> list[Floats]:
     """The rims of the boards as the fitted camera sees them, each (4, 2) px."""
-    from coursekit.geometry import project, transform_points
-
     columns, rows = result.board.corners
     rim = result.board.points[[0, columns - 1, columns * rows - 1, columns * (rows - 1)]]
     lens = result.intrinsics
@@ -275,18 +259,19 @@ def rules(rows: Mapping[str, IntrinsicsResult], range_m: float) -> LessonFigure:
     ):
         ax.barh(names, values, color=COLORS["model"], height=0.6)
         ax.set(xscale="log", xlabel=label, xlim=(0.5 * min(values), 3 * max(values)))
-        ticks = [t for t in (0.1, 0.3, 1, 3, 10, 30) if t > 0.5 * min(values)]
-        ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
-        ax.set_xticks([], minor=True)
+        ticks = (t for t in (0.1, 0.3, 1, 3, 10, 30) if t > 0.5 * min(values))
+        plain_ticks(ax.xaxis, ticks, widen=True)
         for y, value in enumerate(values):
             ax.text(1.1 * value, y, f"{value:.2g}", va="center", fontsize=10)
     axes[0].invert_yaxis()
     axes[0].set_ylabel(" ")
-    fig.alt = "What each rule buys: " + "; ".join(
-        f"{n}: fx to {f:.2g} %, worst pixel {w:.2g} px"
-        for n, f, w in zip(names, fx, worst, strict=True)
+    return fig.saying(
+        "What each rule buys: "
+        + "; ".join(
+            f"{n}: fx to {f:.2g} %, worst pixel {w:.2g} px"
+            for n, f, w in zip(names, fx, worst, strict=True)
+        )
     )
-    return fig
 
 
 # --- the museum ---
@@ -294,20 +279,17 @@ def rules(rows: Mapping[str, IntrinsicsResult], range_m: float) -> LessonFigure:
 
 def signature(results: Mapping[str, IntrinsicsResult]) -> LessonFigure:
     """The residuals that failures leave in the view that suffers most, one panel each."""
-    columns = 3
-    rows = -(-len(results) // columns)
-    fig = figure(9.6, 3.3 * rows)
-    axes = fig.subplots(rows, columns, squeeze=False)
-    for ax, (name, result) in zip(axes.flat, results.items(), strict=False):
+    fig, axes = panels(len(results), 3, 9.6, 3.3)
+    for ax, (name, result) in zip(axes, results.items(), strict=True):
         _worst_view(ax, name, result)
-    for ax in axes.flat[len(results) :]:
-        ax.set_visible(False)
-    fig.alt = "Residuals in the worst view of each session: " + "; ".join(
-        f"{name}, RMS of all views {r.rms_px:.2f} px, of the worst one "
-        f"{r.per_view_rms_px.max():.2f} px"
-        for name, r in results.items()
+    return fig.saying(
+        "Residuals in the worst view of each session: "
+        + "; ".join(
+            f"{name}, RMS of all views {r.rms_px:.2f} px, of the worst one "
+            f"{r.per_view_rms_px.max():.2f} px"
+            for name, r in results.items()
+        )
     )
-    return fig
 
 
 def _worst_view(ax: Any, name: str, result: IntrinsicsResult) -> None:
@@ -350,8 +332,7 @@ def power(table: Mapping[str, Mapping[str, Any]]) -> LessonFigure:
             )
         )
     axes[0].set_ylabel("share named (1)")
-    fig.alt = "Share of sessions in which the cause is named. " + "; ".join(texts)
-    return fig
+    return fig.saying("Share of sessions in which the cause is named. " + "; ".join(texts))
 
 
 # --- against the factory ---
@@ -373,11 +354,10 @@ def difference(comparison: Comparison) -> LessonFigure:
         u, v = np.linspace(0, width - 1, values.shape[1]), np.linspace(0, height - 1, len(values))
         shown = ax.pcolormesh(u, v, values, shading="gouraud", cmap="cividis", vmin=0)
         fig.colorbar(shown, ax=ax, location="bottom", label=label, shrink=0.9)
-        _frame(ax, width, height)
+        image_axes(ax, width, height)
         ax.label_outer()
-    fig.alt = (
+    return fig.saying(
         f"The fit against the factory over the image: {np.nanmin(pixels):.2f} to "
         f"{np.nanmax(pixels):.2f} px, and {np.nanmin(shift_mm):.2f} to "
         f"{np.nanmax(shift_mm):.2f} mm at {comparison.range_m:g} m."
     )
-    return fig

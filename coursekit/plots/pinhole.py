@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from itertools import combinations, product
+from typing import Any
 
 import numpy as np
 from matplotlib.colors import LogNorm
 
 from coursekit import geometry
+from coursekit.arrays import AnyArray, Floats, NDArray
+from coursekit.cameras import Frame
 from coursekit.geometry import Intrinsics
-from coursekit.plots.style import COLORS, LessonFigure, figure
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from coursekit.cameras import Frame
-    from coursekit.simulation.scenes import Box
+from coursekit.plots.style import COLORS, LessonFigure, cross, figure, image_axes, panels, single
+from coursekit.simulation import Box
 
 DISPLACEMENT_PX = 0.1, 120.0  # the colour scale of `displacement`
 SLICE_M = 0.015  # half the height of the slice in `point_cloud`
@@ -29,22 +27,23 @@ def similar_triangles(focal_length_mm: float = 1.93, depth_m: float = 0.45) -> L
 
     focal_length_mm: lens to image plane, mm. depth_m: Z of a point 100 mm right of the axis, m.
     The image plane is drawn 80 times too far from the pinhole, or nobody would see it.
+
+    >>> similar_triangles(focal_length_mm=4.0, depth_m=0.8).alt[-55:]
+    "image 0.500 mm off the sensor's centre for f = 4.00 mm."
     """
     x_mm = focal_length_mm * POINT_X_M / depth_m
     fig = figure(9.0, 3.8)
     above, sensor = fig.subplots(1, 2, width_ratios=[2.4, 1])
     _triangles(above, 0.080 * focal_length_mm, depth_m)
-    sensor.axhline(0, color=COLORS["faint"], lw=1)
-    sensor.axvline(0, color=COLORS["faint"], lw=1)
+    cross(sensor)
     sensor.plot([x_mm], [0], "o", color=COLORS["measured"], ms=10)
     sensor.set(xlim=(-1.3, 1.3), ylim=(-1.3, 1.3), xlabel="$x_s$ on the sensor (mm)")
     sensor.set(aspect="equal", yticks=[], title=f"$x_s = f\\,X/Z$ = {x_mm:.3f} mm")
-    fig.alt = (
+    return fig.saying(
         f"Side by side: the ray from a point {1000 * POINT_X_M:.0f} mm off the axis at Z = "
         f"{depth_m:.2f} m through the pinhole, and its image {x_mm:.3f} mm off the sensor's "
         f"centre for f = {focal_length_mm:.2f} mm."
     )
-    return fig
 
 
 def _triangles(ax: Any, plane_m: float, depth_m: float) -> None:
@@ -68,14 +67,18 @@ def _triangles(ax: Any, plane_m: float, depth_m: float) -> None:
 
 
 def pixel_grid(principal: tuple[float, float] = (3.3, 2.2)) -> LessonFigure:
-    """A sensor of 8 x 5 pixels: (0, 0) is the centre of the top-left one, edges are at +-0.5."""
+    """A sensor of 8 x 5 pixels: (0, 0) is the centre of the top-left one, edges are at +-0.5.
+
+    principal: (cx, cy) px of the point that is marked.
+
+    >>> pixel_grid((3.3, 2.2)).alt[:25]
+    'A grid of 8 by 5 pixels. '
+    """
     columns, rows = 8, 5
-    fig = figure(6.5, 4.4)
-    ax = fig.subplots()
-    for u in range(columns + 1):
-        ax.plot([u - 0.5] * 2, [-0.5, rows - 0.5], color=COLORS["faint"], lw=1)
-    for v in range(rows + 1):
-        ax.plot([-0.5, columns - 0.5], [v - 0.5] * 2, color=COLORS["faint"], lw=1)
+    fig, ax = single(6.5, 4.4)
+    u, v = np.arange(columns + 1) - 0.5, np.arange(rows + 1) - 0.5
+    ax.plot([u] * 2, v[[0, -1]], color=COLORS["faint"], lw=1)
+    ax.plot(u[[0, -1]], [v] * 2, color=COLORS["faint"], lw=1)
     centres = geometry.pixel_grid(columns, rows).reshape(-1, 2)
     ax.plot(*centres.T, ".", color=COLORS["ink"], ms=4, label="pixel centres")
     ax.plot(0, 0, "s", color=COLORS["model"], ms=9, label="(0, 0)")
@@ -84,18 +87,19 @@ def pixel_grid(principal: tuple[float, float] = (3.3, 2.2)) -> LessonFigure:
     ax.set(xlim=(-0.8, columns - 0.2), ylim=(rows - 0.2, -0.8), aspect="equal")
     ax.set(xlabel="u (px), to the right", ylabel="v (px), down")
     fig.legend(loc="outside lower center", ncols=3)
-    fig.alt = (
+    return fig.saying(
         f"A grid of {columns} by {rows} pixels. The origin (0, 0) is the centre of the top-left "
         f"pixel; the principal point, {principal}, falls between pixel centres."
     )
-    return fig
 
 
 def entries_of_K(scene: tuple[Box, ...], camera: Intrinsics, **moved: float) -> LessonFigure:
-    """The edges of a scene's boxes, drawn with the camera's K and with some entries changed."""
+    """The edges of a scene's boxes, drawn with the camera's K and with some entries changed.
+
+    moved: new values, px, of fx, fy, cx or cy. Raises ValueError for another name.
+    """
     changed = Intrinsics.from_dict(camera.to_dict() | moved)
-    fig = figure(8.0, 4.8)
-    ax = fig.subplots()
+    fig, ax = single(8.0, 4.8)
     for intrinsics, color, style, name in (
         (camera, COLORS["model"], "-", "K of the camera"),
         (changed, COLORS["measured"], "--", "your K"),
@@ -105,33 +109,30 @@ def entries_of_K(scene: tuple[Box, ...], camera: Intrinsics, **moved: float) -> 
         ax.plot([], [], style, color=color, label=name)
         ax.plot(intrinsics.cx, intrinsics.cy, "+", color=color, ms=14, mew=2)
     ax.plot([], [], "+", color=COLORS["ink"], ms=12, label="principal point")
-    _image_axes(ax, camera)
+    image_axes(ax, *camera.size)
     ax.legend(loc="upper right")
     values = ", ".join(f"{k} = {getattr(changed, k):.0f}" for k in ("fx", "fy", "cx", "cy"))
     ax.set_title(values + " px")
-    fig.alt = f"Wire frame of the tabletop in the image with the camera's K and with {values} px."
-    return fig
+    return fig.saying(
+        f"Wire frame of the tabletop in the image with the camera's K and with {values} px."
+    )
 
 
-def _edges(scene: tuple[Box, ...]) -> list[NDArray[np.float64]]:
+def _edges(scene: tuple[Box, ...]) -> list[Floats]:
     """The twelve edges of each free-standing box, (2, 3) each, m."""
-    signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]) / 2
-    lines = []
-    for box in scene:
-        if max(box.size_m) > 0.2:  # the wall and the table are larger than the image
-            continue
-        corners = geometry.transform_points(box.T_scene_box, signs * box.size_m)
-        for a in range(8):
-            for b in range(a + 1, 8):
-                if np.count_nonzero(signs[a] != signs[b]) == 1:
-                    lines.append(corners[[a, b]])
-    return lines
+    signs = np.array(list(product((-0.5, 0.5), repeat=3)))
+    pairs = [(a, b) for a, b in combinations(range(8), 2) if (signs[a] != signs[b]).sum() == 1]
+    return [
+        geometry.transform_points(box.T_scene_box, signs[[a, b]] * box.size_m)
+        for box in scene
+        if max(box.size_m) < 0.2  # the wall and the table are larger than the image
+        for a, b in pairs
+    ]
 
 
 def field_of_view(depth: Intrinsics, color: Intrinsics | None, distance_m: float) -> LessonFigure:
     """What the depth and the colour camera see, from above, and how wide that is at a distance."""
-    fig = figure(8.0, 4.0)
-    ax = fig.subplots()
+    fig, ax = single(8.0, 4.0)
     texts = []
     cameras = [("depth", depth)] + ([("color", color)] if color else [])
     for (name, camera), label in zip(cameras, ("depth", "colour"), strict=False):
@@ -147,16 +148,18 @@ def field_of_view(depth: Intrinsics, color: Intrinsics | None, distance_m: float
     ax.plot([0, 0], [0, 1.25 * distance_m], color=COLORS["ink"], lw=1)
     ax.set(xlabel="X (m)", ylabel="Z (m)", aspect="equal", ylim=(0, 1.25 * distance_m))
     fig.legend(loc="outside lower center", ncols=2)
-    fig.alt = "Fields of view from above. " + "; ".join(texts) + "."
-    return fig
+    return fig.saying("Fields of view from above. " + "; ".join(texts) + ".")
 
 
-def same_pixel(near_m: float, near_size_m: float, far_m: float, K: NDArray[Any]) -> LessonFigure:
-    """A small near and a large far object that cover the same pixels."""
+def same_pixel(near_m: float, near_size_m: float, far_m: float, K: Floats) -> LessonFigure:
+    """A small near and a large far object that cover the same pixels; K is (3, 3), px.
+
+    >>> same_pixel(0.5, 0.02, 1.0, np.diag([400.0, 400.0, 1.0])).axes[0].get_title()
+    'both are 16.0 px wide in the image'
+    """
     far_size = near_size_m * far_m / near_m
     pixels = K[0, 0] * near_size_m / near_m
-    fig = figure(8.0, 3.2)
-    ax = fig.subplots()
+    fig, ax = single(8.0, 3.2)
     for z, size, name in ((near_m, near_size_m, "cube"), (far_m, far_size, "block")):
         ax.plot([z, z], [-size / 2, size / 2], color=COLORS[name], lw=6,
                 label=f"{1000 * size:.0f} mm at {z:.4g} m")  # fmt: skip
@@ -167,21 +170,17 @@ def same_pixel(near_m: float, near_size_m: float, far_m: float, K: NDArray[Any])
     ax.set(xlabel="Z (m)", ylabel="X (m)", title=f"both are {pixels:.1f} px wide in the image")
     ax.invert_yaxis()  # from above, the camera's right hand is towards the bottom
     fig.legend(loc="outside lower center", ncols=2)
-    fig.alt = (
+    return fig.saying(
         f"Two objects between the same two rays: {1000 * near_size_m:.0f} mm wide at {near_m:.4g} m"
         f" and {1000 * far_size:.0f} mm wide at {far_m:.4g} m; both are {pixels:.1f} px wide."
     )
-    return fig
 
 
 def displacement(lenses: Mapping[str, Intrinsics]) -> LessonFigure:
     """How far distortion moves each pixel, in px, one map a lens, all to one scale."""
-    columns = 2
-    rows = -(-len(lenses) // columns)
-    fig = figure(8.5, 3.1 * rows)
-    axes = np.atleast_1d(fig.subplots(rows, columns)).ravel()
+    fig, axes = panels(len(lenses), 2, 8.5, 3.1)
     texts = []
-    for ax, (name, lens) in zip(axes, lenses.items(), strict=False):
+    for ax, (name, lens) in zip(axes, lenses.items(), strict=True):
         shift, size = displacement_px(lens)
         shown = ax.imshow(
             np.maximum(size, DISPLACEMENT_PX[0]),
@@ -195,17 +194,14 @@ def displacement(lenses: Mapping[str, Intrinsics]) -> LessonFigure:
                   scale_units="xy", scale=1, color="white", width=0.005)  # fmt: skip
         edge, corner = edge_and_corner(size)
         ax.set_title(f"{name}\nedge {edge:.1f} px, corner {corner:.1f} px", fontsize=10)
-        _image_axes(ax, lens)
+        image_axes(ax, *lens.size)
         texts.append(f"{name}, {edge:.1f} px at an edge, {corner:.1f} px in a corner")
-    for ax in axes[len(lenses) :]:
-        ax.set_visible(False)
     bar = fig.colorbar(shown, ax=list(axes), label="displacement (px)", shrink=0.6)
     bar.set_ticks([0.1, 1, 10, 100], labels=["0.1", "1", "10", "100"])
-    fig.alt = "Maps of the displacement by distortion: " + "; ".join(texts) + "."
-    return fig
+    return fig.saying("Maps of the displacement by distortion: " + "; ".join(texts) + ".")
 
 
-def displacement_px(lens: Intrinsics) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def displacement_px(lens: Intrinsics) -> tuple[Floats, Floats]:
     """How far, and from the pinhole's place, the lens moves each pixel: (H, W, 2), (H, W) px."""
     grid = geometry.pixel_grid(*lens.size)
     ideal = geometry.deproject(grid, np.ones(grid.shape[:2]), lens.K)
@@ -213,13 +209,14 @@ def displacement_px(lens: Intrinsics) -> tuple[NDArray[np.float64], NDArray[np.f
     return shift, np.linalg.norm(shift, axis=-1)
 
 
-def edge_and_corner(size: NDArray[np.float64]) -> tuple[float, float]:
-    """The largest displacement at the middle of the four edges, and in the four corners, px."""
+def edge_and_corner(size: Floats) -> tuple[float, float]:
+    """The largest displacement at the middle of the four edges, and in the four corners, px.
+
+    size: of each pixel's displacement (H, W), px, from `displacement_px`.
+    """
     height, width = size.shape
-    edge = max(
-        size[height // 2, 0], size[height // 2, -1], size[0, width // 2], size[-1, width // 2]
-    )
-    return float(edge), float(max(size[0, 0], size[0, -1], size[-1, 0], size[-1, -1]))
+    edge = max(size[height // 2, [0, -1]].max(), size[[0, -1], width // 2].max())
+    return float(edge), float(size[np.ix_([0, -1], [0, -1])].max())
 
 
 def frame(shot: Frame) -> LessonFigure:
@@ -235,15 +232,14 @@ def frame(shot: Frame) -> LessonFigure:
         axes[1].imshow(shot.color)
         axes[1].set(title="colour", xlabel="u (px)", ylabel="v (px)")
     height, width = depth.shape
-    fig.alt = (
+    return fig.saying(
         f"Depth image of {width} by {height} pixels, half of them nearer than "
         f"{np.nanmedian(depth):.2f} m, {np.isnan(depth).mean():.0%} of it without depth"
         + ("." if shot.color is None else ", and the colour image beside it.")
     )
-    return fig
 
 
-def _far(depth_m: NDArray[Any]) -> float:
+def _far(depth_m: AnyArray) -> float:
     """Where the scene ends, m: false matches may lie far behind it."""
     return 1.1 * float(np.nanquantile(depth_m, 0.97))
 
@@ -275,11 +271,10 @@ def point_cloud(points: NDArray[np.float32]) -> LessonFigure:
     above.set_xlim(-side, side)
     above.set_title(f"from above, |Y| < {1000 * SLICE_M:.0f} mm")
     low, high = cloud.min(axis=0), cloud.max(axis=0)
-    fig.alt = (
+    return fig.saying(
         f"Point cloud of {len(cloud)} points, X from {low[0]:.2f} to {high[0]:.2f} m, Z from "
         f"{low[2]:.2f} to {high[2]:.2f} m, and a slice of {len(flat)} points from above."
     )
-    return fig
 
 
 def _solid(ax: Any, cloud: NDArray[np.float32]) -> None:
@@ -294,8 +289,3 @@ def _solid(ax: Any, cloud: NDArray[np.float32]) -> None:
     ax.locator_params(axis="y", nbins=2)
     ax.view_init(elev=18, azim=-70)
     ax.set_box_aspect(np.maximum(np.ptp(cloud[:, [0, 2, 1]], axis=0), 0.05), zoom=0.85)
-
-
-def _image_axes(ax: Any, camera: Intrinsics) -> None:
-    ax.set(xlim=(-0.5, camera.width - 0.5), ylim=(camera.height - 0.5, -0.5), aspect="equal")
-    ax.set(xlabel="u (px)", ylabel="v (px)")

@@ -1,14 +1,20 @@
-"""One look for all figures, and a figure that also says in words what it shows."""
+"""One look for all figures, figures that say in words what they show, and sliders under them."""
 
 from __future__ import annotations
 
 import base64
 import io
+import math
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import matplotlib as mpl
 from cycler import cycler
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+
+from coursekit.checks import want
 
 # Okabe-Ito, distinguishable with any colour vision; the same thing has the same colour everywhere.
 COLORS = {
@@ -23,6 +29,7 @@ COLORS = {
     "faint": "#BBBBBB",
 }
 DEPTH_COLORMAP = "viridis"
+UNITS = ("mm", "m", "px", "deg")
 
 mpl.rcParams.update(
     {
@@ -44,6 +51,11 @@ class LessonFigure(Figure):
 
     alt: str = ""
 
+    def saying(self, alt: str) -> LessonFigure:
+        """The figure itself, with its text alternative: what a drawing function returns."""
+        self.alt = alt
+        return self
+
     def png(self) -> bytes:
         """The figure as a PNG file."""
         buffer = io.BytesIO()
@@ -55,6 +67,121 @@ class LessonFigure(Figure):
         return {"image/png": image, "text/plain": self.alt}, {"image/png": {"alt": self.alt}}
 
 
+Draw = Callable[..., LessonFigure]
+
+
 def figure(width: float = 8.0, height: float = 4.0) -> LessonFigure:
-    """An empty figure, size in inches; the caller draws into it and sets `alt`."""
+    """An empty figure, size in inches; who draws into it returns it `saying` what it shows."""
     return LessonFigure(figsize=(width, height), layout="constrained")
+
+
+def single(width: float, height: float) -> tuple[LessonFigure, Axes]:
+    """A figure of one pair of axes, size in inches, and these axes."""
+    fig = figure(width, height)
+    return fig, fig.subplots()
+
+
+def panels(
+    n: int, columns: int, width: float, row: float, more: float = 0.0, shared: bool = False
+) -> tuple[LessonFigure, list[Any]]:
+    """A figure of n axes in so many columns, and the n axes; `shared`: with the same limits.
+
+    width of the figure and height of a row in inches; more: how much higher the figure is.
+    """
+    rows = -(-n // columns)
+    fig = figure(width, row * rows + more)
+    axes = fig.subplots(rows, columns, squeeze=False, sharex=shared, sharey=shared).ravel()
+    for empty in axes[n:]:
+        empty.set_visible(False)
+    return fig, list(axes[:n])
+
+
+def image_axes(ax: Axes, width: int, height: int) -> None:
+    """Axes that end at an image's rim, in px, with v downwards."""
+    ax.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
+    ax.set(xlabel="u (px)", ylabel="v (px)")
+
+
+def cross(ax: Axes) -> None:
+    """Faint lines through (0, 0)."""
+    ax.axhline(0, color=COLORS["faint"], lw=1)
+    ax.axvline(0, color=COLORS["faint"], lw=1)
+
+
+def plain_ticks(axis: Axis, ticks: Iterable[float], widen: bool = False) -> None:
+    """Ticks of a logarithmic axis at these numbers, written as numbers.
+
+    Those outside its range are left out, or else `widen` it.
+    """
+    low, high = axis.get_view_interval()
+    shown = [t for t in ticks if widen or low <= t <= high]
+    axis.set_ticks(shown, [f"{t:g}" for t in shown])
+    axis.set_ticks([], minor=True)
+
+
+def drag(draw: Draw, **sliders: tuple[float, float, float]) -> Draggable:
+    """A figure drawn by `draw(**values)` with one slider a parameter, each (low, high, start).
+
+    Raises ValueError under a slider's name where its start is not in its range.
+
+    >>> from coursekit.plots import pinhole
+    >>> drag(pinhole.similar_triangles, depth_m=(0.3, 1.2, 0.6)).start().alt[:26]
+    'Side by side: the ray from'
+    """
+    for name, slider in sliders.items():
+        fits = len(slider) == 3 and slider[0] <= slider[2] <= slider[1] and slider[0] < slider[1]
+        want(fits, name, slider, "(low, high, start) in that range")
+    return Draggable(draw, sliders)
+
+
+class Draggable:
+    """What `drag` returns: a widget where a kernel runs, else the figure at the start values."""
+
+    def __init__(self, draw: Draw, sliders: dict[str, tuple[float, float, float]]) -> None:
+        self.draw, self.sliders = draw, sliders
+
+    def start(self) -> LessonFigure:
+        """The figure at the start values."""
+        return self.draw(**{name: start for name, (_, _, start) in self.sliders.items()})
+
+    def widget(self) -> Any:
+        """Sliders above an image that is drawn again at every step of a drag."""
+        import ipywidgets
+
+        fields = {}
+        for name, (low, high, start) in self.sliders.items():
+            step = 10.0 ** math.floor(math.log10((high - low) / 50))
+            fields[name] = ipywidgets.FloatSlider(
+                value=start,
+                min=start - step * math.floor((start - low) / step),  # a slider counts from here
+                max=start + step * math.floor((high - start) / step),
+                step=step,
+                description=label(name),
+                readout_format=f".{max(0, -round(math.log10(step)))}f",
+                style={"description_width": "11em"},
+                layout=ipywidgets.Layout(width="32em"),
+            )
+        first = self.start()
+        image = ipywidgets.Image(value=first.png(), format="png")
+        image.layout.max_width = "100%"
+
+        def redraw(_: Any) -> None:
+            drawn = self.draw(**{name: field.value for name, field in fields.items()})
+            image.value = drawn.png()
+
+        for field in fields.values():
+            field.observe(redraw, names="value")
+        return ipywidgets.VBox([*fields.values(), image])
+
+    def __repr__(self) -> str:
+        return self.start().alt
+
+    def _repr_mimebundle_(self, **kwargs: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+        data, metadata = self.start()._repr_mimebundle_()
+        return self.widget()._repr_mimebundle_(**kwargs) | data, metadata
+
+
+def label(name: str) -> str:
+    """`focal_length_mm` as `focal length (mm)`."""
+    words, _, unit = name.rpartition("_")
+    return f"{words.replace('_', ' ')} ({unit})" if unit in UNITS and words else name

@@ -12,7 +12,7 @@ from coursekit.simulation.arm_sessions import (
 )
 from coursekit.simulation.board_images import render_board
 from coursekit.simulation.corner_sessions import Effects, Truth, corner_session
-from coursekit.simulation.rig import Rig, StereoFrame, View, cost_curve, match
+from coursekit.simulation.rig import Rig, RigView, StereoFrame, cost_curve, match
 from coursekit.simulation.scenes import (
     Box,
     RenderResult,
@@ -29,10 +29,10 @@ __all__ = [
     "HandEyeMistakes",
     "RenderResult",
     "Rig",
+    "RigView",
     "Scene",
     "StereoFrame",
     "Truth",
-    "View",
     "artefact_scene",
     "corner_session",
     "cost_curve",

@@ -1,43 +1,37 @@
-"""Joint configurations for hand-eye calibration: careful sessions, and the ones that cannot work.
+"""Where an arm, a camera and a board are by default, and joint configurations to calibrate with.
 
 A careful session turns the gripper by 30 degrees or more about at least two axes with the board in
-view. The degenerate ones are what people do instead: a grid of translations at one orientation,
-turns about one axis only, turns of a few degrees.
+view: `careful_poses` takes, from many random configurations, those that turn farthest. What people
+do instead (a grid of translations at one orientation, turns about one axis only, turns of a few
+degrees) was searched for once, by tools/degenerate_poses.py, and is kept in data/.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Literal, get_args
+import json
+from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coursekit.arm import Arm
-from coursekit.arrays import ArrayLike, Floats, Mask, NDArray
+from coursekit.arrays import ArrayLike, Bools, Floats, Integers
 from coursekit.boards import Board
-from coursekit.geometry import (
-    Intrinsics,
-    check_transform,
-    deproject,
-    invert_transform,
-    make_transform,
-    project,
-    undistort,
-)
+from coursekit.boards.view import seen
+from coursekit.checks import number, transform, transforms, whole
+from coursekit.geometry import Intrinsics, invert_transform, make_transform
+from coursekit.hand_eye.poses import Mount, check_mount
+from coursekit.specifications import DATA
 
-Mount = Literal["eye_in_hand", "eye_to_hand"]
-
-BORDER_PX = 6.0  # a corner nearer to the image's border has no room for its refinement window
 SMALLEST_SQUARE_PX = 14.0  # a square's side as seen, below which markers are not read
 STEEPEST_RAD = np.radians(60)  # between the line of sight and the board's normal
 CLEARANCE_M = 0.02  # of arm, camera and a held board above the table
 WIDE_TURN_RAD = np.radians(30)  # a careful session turns so far to either side about two axes
-TRIES = 6  # places in the image and ranges that are tried for each pose of a degenerate set
-ASIDE, NEARER = 0.12, 0.15  # how much these differ: of the image's size, and of the range
-CHOICE = 6  # candidates for each pose of a careful session, from which distant ones are taken
-TRIES_AT_LEAST, TRIES_A_POSE = 100_000, 4_000  # random configurations before a search gives up
+CANDIDATES_A_POSE = 6  # of a careful session, from which distant ones are taken
+SEARCHED_AT_LEAST, SEARCHED_A_POSE = 100_000, 4_000  # random configurations before giving up
 FINGERS_M = 0.01  # free paper between the fingertips' frame and the pattern
+DEGENERATE = DATA / "degenerate_poses.json"
 
 
 # --- where things are by default ---
@@ -53,7 +47,7 @@ def board_on_table(
     # x right, y towards the arm, z into the table, as one looks from the arm
     axes = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]).T
     R = Rotation.from_euler("z", turn_rad).as_matrix() @ axes
-    return make_transform(R, np.array([*centre_m, 0.0]) - R @ _middle(board))
+    return make_transform(R, np.array([*centre_m, 0.0]) - R @ board.middle)
 
 
 def board_in_gripper(board: Board) -> Floats:
@@ -67,7 +61,7 @@ def board_in_gripper(board: Board) -> Floats:
         y, z = -y, -z
     R = np.column_stack([x, y, z])
     half = board.size_m[1] / 2
-    return make_transform(R, np.array([FINGERS_M + half, 0.0, 0.0]) - R @ _middle(board))
+    return make_transform(R, np.array([FINGERS_M + half, 0.0, 0.0]) - R @ board.middle)
 
 
 def over_the_shoulder(
@@ -81,11 +75,6 @@ def over_the_shoulder(
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
     return make_transform(np.column_stack([right, np.cross(forward, right), forward]), at)
-
-
-def _middle(board: Board) -> Floats:
-    """The middle of the pattern in the board's frame, (3,) m, wherever its origin is."""
-    return np.asarray(board.points.mean(axis=0))
 
 
 # --- what is fixed to what, and what the camera sees ---
@@ -112,34 +101,30 @@ class Setup:
     turn_rad: float = np.radians(60)
 
     def __post_init__(self) -> None:
-        if self.mount not in get_args(Mount):
-            raise ValueError(f"mount: got {self.mount!r}, want 'eye_in_hand' or 'eye_to_hand'")
-        for name in ("X", "Y"):
-            T = check_transform(name, getattr(self, name))
-            if T.ndim != 2:
-                raise ValueError(f"{name}: got shape {T.shape}, want one (4, 4) transform")
-            object.__setattr__(self, name, T)
-        if not 0 < self.share <= 1:
-            raise ValueError(f"share: got {self.share!r}, want more than 0 and at most 1")
+        check_mount(self.mount)
+        object.__setattr__(self, "X", transform("X", self.X))
+        object.__setattr__(self, "Y", transform("Y", self.Y))
+        number("share", self.share, "more than 0 and at most 1", above=0.0, most=1.0)
 
     def T_camera_board(self, T_base_gripper: ArrayLike) -> Floats:
         """The board in the camera (..., 4, 4) for gripper poses (..., 4, 4)."""
-        return self._seen(check_transform("T_base_gripper", T_base_gripper))
+        return self._seen(transforms("T_base_gripper", T_base_gripper))
 
     def T_base_gripper(self, T_camera_board: ArrayLike) -> Floats:
         """The gripper poses (..., 4, 4) at which the camera has the board at (..., 4, 4)."""
-        arm = self.X @ check_transform("T_camera_board", T_camera_board) @ invert_transform(self.Y)
+        arm = self.X @ transforms("T_camera_board", T_camera_board) @ invert_transform(self.Y)
         return invert_transform(arm) if self.mount == "eye_in_hand" else arm
 
-    def sees(self, T_base_gripper: ArrayLike) -> Mask:
+    def sees(self, T_base_gripper: ArrayLike) -> Bools:
         """(...): whether enough of the board is in view, from the front, and large enough."""
         T = self.T_camera_board(T_base_gripper)
         flat = T.reshape(-1, 4, 4)
-        seen = self._faces(flat)
-        seen[seen] = self._corners(flat[seen]) >= self.share - 1e-9
-        return seen.reshape(T.shape[:-2])
+        good = self._faces(flat)
+        corners = seen(self.board.points, flat[good], self.intrinsics)
+        good[good] = corners.mean(axis=-1) >= self.share - 1e-9
+        return good.reshape(T.shape[:-2])
 
-    def allows(self, q: ArrayLike) -> Mask:
+    def allows(self, q: ArrayLike) -> Bools:
         """(...): whether the arm can hold still at q (..., 6), rad, and the camera then `sees`.
 
         Inside the limits, the arm free, and a board in the gripper above the table.
@@ -150,25 +135,28 @@ class Setup:
         # most fail the first test, so the costly ones come last and see only what is left
         left = np.flatnonzero(self._faces(self._seen(T)) & self.arm.within_limits(flat))
         if self.mount == "eye_to_hand":
-            left = left[self._held_above_table(T[left])]
+            outline = self.Y[:3, :3] @ self.board.outline.T + self.Y[:3, 3:]
+            heights = T[left, 2, :3] @ outline + T[left, 2, 3:]
+            left = left[(heights >= CLEARANCE_M).all(axis=-1)]
         left = left[self.sees(T[left])]
         left = left[self.arm.is_free(flat[left], CLEARANCE_M)]
         allowed = np.zeros(len(flat), bool)
         allowed[left] = True
         return allowed.reshape(q.shape[:-1])
 
+    def upright(self, T_camera_board: Floats) -> Floats:
+        """1 + 2 cos of the angle (n,) by which boards (n, 4, 4) are turned from upright."""
+        axes = np.array([1.0, -1.0, -1.0]) if self.board.old_origin else np.ones(3)
+        return np.einsum("nii,i->n", T_camera_board[:, :3, :3], axes)
+
     def _seen(self, T: Floats) -> Floats:
+        """As `T_camera_board`, without its check."""
         arm = _inverse(T) if self.mount == "eye_in_hand" else T
-        return np.asarray(_inverse(self.X) @ arm @ self.Y)
+        return _inverse(self.X) @ arm @ self.Y
 
-    def _held_above_table(self, T: Floats) -> Mask:
-        outline = self.Y[:3, :3] @ _outline(self.board).T + self.Y[:3, 3:]
-        heights = T[:, 2, :3] @ outline + T[:, 2, 3:]
-        return np.asarray((heights >= CLEARANCE_M).all(axis=-1))
-
-    def _faces(self, T: Floats) -> Mask:
+    def _faces(self, T: Floats) -> Bools:
         """(n,): whether the board is in front, little enough turned, and its squares large."""
-        middle = T[:, :3, :3] @ _middle(self.board) + T[:, :3, 3]
+        middle = T[:, :3, :3] @ self.board.middle + T[:, :3, 3]
         into = T[:, :3, 2] * (-1.0 if self.board.old_origin else 1.0)
         facing = (middle * into).sum(axis=1) / np.linalg.norm(middle, axis=1)
         focal = min(self.intrinsics.fx, self.intrinsics.fy)
@@ -178,25 +166,8 @@ class Setup:
             (middle[:, 2] > 0)
             & (facing >= np.cos(STEEPEST_RAD))
             & (side_px >= SMALLEST_SQUARE_PX)
-            & (_upright_trace(self.board, T) >= 1 + 2 * np.cos(self.turn_rad))
+            & (self.upright(T) >= 1 + 2 * np.cos(self.turn_rad))
         )
-
-    def _corners(self, T: Floats) -> Floats:
-        """(n,): the share of the corners that lie in the image, BORDER_PX from its border."""
-        lens = self.intrinsics
-        points = self.board.points @ np.swapaxes(T[:, :3, :3], -1, -2) + T[:, None, :3, 3]
-        pixels = project(points, lens.K, lens.dist)
-        high = np.array(lens.size) - 1 - BORDER_PX
-        seen = ((pixels >= BORDER_PX) & (pixels <= high)).all(axis=-1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            slope = np.linalg.norm(points[..., :2] / points[..., 2:], axis=-1)
-        return np.asarray((seen & (slope <= _widest_slope(lens))).mean(axis=-1))
-
-
-def _upright_trace(board: Board, T: Floats) -> Floats:
-    """1 + 2 cos of the angle (n,) by which boards in the camera are turned from upright."""
-    upright = np.array([1.0, -1.0, -1.0]) if board.old_origin else np.ones(3)
-    return np.asarray(np.einsum("nii,i->n", T[:, :3, :3], upright))
 
 
 def _inverse(T: Floats) -> Floats:
@@ -208,64 +179,7 @@ def _inverse(T: Floats) -> Floats:
     return inverse
 
 
-def _outline(board: Board) -> Floats:
-    """The four outer corners of the pattern in the board's frame, (4, 3) m."""
-    width, height = board.size_m
-    corners = np.array([[x, y, 0.0] for x in (-0.5, 0.5) for y in (-0.5, 0.5)])
-    return _middle(board) + corners * [width, height, 0.0]
-
-
-def _widest_slope(lens: Intrinsics) -> float:
-    """The largest sqrt(X^2 + Y^2) / Z in the image; past its fold a lens brings points back in."""
-    across, down = np.arange(lens.width), np.arange(lens.height)
-    rim = [(u, v) for u in across[:: max(lens.width // 32, 1)] for v in (0, lens.height - 1)]
-    rim += [(u, v) for v in down[:: max(lens.height // 32, 1)] for u in (0, lens.width - 1)]
-    rim.append((lens.width - 1, lens.height - 1))
-    xy = (np.array(rim) - [lens.cx, lens.cy]) / [lens.fx, lens.fy]
-    if lens.dist is not None:
-        xy, found = undistort(xy, lens.dist)
-        xy = xy[found]
-    return float(np.linalg.norm(xy, axis=1).max(initial=0.0)) if len(xy) else np.inf
-
-
 # --- careful sessions ---
-
-
-def eye_in_hand_poses(
-    arm: Arm,
-    T_base_board: ArrayLike,
-    T_gripper_camera: ArrayLike,
-    intrinsics: Intrinsics,
-    board: Board,
-    rng: np.random.Generator,
-    n: int,
-    share: float = 1.0,
-) -> Floats:
-    """n joint configurations (n, 6), rad, of a careful session with the camera on the gripper.
-
-    Inside the limits, fingertip and camera above the table, the board in view; turned by at least
-    30 degrees to either side about two axes or more. Raises ValueError when there are none.
-    """
-    X, Y = np.asarray(T_gripper_camera, float), np.asarray(T_base_board, float)
-    return careful_poses(Setup(arm, "eye_in_hand", X, Y, intrinsics, board, share), rng, n)
-
-
-def eye_to_hand_poses(
-    arm: Arm,
-    T_base_camera: ArrayLike,
-    T_gripper_board: ArrayLike,
-    intrinsics: Intrinsics,
-    board: Board,
-    rng: np.random.Generator,
-    n: int,
-    share: float = 1.0,
-) -> Floats:
-    """n joint configurations (n, 6), rad, of a careful session with the board in the gripper.
-
-    As `eye_in_hand_poses`; the board stays above the table as well.
-    """
-    X, Y = np.asarray(T_base_camera, float), np.asarray(T_gripper_board, float)
-    return careful_poses(Setup(arm, "eye_to_hand", X, Y, intrinsics, board, share), rng, n)
 
 
 def careful_poses(
@@ -273,19 +187,17 @@ def careful_poses(
 ) -> Floats:
     """n joint configurations (n, 6), rad, that the setup allows and that turn far about two axes.
 
-    From CHOICE times as many random ones, each next one is that which turns farthest from all
-    taken so far. pool (m, 6): configurations from `random_poses` to draw these from, which saves
-    the search when many sessions are made with one setup. Raises ValueError when the arm has too
-    few, or none that turn so far.
+    From CANDIDATES_A_POSE times as many random ones, each next one is that which turns farthest
+    from all taken so far. pool (m, 6): configurations from `random_poses` to draw these from, which
+    saves the search when many sessions are made with one setup. Raises ValueError when the arm has
+    too few, or none that turn so far.
     """
-    if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 3:
-        raise ValueError(f"n: got {n!r}, want at least 3 poses")
+    n = whole("n", n, "at least 3 poses", least=3)
     if pool is None:
-        pool = random_poses(setup, rng, CHOICE * int(n))
-    elif len(pool) < n:
-        raise ValueError(f"pool: got {len(pool)} configurations, want at least {n}")
-    q = pool[rng.permutation(len(pool))[: CHOICE * int(n)]]
-    q = q[_farthest(setup.arm.forward(q)[:, :3, :3], int(n))]
+        pool = random_poses(setup, rng, CANDIDATES_A_POSE * n)
+    whole("pool", len(pool), f"at least {n} configurations", least=n)
+    q = pool[rng.permutation(len(pool))[: CANDIDATES_A_POSE * n]]
+    q = q[_farthest(setup.arm.forward(q)[:, :3, :3], n)]
     turns = half_turns(setup.arm.forward(q))
     if turns[1] < WIDE_TURN_RAD:
         raise ValueError(
@@ -299,7 +211,7 @@ def random_poses(setup: Setup, rng: np.random.Generator, n: int) -> Floats:
     """n joint configurations (n, 6), rad, uniform over the joints' ranges among those allowed."""
     low, high = setup.arm.limits.T
     found, tried, batch = np.empty((0, 6)), 0, 4000
-    while len(found) < n and tried < TRIES_AT_LEAST + n * TRIES_A_POSE:
+    while len(found) < n and tried < SEARCHED_AT_LEAST + n * SEARCHED_A_POSE:
         q = rng.uniform(low, high, (batch, 6))
         found = np.concatenate([found, q[setup.allows(q)]])
         tried += batch
@@ -312,7 +224,7 @@ def random_poses(setup: Setup, rng: np.random.Generator, n: int) -> Floats:
     return found[:n]
 
 
-def _farthest(R: Floats, n: int) -> NDArray[np.int64]:
+def _farthest(R: Floats, n: int) -> Integers:
     """The indices of n rotations of (m, 3, 3), each as far as can be from those before it."""
     taken = [0]
     closest = np.full(len(R), np.inf)
@@ -328,7 +240,7 @@ def half_turns(T_base_gripper: ArrayLike) -> Floats:
 
     Rotation vectors from the mean orientation, along their principal directions: half the range.
     """
-    R = Rotation.from_matrix(check_transform("T_base_gripper", T_base_gripper)[:, :3, :3])
+    R = Rotation.from_matrix(transforms("T_base_gripper", T_base_gripper)[:, :3, :3])
     vectors = (R.mean().inv() * R).as_rotvec()
     _, axes = np.linalg.eigh(vectors.T @ vectors)
     return np.sort(np.ptp(vectors @ axes, axis=0) / 2)[::-1]
@@ -337,140 +249,13 @@ def half_turns(T_base_gripper: ArrayLike) -> Floats:
 # --- sessions that cannot determine the mount ---
 
 
-def translation_grid(
-    setup: Setup, rng: np.random.Generator, side: int = 5, step_m: float = 0.025
-) -> Floats:
-    """Joint configurations (side^2, 6), rad: a horizontal grid of positions at one orientation.
+@cache
+def degenerate_poses(mount: Mount, design: str) -> Floats:
+    """Joint configurations (4, 25, 6), rad, of sessions that cannot work: four of each design.
 
-    Raises ValueError when no orientation has the whole grid in reach and the board in view.
+    design: "grid", 5 x 5 places in a plane, 25 mm apart, at one orientation; "single_axis", turns
+    of up to 30 degrees about the vertical, in order; "small_rotations", of up to 3 degrees about
+    any axis. The arm is allowed to go there in the course's own rig of this mount, and sees the
+    board.
     """
-    offsets = step_m * (np.arange(side) - (side - 1) / 2)
-    steps = np.stack([*np.meshgrid(offsets, offsets, indexing="ij"), np.zeros((side, side))], -1)
-    for start in np.concatenate([_starts(setup, rng) for _ in range(2)]):
-        targets = np.repeat(_aimed(setup, setup.arm.forward(start)[None]), side * side, axis=0)
-        targets[:, :3, 3] += steps.reshape(-1, 3)
-        q, good = _reach(setup, targets, start)
-        if good.all():
-            return q
-    raise ValueError(
-        f"side, step_m: no {side}x{side} grid of {1e3 * step_m:.0f} mm steps is in reach with the "
-        "board in view"
-    )
-
-
-def single_axis_poses(
-    setup: Setup,
-    rng: np.random.Generator,
-    n: int,
-    axis: ArrayLike = (0.0, 0.0, 1.0),
-    turn_rad: float = np.radians(30),
-) -> Floats:
-    """Joint configurations (n, 6), rad, all turned about one axis from one orientation.
-
-    axis (3,): in the base. turn_rad: the largest angle to either side; the poses' angles are
-    spread over it evenly. The positions differ too. Raises ValueError when no start has them all
-    in reach and in view.
-    """
-    along: Floats = np.asarray(axis, dtype=np.float64)
-    if along.shape != (3,) or not 0 < np.linalg.norm(along) < np.inf:
-        raise ValueError(f"axis: got {along.tolist()}, want a direction (3,)")
-    along = along / np.linalg.norm(along)
-    angles = np.linspace(-turn_rad, turn_rad, n)
-    # The start need not be in the middle of the turns, nor the board upright in all of them.
-    shifts = turn_rad * np.array([0.0, 0.5, -0.5, 1.0, -1.0])
-    free = replace(setup, turn_rad=np.pi)
-    starts = _starts(setup, rng)
-    return _turned(free, rng, starts, angles[:, None] * along, shifts[:, None] * along)
-
-
-def small_rotations(
-    setup: Setup, rng: np.random.Generator, n: int, turn_rad: float = np.radians(3)
-) -> Floats:
-    """Joint configurations (n, 6), rad, about all axes but by no more than turn_rad from one.
-
-    The positions differ too. Raises ValueError as `single_axis_poses` does.
-    """
-    vectors = rng.normal(size=(n, 3))
-    length = turn_rad * np.cbrt(rng.random((n, 1)))  # even over the ball
-    vectors = length * vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-    return _turned(setup, rng, _starts(setup, rng), vectors, np.zeros((1, 3)))
-
-
-def _turned(
-    setup: Setup, rng: np.random.Generator, starts: Floats, vectors: Floats, shifts: Floats
-) -> Floats:
-    """Joint configurations (n, 6) with orientations exp(vectors) exp(shift) of a start's."""
-    turns = Rotation.from_rotvec(vectors).as_matrix()
-    for start in starts:
-        for shift in Rotation.from_rotvec(shifts).as_matrix():
-            begin = setup.arm.forward(start)
-            begin[:3, :3] = shift @ begin[:3, :3]
-            q = _scattered(setup, rng, start, begin, turns)
-            if q is not None:
-                return q
-    raise ValueError("turn_rad: no such poses are in reach with the board in view")
-
-
-def _scattered(
-    setup: Setup, rng: np.random.Generator, start: Floats, begin: Floats, turns: Floats
-) -> Floats | None:
-    """Configurations (n, 6) for orientations `turns @ begin`, places differing, if all exist."""
-    targets = np.repeat(begin[None], len(turns), axis=0)
-    targets[:, :3, :3] = turns @ begin[:3, :3]
-    q, good = _reach(setup, _aimed(setup, targets[[0, -1]]), start)
-    if not good.all():  # the outermost two decide mostly, and cheaply
-        return None
-    q, missing = np.empty((len(turns), 6)), np.arange(len(turns))
-    for attempt in range(TRIES):
-        width = 1 - attempt / TRIES  # ask for less as it goes on
-        aside = width * rng.uniform(-ASIDE, ASIDE, (len(missing), 2))
-        nearness = 1 + width * rng.uniform(-NEARER, NEARER, len(missing))
-        aimed = _aimed(setup, targets[missing], aside, nearness)
-        found, good = _reach(setup, aimed, start, elsewhere=True)
-        q[missing[good]] = found[good]
-        missing = missing[~good]
-        if not missing.size:
-            return q
-    return None
-
-
-def _aimed(
-    setup: Setup, T_base_gripper: Floats, aside: ArrayLike = (0.0, 0.0), nearness: ArrayLike = 1.0
-) -> Floats:
-    """Gripper poses (n, 4, 4) of the same orientations with the board's middle at a chosen pixel.
-
-    aside (n, 2): from the image's middle, or with a fixed camera from where the first pose has
-    it, as parts of width and height. nearness (n,): times the range that the first pose has.
-    """
-    lens = setup.intrinsics
-    T = setup.T_camera_board(T_base_gripper)
-    first = T[0, :3, :3] @ _middle(setup.board) + T[0, :3, 3]
-    # a camera on the arm can look anywhere; in front of a fixed one the arm's reach comes first
-    on_arm = setup.mount == "eye_in_hand"
-    around = 0.5 * np.array(lens.size) - 0.5 if on_arm else project(first, lens.K, lens.dist)
-    pixels = around + np.asarray(aside) * lens.size
-    wanted = deproject(pixels, first[2] * np.asarray(nearness), lens.K, lens.dist)
-    T[:, :3, 3] = wanted - T[:, :3, :3] @ _middle(setup.board)
-    return setup.T_base_gripper(T)
-
-
-def _starts(setup: Setup, rng: np.random.Generator) -> Floats:
-    """Configurations (60, 6) to begin from: straight on and far from the joints' limits first."""
-    q = random_poses(setup, rng, 60)
-    low, high = setup.arm.limits.T
-    room = np.minimum(q - low, high - q).min(axis=1)
-    T = setup.T_camera_board(setup.arm.forward(q))
-    return q[np.argsort(-room - _upright_trace(setup.board, T) / 2)]
-
-
-def _reach(
-    setup: Setup, targets: Floats, start: Floats, elsewhere: bool = False
-) -> tuple[Floats, Mask]:
-    """Joint configurations (n, 6) for gripper poses, and whether each is found and allowed.
-
-    elsewhere: also try to get there by configurations that are far from `start`.
-    """
-    q, good = np.tile(start, (len(targets), 1)), setup.sees(targets)
-    q[good], reached = setup.arm.inverse(targets[good], start, elsewhere)
-    good[good] = reached & setup.allows(q[good])
-    return q, good
+    return np.array(json.loads(DEGENERATE.read_text("utf-8"))[mount][design])

@@ -1,14 +1,12 @@
-"""Simulated hand-eye sessions: careful ones, and each classic way of spoiling one.
+"""Simulated hand-eye sessions, careful ones and each classic way of spoiling one, and what the
+world says of an X afterwards: touch the board, look with two cameras.
 
 At corner level (`hand_eye_session`, milliseconds) corners are projected and get Gaussian noise;
 with images (`rendered_session`) a renderer takes the pictures and the detector finds the board. The
-arm's own errors come from `SimulatedArm`. What the session reports is what a student would have;
-what is true is in `HandEyeTruth`, and both can be made again from the seed.
-
-Tests of a hand-eye calibration in the world: touch the board, look with two cameras.
-
-The simulated arm is really at the place; what it *reports* is its own forward kinematics, so its
-hidden errors show, as they would on a table.
+arm's own errors come from `SimulatedArm`: it is really at the place, and what it *reports* is its
+own forward kinematics, so its hidden errors show, as they would on a table. What the session
+reports is what a student would have; what is true is in `HandEyeTruth`, and both can be made again
+from the seed.
 """
 
 from __future__ import annotations
@@ -26,25 +24,25 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coursekit.arm import ArmErrors, SimulatedArm, widowx
-from coursekit.arrays import Floats, NDArray
+from coursekit.arrays import Floats, Grey
 from coursekit.boards import Board, BoardNotFound, Detection, Detections, detect
-from coursekit.boards.detector import SESSION
+from coursekit.boards.detector import FEWEST_CORNERS, SESSION
+from coursekit.boards.view import seen
+from coursekit.checks import choice, number, positive, want, whole
 from coursekit.geometry import invert_transform, make_transform, project, transform_points
 from coursekit.hand_eye.poses import Mount, camera_board, check_mount, turned
 from coursekit.hand_eye.session import HandEyeSession
 from coursekit.simulation.arm_poses import (
-    BORDER_PX,
     Setup,
     board_in_gripper,
     board_on_table,
     careful_poses,
+    degenerate_poses,
     over_the_shoulder,
     random_poses,
-    single_axis_poses,
-    small_rotations,
-    translation_grid,
 )
 from coursekit.simulation.board_images import render_board
+from coursekit.simulation.corner_sessions import corner_noise
 from coursekit.specifications import device
 
 Design = Literal["careful", "grid", "single_axis", "small_rotations"]
@@ -53,13 +51,12 @@ Millimetres = Literal["", "arm", "board"]
 
 TABLE_BOARD = Board("charuco", (9, 6), 0.025)
 HELD_BOARD = Board("charuco", (7, 5), 0.02)
-POOL = 160  # configurations that the default setups' careful sessions are drawn from
+CONFIGURATIONS = 160  # that the careful sessions of a default setup are drawn from
 X_JITTER = np.repeat([np.radians(1.0), 4e-3], 3)  # rad, m: no two rigs are mounted alike
 Y_JITTER = np.repeat([np.radians(4.0), 8e-3], 3)
+FLAT_ON_TABLE = np.array([0.0, 0.0, 1.0, 1.0, 1.0, 0.0])  # of Y_JITTER, what leaves a board flat
 SECONDS = 4.0  # from one image to the next
-DEGENERATE_VARIANTS = 4  # of each degenerate set in a default setup: their search takes a second
-MIN_CORNERS = 6
-TRIES = 20  # places of camera and board before the default ones are taken
+PLACES_TRIED = 20  # of camera and board, before the default ones are taken
 PARTIAL = 0.6  # of the corners in view are enough in a degenerate session
 SIMULATED = "simulated"  # what session.json calls its source
 
@@ -68,13 +65,13 @@ SIMULATED = "simulated"  # what session.json calls its source
 class HandEyeMistakes:
     """What is wrong with a session. The defaults are a healthy one.
 
-    design: which poses; "grid" is 5 x 5 places at one orientation, "single_axis" and
-    "small_rotations" (up to 3 degrees) as `hand_eye_poses` makes them. shifted_by: the arm pose of
-    image i stands at i + shifted_by. late_s: joint angles are read so long after the image, on an
-    arm that does not stop (`moving`). slip_m, slip_deg: how far the board moves, once, about a
-    third to two thirds into the session. degrees: "joints" are given in degrees and taken as
-    radians, or the arm's "rotation_vectors" are. millimetres: the poses of the "arm" or the
-    "board" have their translation in mm. inverted_poses: T_gripper_base for T_base_gripper;
+    design: which poses; "grid" is 5 x 5 places at one orientation, "single_axis" turns about the
+    vertical, "small_rotations" by up to 3 degrees (see `degenerate_poses`). shifted_by: the arm
+    pose of image i stands at i + shifted_by. late_s: joint angles are read so long after the image,
+    on an arm that does not stop (`moving`). slip_m, slip_deg: how far the board moves, once, about
+    a third to two thirds into the session. degrees: "joints" are given in degrees and taken as
+    radians, or the arm's "rotation_vectors" are. millimetres: the poses of the "arm" or the "board"
+    have their translation in mm. inverted_poses: T_gripper_base for T_base_gripper;
     inverted_detections: T_board_camera for T_camera_board. square_scale: a square's real size over
     what is claimed. wrong_mount: the other mount is declared. outliers: in so many views the arm is
     not where it reports, by outlier_m and outlier_deg. joint_offset_deg: the zero of one joint
@@ -99,23 +96,16 @@ class HandEyeMistakes:
     joint_offset_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        for name, choices in (
-            ("design", Design),
-            ("degrees", Degrees),
-            ("millimetres", Millimetres),
-        ):
-            if getattr(self, name) not in get_args(choices):
-                wanted = ", ".join(map(repr, get_args(choices)))
-                raise ValueError(f"{name}: got {getattr(self, name)!r}, want one of {wanted}")
+        choice("design", self.design, get_args(Design))
+        choice("degrees", self.degrees, get_args(Degrees))
+        choice("millimetres", self.millimetres, get_args(Millimetres))
+        signed = ("late_s", "joint_offset_deg")
         for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, float) and not np.isfinite(value):
-                raise ValueError(f"{field.name}: got {value!r}, want a finite number")
-        for name in ("slip_m", "slip_deg", "outliers", "outlier_m", "outlier_deg"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name}: got {getattr(self, name)!r}, want 0 or more")
-        if not self.square_scale > 0:
-            raise ValueError(f"square_scale: got {self.square_scale}, want a positive number")
+            if field.type == "float":
+                least = -np.inf if field.name in signed else 0.0
+                number(field.name, getattr(self, field.name), "a finite number", least=least)
+        whole("outliers", self.outliers, least=0)
+        positive("square_scale", self.square_scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +156,7 @@ def default_setup(mount: Mount) -> Setup:
 
 
 def hand_eye_session(
-    setup: Setup | Mount,
+    mount: Mount,
     seed: int,
     n: int = 25,
     corner_noise_px: float = 0.1,
@@ -175,41 +165,42 @@ def hand_eye_session(
 ) -> tuple[HandEyeSession, HandEyeTruth]:
     """A session at corner level, and the truth behind it.
 
-    setup: a `Setup` as it is, or a mount: the default one, with camera and board moved a little by
-    the seed. corner_noise_px: std of one coordinate of a corner. arm_errors: sizes of the arm's
-    hidden errors, None for an arm that has none. The same arguments give the same session.
-    Raises ValueError for bad arguments, and where the setup has no such poses.
+    mount: whose `default_setup` is used, with camera and board moved a little by the seed. n: arm
+    poses, at most 25 where the design is not careful. corner_noise_px: std of one coordinate of a
+    corner. arm_errors: sizes of the arm's hidden errors, None for an arm that has none. The same
+    arguments give the same session. Raises ValueError for bad arguments.
+
+    >>> session, truth = hand_eye_session("eye_in_hand", seed=1, n=5)
+    >>> session.T_base_gripper.shape, truth.X.shape
+    ((5, 4, 4), (4, 4))
     """
-    if not (np.isfinite(corner_noise_px) and corner_noise_px >= 0):
-        raise ValueError(f"corner_noise_px: got {corner_noise_px!r}, want a number, 0 or more")
-    truth, q, dq = _poses(setup, seed, n, arm_errors, mistakes or HandEyeMistakes())
+    number("corner_noise_px", corner_noise_px, "a number, 0 or more", least=0.0)
+    truth, q, dq = _poses(mount, seed, n, arm_errors, mistakes or HandEyeMistakes())
     rng = _stream(seed, b"corners")
-    seen = [_corners(truth, T, rng, corner_noise_px, i) for i, T in enumerate(truth.T_camera_board)]
-    return _reported(truth, q, dq, Detections(seen))
+    found = [_corners(truth, view, rng, corner_noise_px) for view in range(len(q))]
+    return _reported(truth, q, dq, Detections(found)), truth
 
 
 def rendered_session(
-    setup: Setup | Mount,
+    mount: Mount,
     seed: int,
     n: int = 20,
     arm_errors: ArmErrors | None = None,
     mistakes: HandEyeMistakes | None = None,
-) -> tuple[HandEyeSession, HandEyeTruth, list[NDArray[np.uint8]]]:
+) -> tuple[HandEyeSession, HandEyeTruth, list[Grey]]:
     """A session whose images (h, w) are rendered and whose corners `boards.detect` found.
 
     As `hand_eye_session`, at about 0.1 s an image. Raises ValueError where the board is not found
     in one, which the poses are chosen to avoid.
     """
-    truth, q, dq = _poses(setup, seed, n, arm_errors, mistakes or HandEyeMistakes())
-    images = list(images_of(truth, seed))
-    seen = []
+    truth, q, dq = _poses(mount, seed, n, arm_errors, mistakes or HandEyeMistakes())
+    images, found = list(images_of(truth, seed)), []
     for i, image in enumerate(images):
         try:
-            seen.append(detect(image, truth.setup.board, f"view_{i:02d}"))
+            found.append(detect(image, truth.setup.board, f"view_{i:02d}"))
         except BoardNotFound as reason:
-            raise ValueError(f"setup: no board in image {i} ({reason})") from reason
-    session, truth = _reported(truth, q, dq, Detections(seen))
-    return session, truth, images
+            raise ValueError(f"seed: no board in image {i} ({reason})") from reason
+    return _reported(truth, q, dq, Detections(found)), truth, images
 
 
 def truth_of(folder: str | os.PathLike[str]) -> HandEyeTruth:
@@ -229,14 +220,12 @@ def truth_of(folder: str | os.PathLike[str]) -> HandEyeTruth:
     return _poses(mount, seed, views, ArmErrors(), HandEyeMistakes())[0]
 
 
-def images_of(truth: HandEyeTruth, seed: int) -> Iterator[NDArray[np.uint8]]:
+def images_of(truth: HandEyeTruth, seed: int) -> Iterator[Grey]:
     """The rendered pictures (h, w) of a session, one after the other."""
     rng = _stream(seed, b"images")
-    real = replace(
-        truth.setup.board,
-        square_m=truth.setup.board.square_m * truth.mistakes.square_scale,
-        marker_m=(truth.setup.board.marker_m or 0) * truth.mistakes.square_scale or None,
-    )
+    board, scale = truth.setup.board, truth.mistakes.square_scale
+    marker_m = (board.marker_m or 0) * scale or None
+    real = replace(board, square_m=board.square_m * scale, marker_m=marker_m)
     for T in truth.T_camera_board:
         yield render_board(real, T, truth.setup.intrinsics, rng)
 
@@ -250,14 +239,10 @@ def _stream(seed: int, name: bytes) -> np.random.Generator:
 
 
 def _poses(
-    setup: Setup | Mount, seed: int, n: int, errors: ArmErrors | None, mistakes: HandEyeMistakes
+    mount: Mount, seed: int, n: int, errors: ArmErrors | None, mistakes: HandEyeMistakes
 ) -> tuple[HandEyeTruth, Floats, Floats]:
     """The truth, and the joint angles and velocities (n, 6) that the encoders read."""
-    rng = _stream(seed, b"poses")
-    if isinstance(setup, str):
-        rig, q = _default_session(setup, rng, n, mistakes.design)
-    else:
-        rig, q = setup, _configurations(setup, rng, n, mistakes.design)
+    rig, q = _placed(check_mount(mount), _stream(seed, b"poses"), n, mistakes.design)
     offsets, joint = _joint_zero(seed, mistakes)
     arm = SimulatedArm(seed, errors or ArmErrors(0.0, 0.0, 0.0, 0.0))
     dq = np.zeros_like(q)
@@ -272,69 +257,48 @@ def _poses(
     for view in outliers:  # the image was taken while the arm swung, or somebody leant on it
         true[view] = turned(true[view], _twist(bumps, mistakes.outlier_m, mistakes.outlier_deg))
     Y, slipped_at = _slipping(rig.Y, seed, len(q), mistakes)
-    seen = np.stack(
-        [camera_board(true[i : i + 1], rig.X, Y[i], rig.mount)[0] for i in range(len(q))]
-    )
-    truth = HandEyeTruth(
-        rig, mistakes, true, seen, Y, slipped_at, tuple(sorted(outliers.tolist())), joint, arm
-    )
+    T_camera_board = camera_board(true, rig.X, Y, rig.mount)
+    bad = tuple(sorted(outliers.tolist()))
+    truth = HandEyeTruth(rig, mistakes, true, T_camera_board, Y, slipped_at, bad, joint, arm)
     return truth, read, dq
 
 
-def _jittered(setup: Setup, rng: np.random.Generator) -> Setup:
-    X = turned(setup.X, X_JITTER * rng.normal(size=6))
-    Y = turned(setup.Y, Y_JITTER * rng.normal(size=6) * _in_place(setup))
-    return replace(setup, X=X, Y=Y)
-
-
-def _in_place(setup: Setup) -> Floats:
-    """A board on the table stays flat on it; one in the fingers may sit anyhow."""
-    if setup.mount == "eye_in_hand":
-        return np.array([0.0, 0.0, 1.0, 1.0, 1.0, 0.0])
-    return np.ones(6)
-
-
-def _configurations(setup: Setup, rng: np.random.Generator, n: int, design: Design) -> Floats:
-    """Joint configurations (n, 6), or (25, 6) of the grid."""
-    if design == "careful":
-        return careful_poses(setup, rng, n)
-    if design == "grid":
-        return translation_grid(setup, rng)
-    poses = single_axis_poses if design == "single_axis" else small_rotations
-    return poses(setup, rng, n)
-
-
 @cache
-def _pool(mount: Mount) -> Floats:
-    return random_poses(default_setup(mount), np.random.default_rng(0), POOL)
+def _configurations(mount: Mount) -> Floats:
+    return random_poses(default_setup(mount), np.random.default_rng(0), CONFIGURATIONS)
 
 
-@cache
-def _degenerate(mount: Mount, design: Design, n: int, variant: int) -> Floats:
-    return _configurations(default_setup(mount), np.random.default_rng([variant, 1]), n, design)
+def _placed(mount: Mount, rng: np.random.Generator, n: int, design: Design) -> tuple[Setup, Floats]:
+    """A default setup moved a little, and joint configurations (n, 6) at which it sees the board.
 
-
-def _default_session(
-    mount: Mount, rng: np.random.Generator, n: int, design: Design
-) -> tuple[Setup, Floats]:
-    """A default setup moved a little, and configurations that were searched for once and kept."""
-    for _ in range(TRIES):
-        rig = _jittered(default_setup(mount), rng)
+    A board on the table stays flat on it; one in the fingers may sit anyhow.
+    """
+    default = default_setup(mount)
+    in_place = FLAT_ON_TABLE if mount == "eye_in_hand" else np.ones(6)
+    if design != "careful":
+        sets = degenerate_poses(mount, design)
+        whole("n", n, f"at most {sets.shape[1]} poses", least=3, most=sets.shape[1])
+        if design != "grid":  # which is what it is with all its places only
+            sets = sets[:, np.linspace(0, sets.shape[1] - 1, n).round().astype(int)]
+    for _ in range(PLACES_TRIED):
+        X = turned(default.X, X_JITTER * rng.normal(size=6))
+        Y = turned(default.Y, Y_JITTER * rng.normal(size=6) * in_place)
+        rig = replace(default, X=X, Y=Y)
         if design != "careful":
-            q = _degenerate(mount, design, n, int(rng.integers(DEGENERATE_VARIANTS)))
+            q = sets[rng.integers(len(sets))]
             if replace(rig, share=PARTIAL).sees(rig.arm.forward(q)).all():
                 return rig, q
             continue
-        pool = _pool(mount)
-        pool = pool[rig.sees(rig.arm.forward(pool))]
+        q = _configurations(mount)
         try:
-            return rig, careful_poses(rig, rng, n, pool)
+            return rig, careful_poses(rig, rng, n, q[rig.sees(rig.arm.forward(q))])
         except ValueError:  # too few are left, or they turn too little: another place then
             continue
-    return default_setup(mount), _configurations(default_setup(mount), rng, n, design)
+    return default, careful_poses(default, rng, n) if design == "careful" else sets[0]
 
 
 def _joint_zero(seed: int, mistakes: HandEyeMistakes) -> tuple[Floats, int | None]:
+    """By how much each joint's zero is off, (6,) rad, and which one that is."""
     offsets = np.zeros(6)
     if not mistakes.joint_offset_deg:
         return offsets, None
@@ -350,8 +314,7 @@ def _slipping(Y: Floats, seed: int, n: int, mistakes: HandEyeMistakes) -> tuple[
         return stands, None
     rng = _stream(seed, b"slip")
     at = int(rng.integers(n // 3, max(n // 3 + 1, 2 * n // 3 + 1)))
-    twist = _twist(rng, mistakes.slip_m, mistakes.slip_deg)
-    stands[at:] = turned(Y, twist)
+    stands[at:] = turned(Y, _twist(rng, mistakes.slip_m, mistakes.slip_deg))
     return stands, at
 
 
@@ -362,39 +325,47 @@ def _twist(rng: np.random.Generator, shift_m: float, turn_deg: float) -> Floats:
 
 
 def _corners(
-    truth: HandEyeTruth, T: Floats, rng: np.random.Generator, noise_px: float, view: int
+    truth: HandEyeTruth, view: int, rng: np.random.Generator, noise_px: float
 ) -> Detection:
     """What a detector reports of one view: all corners with room in the image."""
-    setup = truth.setup
-    inside = transform_points(T, setup.board.points * truth.mistakes.square_scale)
-    pixels = project(inside, setup.intrinsics.K, setup.intrinsics.dist)
-    noisy = pixels + noise_px * rng.normal(size=pixels.shape)
-    high = np.array(setup.intrinsics.size) - 1 - BORDER_PX
-    room = ((pixels >= BORDER_PX) & (pixels <= high)).all(axis=1) & (inside[:, 2] > 0)
-    ids = np.flatnonzero(room)
-    if len(ids) < MIN_CORNERS:
+    board, lens, T = truth.setup.board, truth.setup.intrinsics, truth.T_camera_board[view]
+    points = board.points * truth.mistakes.square_scale
+    pixels = project(transform_points(T, points), lens.K, lens.dist)
+    pixels += corner_noise(rng, len(pixels), noise_px)
+    ids = np.flatnonzero(seen(points, T, lens))
+    if len(ids) < FEWEST_CORNERS:
         raise ValueError(f"mistakes: the board leaves the image in view {view}; take smaller ones")
-    return Detection(ids, noisy[ids], setup.intrinsics.size, f"view_{view:02d}", noise_px)
+    return Detection(ids, pixels[ids], lens.size, f"view_{view:02d}", noise_px)
 
 
 # --- what is reported ---
 
 
-def _reported(
-    truth: HandEyeTruth, q: Floats, dq: Floats, seen: Detections
-) -> tuple[HandEyeSession, HandEyeTruth]:
+def _reported(truth: HandEyeTruth, q: Floats, dq: Floats, found: Detections) -> HandEyeSession:
     """The session as a student has it, mistakes and all."""
     setup, mistakes = truth.setup, truth.mistakes
     if mistakes.degrees == "joints":
         q = np.asarray(np.degrees(q), np.float64)
-    times: Floats = np.arange(len(q)) * np.float64(SECONDS)
+    T = setup.arm.forward(q)
+    if mistakes.degrees == "rotation_vectors":
+        vectors = Rotation.from_matrix(T[:, :3, :3]).as_rotvec(degrees=True)
+        T[:, :3, :3] = Rotation.from_rotvec(vectors).as_matrix()  # taken as radians
+    if mistakes.inverted_poses:
+        T = invert_transform(T)
+    if mistakes.millimetres == "arm":
+        T[:, :3, 3] *= 1e3
+    only_poses = mistakes.inverted_poses or mistakes.degrees == "rotation_vectors"
     session = HandEyeSession(
-        setup.mount, setup.arm.forward(q), seen, setup.board, setup.intrinsics, q,
-        dq if dq.any() else None, times, tuple(view.name for view in seen),
-    )  # fmt: skip
-    session = replace(session, T_base_gripper=_arm_poses(session.T_base_gripper, mistakes))
-    if mistakes.inverted_poses or mistakes.degrees == "rotation_vectors":
-        session = replace(session, q=None, dq=None)  # a driver that gives poses and nothing else
+        mount=setup.mount,
+        T_base_gripper=T,
+        seen=found,
+        board=setup.board,
+        intrinsics=setup.intrinsics,
+        q=None if only_poses else q,
+        dq=dq if dq.any() and not only_poses else None,
+        times=np.arange(len(q)) * np.float64(SECONDS),
+        names=tuple(view.name for view in found),
+    )
     if mistakes.inverted_detections or mistakes.millimetres == "board":
         T = session.T_camera_board.copy()
         T = invert_transform(T) if mistakes.inverted_detections else T
@@ -403,34 +374,19 @@ def _reported(
     if mistakes.wrong_mount:
         other: Mount = "eye_to_hand" if setup.mount == "eye_in_hand" else "eye_in_hand"
         session = replace(session, mount=other)
-    if mistakes.shifted_by:
-        session = _shifted(session, mistakes.shifted_by)
-    return session, truth
+    if mistakes.shifted_by:  # image i with the arm pose of i - by; those without one are left out
+        by, n = mistakes.shifted_by, len(session)
+        arm = np.arange(max(0, -by), min(n, n - by))
+        rows = session.pick(arm)
+        poses = {"T_base_gripper": rows.T_base_gripper, "q": rows.q, "dq": rows.dq}
+        session = replace(session.pick(arm + by), **poses)
+    return session
 
 
-def _arm_poses(T: Floats, mistakes: HandEyeMistakes) -> Floats:
-    """The arm's poses (n, 4, 4) with the mistakes that are made in writing them down."""
-    if mistakes.degrees == "rotation_vectors":
-        vectors = Rotation.from_matrix(T[:, :3, :3]).as_rotvec(degrees=True)
-        T[:, :3, :3] = Rotation.from_rotvec(vectors).as_matrix()  # taken as radians
-    if mistakes.inverted_poses:
-        T = invert_transform(T)
-    if mistakes.millimetres == "arm":
-        T[:, :3, 3] *= 1e3
-    return T
+# --- what the world says of an X ---
 
-
-def _shifted(session: HandEyeSession, by: int) -> HandEyeSession:
-    """Image i with the arm pose of i - by; the images without one are left out."""
-    n = len(session)
-    arm = np.arange(max(0, -by), min(n, n - by))
-    images = session.pick(arm + by)
-    rows = session.pick(arm)
-    return replace(images, T_base_gripper=rows.T_base_gripper, q=rows.q, dq=rows.dq)
-
-
-# the gripper points down (its x to the table), its fingers close along the base's y
-POINTS_DOWN = np.column_stack([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+# the gripper's x points to the table, its fingers close along the base's y
+_POINTS_DOWN = np.column_stack([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
 SEEN_TO_M = 2e-4  # std along each axis of where one camera puts a target in its own frame
 
 
@@ -441,11 +397,10 @@ def touch_corners(truth: HandEyeTruth, corners: Sequence[int] = (0, 7, 39)) -> F
     arm's own forward kinematics; the fingertip is really on the corner.
     Raises ValueError for another mount, and for a corner out of the arm's reach.
     """
-    if truth.mount != "eye_in_hand":
-        raise ValueError(f"truth: got {truth.mount}, the board has to lie on the table")
+    want(truth.mount == "eye_in_hand", "truth", truth.mount, "eye_in_hand: a board on the table")
     places = transform_points(truth.setup.Y, truth.setup.board.points[list(corners)])
-    poses = np.stack([make_transform(POINTS_DOWN, place) for place in places])
-    return np.asarray(_reported_poses(truth.arm, poses, "corners")[:, :3, 3])
+    poses = np.stack([make_transform(_POINTS_DOWN, place) for place in places])
+    return _reported_poses(truth.arm, poses, "corners")[:, :3, 3]
 
 
 @dataclass(frozen=True, eq=False)
@@ -469,14 +424,11 @@ def shared_target(
     Both cameras are good to 0.2 mm along each axis in their own frames.
     Raises ValueError for sessions of other mounts.
     """
-    if (on_wrist.mount, over_shoulder.mount) != ("eye_in_hand", "eye_to_hand"):
-        raise ValueError(
-            f"on_wrist, over_shoulder: got {on_wrist.mount} and {over_shoulder.mount}, want an "
-            "eye_in_hand and an eye_to_hand session"
-        )
+    mounts = (on_wrist.mount, over_shoulder.mount)
+    wanted = "an eye_in_hand and an eye_to_hand session"
+    want(mounts == ("eye_in_hand", "eye_to_hand"), "on_wrist, over_shoulder", mounts, wanted)
     rng = np.random.default_rng(seed)
-    middle = on_wrist.setup.board.points.mean(axis=0)
-    place = transform_points(on_wrist.Y[view], middle)
+    place = transform_points(on_wrist.Y[view], on_wrist.setup.board.middle)
     true = on_wrist.T_base_gripper[view]
     near, far = (
         transform_points(invert_transform(T), place) + SEEN_TO_M * rng.normal(size=3)
@@ -497,4 +449,4 @@ def _reported_poses(arm: SimulatedArm, poses: Floats, name: str) -> Floats:
     read = arm.move(q)
     computed = nominal.forward(read)
     error = arm.true_pose() @ invert_transform(computed)  # about the base's origin
-    return np.asarray(invert_transform(error) @ poses)
+    return invert_transform(error) @ poses

@@ -1,13 +1,11 @@
-"""A printed sheet on a table as one camera sees it, compiled by numba.
-
-Sheet frame: origin in the pattern's top-left corner, x right, y down, z into the sheet, metres. A
-pose is a row of 12 numbers in that frame: where the camera is (3), then the rotation that takes a
-ray of the camera there, row by row (9).
-
-Pictures of a printed board, so that corner noise emerges from detection instead of being put in.
+"""Pictures of a printed board, so that corner noise emerges from detection instead of being put in.
 
 Light is linear: the print is sampled through the whole camera model, blurred by the lens, counted
 in photons, read with noise and rounded to 8 bits. The board lies on a wooden table, under a lamp.
+
+Sheet frame (`Board.T_board_sheet`): origin in the pattern's top-left corner, x right, y down, z
+into the sheet, metres. For the kernels a pose is a row of 12 numbers in that frame: where the
+camera is (3), then the rotation that takes a ray of the camera there, row by row (9).
 """
 
 from __future__ import annotations
@@ -22,21 +20,16 @@ from numba import njit, prange
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from coursekit.arrays import ArrayLike, NDArray
+from coursekit import checks
+from coursekit.arrays import ArrayLike, Floats, Grey, NDArray
 from coursekit.boards import Board
-from coursekit.geometry import (
-    Intrinsics,
-    check_transform,
-    deproject,
-    invert_transform,
-    make_transform,
-    pixel_grid,
-    transform_points,
-)
+from coursekit.geometry import Intrinsics, invert_transform, transform_points
 from coursekit.simulation.raycast import WOOD, texture_factor
-from coursekit.simulation.scenes import MAPLE, TABLE_THICK_M, WALL_PAINT, Box, Scene
+from coursekit.simulation.scenes import MAPLE, TABLE_THICK_M, WALL_PAINT, Box, Scene, corner_rays
 
-SAMPLES = 64  # points of a lattice in a pixel that sees an edge: an edge moves by 1/64 px
+# --- kernels, compiled by numba ---
+
+LATTICE = 64  # points of a lattice in a pixel that sees an edge: an edge moves by 1/64 px
 STEP_V, STEP_T = 19, 27  # of that lattice down the pixel and in time, where across it steps by 1
 BOW_STEPS = 4  # each leaves a few hundredths of the error, for a bow's slope is small
 SHADOW, SHADOW_M = 0.35, 0.006  # beside the sheet, on the table
@@ -67,7 +60,7 @@ def unroll(poses: Any, bow: Any, rays: Any, out: Any) -> None:
     """Write where the pixels' corners are on the sheet, (n, H + 1, W + 1, 2) m, NaN for nowhere.
 
     poses (n, 1 or H + 1, 12): at n moments of the exposure, of each row of corners where rows are
-    exposed at different times. rays (H + 1, W + 1, 2): of the pixels' corners, at Z = 1.
+    exposed at different times. rays (H + 1, W + 1, 3): of the pixels' corners, at Z = 1.
     """
     for v in prange(rays.shape[0]):
         for moment in range(poses.shape[0]):
@@ -130,19 +123,19 @@ def _pixel(
     elif reach + 1.0 < edges[i, j]:
         return sheet[i, j] * _lamp(place, X / place[1] + place[0], Y / place[1] + place[0], 0.0)
     printed, count = 0.0, 0
-    for k in range(SAMPLES):
-        a = (k + 0.5) / SAMPLES - 0.5
-        b = ((k * STEP_V) % SAMPLES + 0.5) / SAMPLES - 0.5
-        t = ((k * STEP_T) % SAMPLES + 0.5) / SAMPLES - 0.5
+    for k in range(LATTICE):
+        a = (k + 0.5) / LATTICE - 0.5
+        b = ((k * STEP_V) % LATTICE + 0.5) / LATTICE - 0.5
+        t = ((k * STEP_T) % LATTICE + 0.5) / LATTICE - 0.5
         j = math.floor(X + a * XA + b * XB + t * XT)
         i = math.floor(Y + a * YA + b * YB + t * YT)
         if 0 <= i < rows and 0 <= j < columns:
             printed += sheet[i, j]
             count += 1
     light = printed * _lamp(place, X / place[1] + place[0], Y / place[1] + place[0], 0.0)
-    if count < SAMPLES:
-        light += (SAMPLES - count) * _table(pose, sheet, place, x, y, pixel)
-    return light / SAMPLES
+    if count < LATTICE:
+        light += (LATTICE - count) * _table(pose, sheet, place, x, y, pixel)
+    return light / LATTICE
 
 
 @njit(cache=True, error_model="numpy")
@@ -200,17 +193,19 @@ def _lamp(place: Any, X: float, Y: float, z: float) -> float:
     return (place[6] / dz) ** 2 / ((1.0 + squared) * math.sqrt(1.0 + squared))
 
 
+# --- the camera that looks at it ---
+
 # Plausible, not measured. Light and noise were chosen so that detection finds the corners of an
 # ordinary view with a standard deviation of about 0.05 px: tests/test_board_images.py measures it.
 TEXELS_PER_SQUARE = 112  # whole texels for each module of a ChArUco marker of 3/4 square
 MARGIN = 0.625  # of a square, whole texels: white paper round the pattern
-PAPER, INK, TABLE = 1.0, 0.06, 0.34  # light that they send back, of white paper's
+PAPER_LIGHT, INK_LIGHT, TABLE_LIGHT = 1.0, 0.06, 0.34  # light that they send back, of white paper's
 THICK_M = 0.005  # of the plate that the sheet is glued to
-LAMP_M = (-0.50, -0.70, -1.80)  # from the board's middle, in the sheet's frame
-LENS_SIGMA_PX = 0.6  # blur of lens and sensor in focus
+LAMP_FROM_MIDDLE_M = (-0.50, -0.70, -1.80)  # from the board's middle, in the sheet's frame
+CAMERA_BLUR_PX = 0.6  # blur of lens and sensor in focus
 ELECTRONS_PER_MS = 50.0  # from white paper in a room of light 1: an evening at home
 READ_NOISE_E = 3.5
-WHITE_GREY, BLACK_GREY = 150.0, 8.0  # the camera's gain brings white paper and no light to these
+PAPER_GREY, NO_LIGHT_GREY = 150.0, 8.0  # the camera's gain brings white paper and no light to these
 MOST_BOW_M = 0.02  # a steeper one hides parts of the board behind others
 
 
@@ -226,7 +221,7 @@ def render_board(
     velocity: ArrayLike = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
     readout_ms: float = 0.0,
     light: float = 1.0,
-) -> NDArray[np.uint8]:
+) -> Grey:
     """A grey picture (h, w) of a board on a table, as a camera with this lens takes it.
 
     T_camera_board (4, 4): board frame to camera frame, at the middle of the exposure of the middle
@@ -240,26 +235,27 @@ def render_board(
     makes up for it.
     Raises ValueError for a wrong argument, and for a board that does not face the camera.
     """
-    T = check_pose(board, T_camera_board)
-    if not isinstance(lens, Intrinsics):
-        raise ValueError(f"lens: got {type(lens).__name__}, want Intrinsics")
-    _check("bow_m", bow_m, -MOST_BOW_M, MOST_BOW_M, "m")
-    _check("defocus_px", defocus_px, 0, 50, "px")
-    _check("exposure_ms", exposure_ms, 0.01, 1000, "ms")
-    _check("readout_ms", readout_ms, 0, 1000, "ms")
-    _check("light", light, 0.001, 1000, "times an ordinary room's")
-    twist = _check_velocity(velocity)
-    T_camera_sheet = T @ T_board_sheet(board)
+    T_camera_sheet = check_pose(board, T_camera_board) @ board.T_board_sheet
+    checks.instance("lens", lens, Intrinsics)
+    for name, value, least, most, unit in (
+        ("bow_m", bow_m, -MOST_BOW_M, MOST_BOW_M, "m"),
+        ("defocus_px", defocus_px, 0, 50, "px"),
+        ("exposure_ms", exposure_ms, 0.01, 1000, "ms"),
+        ("readout_ms", readout_ms, 0, 1000, "ms"),
+        ("light", light, 0.001, 1000, "times an ordinary room's"),
+    ):
+        checks.number(name, value, f"{least} to {most} {unit}", least=least, most=most)
+    twist = checks.array("velocity", velocity, (6,), finite=True)
     middle = np.array([*board.size_m, 0.0]) / 2
     poses = _poses(T_camera_sheet, middle, twist, exposure_ms / 1e3, readout_ms / 1e3, lens.height)
     radiance = _radiance(board, poses, lens, bow_m)
-    blurred = gaussian_filter(radiance, np.hypot(LENS_SIGMA_PX, defocus_px), mode="nearest")
+    blurred = gaussian_filter(radiance, np.hypot(CAMERA_BLUR_PX, defocus_px), mode="nearest")
     return _expose(blurred, ELECTRONS_PER_MS * exposure_ms * light, rng)
 
 
 def board_scene(board: Board, T_scene_board: ArrayLike) -> Scene:
     """A plate of the printed sheet's size, without the print, on a table: "board", "table"."""
-    T = check_transform("T_scene_board", T_scene_board) @ T_board_sheet(board)
+    T = checks.transform("T_scene_board", T_scene_board) @ board.T_board_sheet
     wide, high = board.size_m
     margin = 2 * MARGIN * board.square_m
     into_plate, into_table = np.eye(4), np.eye(4)
@@ -271,42 +267,24 @@ def board_scene(board: Board, T_scene_board: ArrayLike) -> Scene:
     )
 
 
-def check_pose(board: Board, T_camera_board: ArrayLike) -> NDArray[np.float64]:
+def check_pose(board: Board, T_camera_board: ArrayLike) -> Floats:
     """T_camera_board as (4, 4) float64; ValueError unless the board's print faces the camera."""
-    T = check_transform("T_camera_board", T_camera_board)
-    if T.shape != (4, 4):
-        raise ValueError(f"T_camera_board: got shape {T.shape}, want one (4, 4) transform")
-    T_camera_sheet = T @ T_board_sheet(board)
-    middle = transform_points(T_camera_sheet, np.array([*board.size_m, 0.0]) / 2)
-    if not (middle[2] > 0 and invert_transform(T_camera_sheet)[2, 3] < 0):
+    T = checks.transform("T_camera_board", T_camera_board)
+    in_front = transform_points(T, board.middle)[2] > 0
+    if not (in_front and invert_transform(T @ board.T_board_sheet)[2, 3] < 0):
         raise ValueError("T_camera_board: the board's printed side does not face the camera")
     return T
 
 
-def T_board_sheet(board: Board) -> NDArray[np.float64]:
-    """Sheet frame to board frame (4, 4): see `board_kernels`."""
-    image_from_board = board.image_from_board(1)
-    right, down = np.sign(np.diag(image_from_board)[:2])
-    offset = board.square_m * (image_from_board[:2, 2] + 0.5)
-    return invert_transform(make_transform(np.diag([right, down, right * down]), (*offset, 0.0)))
-
-
-def _bow(board: Board, bow_m: float) -> NDArray[np.float64]:
-    """As `board_kernels.meet` wants it, (4,): z points away from the viewer."""
-    width, height = board.size_m
-    across, down = board.square_m * (np.array(board.corners) - 1)
-    return np.array([width / 2, height / 2, -bow_m, 4.0 / (across**2 + down**2)])
-
-
 def _poses(
-    T_camera_sheet: NDArray[np.float64],
-    middle: NDArray[np.float64],
-    twist: NDArray[np.float64],
+    T_camera_sheet: Floats,
+    middle: Floats,
+    twist: Floats,
     exposure_s: float,
     readout_s: float,
     rows: int,
-) -> NDArray[np.float64]:
-    """Where the camera is in the sheet's frame, (moments, lines, 12): see `board_kernels`."""
+) -> Floats:
+    """Where the camera is in the sheet's frame, (moments, lines, 12): see the module."""
     moments, lines = (2, rows + 1 if readout_s else 1) if twist.any() else (1, 1)
     within = exposure_s * np.array([-0.5, 0.5])[-moments:, None] * (moments - 1)
     time_s = within + readout_s * np.linspace(-0.5, 0.5, lines) * (lines > 1)
@@ -317,29 +295,26 @@ def _poses(
     return np.concatenate([place, np.swapaxes(R, -1, -2).reshape(moments, lines, 9)], axis=-1)
 
 
-def _radiance(
-    board: Board, poses: NDArray[np.float64], lens: Intrinsics, bow_m: float
-) -> NDArray[np.float64]:
+def _radiance(board: Board, poses: Floats, lens: Intrinsics, bow_m: float) -> Floats:
     """The light (h, w) on the sensor without the lens's blur, 1 for white paper below the lamp."""
-
     sheet, edges = _sheet(board)
-    rays, pixel = _corner_rays(lens), 1.0 / lens.fx
-    lamp = np.array([*board.size_m, 0.0]) / 2 + LAMP_M
+    rays, pixel = corner_rays(lens), 1.0 / lens.fx
+    lamp = np.array([*board.size_m, 0.0]) / 2 + LAMP_FROM_MIDDLE_M
     texels_per_m = TEXELS_PER_SQUARE / board.square_m
-    place = np.array([-MARGIN * board.square_m, texels_per_m, THICK_M, TABLE, *lamp])
-    corners = np.empty((len(poses), *rays.shape))
-    unroll(poses, _bow(board, bow_m), rays, corners)
+    place = np.array([-MARGIN * board.square_m, texels_per_m, THICK_M, TABLE_LIGHT, *lamp])
+    across, down = board.square_m * (np.array(board.corners) - 1)  # z points away from the viewer
+    bow = np.array([*np.array(board.size_m) / 2, -bow_m, 4.0 / (across**2 + down**2)])
+    corners = np.empty((len(poses), *rays.shape[:2], 2))
+    unroll(poses, bow, rays, corners)
     light = np.empty((lens.height, lens.width))
     light_up(poses, rays, corners, sheet, edges, place, pixel, light)
     return light
 
 
-def _expose(
-    radiance: NDArray[np.float64], white_e: float, rng: np.random.Generator | None
-) -> NDArray[np.uint8]:
+def _expose(radiance: Floats, white_e: float, rng: np.random.Generator | None) -> Grey:
     """The 8-bit picture: photon noise by its normal limit, read noise, gain, rounding."""
-    grey_per_e = (WHITE_GREY - BLACK_GREY) / white_e
-    grey = (WHITE_GREY - BLACK_GREY) * radiance + BLACK_GREY
+    grey_per_e = (PAPER_GREY - NO_LIGHT_GREY) / white_e
+    grey = (PAPER_GREY - NO_LIGHT_GREY) * radiance + NO_LIGHT_GREY
     if rng is not None:
         sigma_e = np.sqrt(white_e * radiance + READ_NOISE_E**2)
         grey += grey_per_e * sigma_e * rng.standard_normal(grey.shape)
@@ -352,34 +327,10 @@ def _sheet(board: Board) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     pattern = board.image(TEXELS_PER_SQUARE)
     margin = round(MARGIN * TEXELS_PER_SQUARE)
     paper = np.pad(pattern, margin, constant_values=255)
-    sheet = (INK + (PAPER - INK) / 255.0 * paper).astype(np.float32)
+    sheet = (INK_LIGHT + (PAPER_LIGHT - INK_LIGHT) / 255.0 * paper).astype(np.float32)
     framed = np.pad(paper, 1, constant_values=128)  # the sheet's own edge is one, too
     flat = np.ones(framed.shape, np.uint8)
     flat[:-1] &= framed[:-1] == framed[1:]
     flat[:, :-1] &= framed[:, :-1] == framed[:, 1:]
     edges = cv2.distanceTransform(flat, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
     return sheet, np.ascontiguousarray(edges, np.float32)
-
-
-@lru_cache(maxsize=4)
-def _corner_rays(lens: Intrinsics) -> NDArray[np.float64]:
-    """Where the rays of the pixels' corners are at Z = 1 m, (h + 1, w + 1, 2), NaN for no ray."""
-    corners = pixel_grid(lens.width + 1, lens.height + 1) - 0.5
-    rays = deproject(corners, np.ones(corners.shape[:2]), lens.K, lens.dist)
-    return np.ascontiguousarray(rays[..., :2])
-
-
-def _check(name: str, value: object, least: float, most: float, unit: str) -> None:
-    number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
-    if not number or not least <= value <= most:  # type: ignore[operator]
-        raise ValueError(f"{name}: got {value!r}, want {least} to {most} {unit}")
-
-
-def _check_velocity(velocity: ArrayLike) -> NDArray[np.float64]:
-    try:
-        twist = np.asarray(velocity, np.float64)
-    except (TypeError, ValueError):
-        twist = np.full(6, np.nan)
-    if twist.shape != (6,) or not np.isfinite(twist).all():
-        raise ValueError(f"velocity: got {velocity!r}, want six finite numbers, m/s and rad/s")
-    return twist

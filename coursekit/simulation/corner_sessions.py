@@ -12,16 +12,18 @@ from dataclasses import dataclass, fields
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coursekit.arrays import Floats, NDArray
+from coursekit.arrays import Bools, Floats, Integers
 from coursekit.boards import Board, Detection, Detections
-from coursekit.geometry import Intrinsics, deproject, fold_radius, project, transform_points
+from coursekit.boards.view import BORDER_PX, in_view, seen
+from coursekit.checks import number, positive, whole
+from coursekit.geometry import Intrinsics, project, transform_points
 
-BORDER_PX = 6.0  # a corner nearer to the image's border has no room for its refinement window
 PARTIAL_SHARE = 0.4  # a ChArUco view shows at least this share of the corners
 SHARP_BLUR_PX = 0.63  # std of the blur that `detect` measures in sharp rendered images
 BLUR_SCATTER = 0.08  # relative error of a blur variance; measured, as the two others are
 BLUR_NOISE_GAIN = 0.15  # growth of the corner variance per unit of relative blur variance
-SLIDES, TRIES = 21, 60  # from the target to the middle of the image; poses before giving up
+POSES_TRIED = 60  # for each view, before giving up
+NEAREST_M, FARTHEST_M = 0.3, 0.8
 ROW_STEPS, ROW_TOLERANCE_PX = 50, 1e-9
 
 
@@ -55,19 +57,12 @@ class Effects:
     noise_spread: float = 0.0
 
     def __post_init__(self) -> None:
+        most = {"max_tilt_deg": 60.0, "inner_only": 0.3, "blur_share": 1.0}
         for field in fields(self):
-            value = getattr(self, field.name)
-            signed = field.name == "bow_m"
-            if not np.isfinite(value) or (value < 0 and not signed):
-                raise ValueError(f"{field.name}: got {value!r}, want a finite number, 0 or more")
-        if not self.max_tilt_deg <= 60:
-            raise ValueError(f"max_tilt_deg: got {self.max_tilt_deg}, want at most 60")
-        if not self.inner_only <= 0.3:
-            raise ValueError(f"inner_only: got {self.inner_only}, want a share of at most 0.3")
-        if not self.blur_share <= 1:
-            raise ValueError(f"blur_share: got {self.blur_share}, want a share of at most 1")
-        if not self.square_scale > 0:
-            raise ValueError(f"square_scale: got {self.square_scale}, want a positive number")
+            least, highest = -np.inf if field.name == "bow_m" else 0.0, most.get(field.name, np.inf)
+            wanted = f"a finite number from {least:g} to {highest:g}"
+            number(field.name, getattr(self, field.name), wanted, least=least, most=highest)
+        positive("square_scale", self.square_scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,42 +101,46 @@ def corner_session(
     noise_px: std of one coordinate of a corner. The same arguments give the same bytes.
     Raises ValueError for bad arguments and when the board does not fit the image at any distance.
     """
-    if views < 1:
-        raise ValueError(f"views: got {views!r}, want at least 1")
-    if not (np.isfinite(noise_px) and noise_px >= 0):
-        raise ValueError(f"noise_px: got {noise_px!r}, want a finite number, 0 or more")
+    whole("views", views)
+    number("noise_px", noise_px, "a finite number, 0 or more", least=0.0)
     effects = effects or Effects()
     # One stream of random numbers for the poses and one for the rest: a session with an effect
     # then has the poses and the noise of the healthy session with the same seed.
     poses = view_poses(board, lens, np.random.default_rng([seed, 0]), views, effects)
     rng = np.random.default_rng([seed, 1])
     draw = _Draw(rng, views, effects)
-    seen = [
-        _see(board, lens, poses[i], effects, draw.focal_scale[i], draw.velocity_m_s[i])
+    looks = [
+        _look(board, lens, poses[i], effects, draw.focal_scale[i], draw.velocity_m_s[i])
         for i in range(views)
     ]
-    wrong = _wrong_corners(rng, seen, effects)
+    # single bad corners, in different views as far as they go round
+    order = np.resize(rng.permutation(views), effects.bad_corners).tolist()
+    wrong = tuple((view, int(rng.choice(looks[view][0]))) for view in order)
     detections = []
-    for i, (ids, pixels, _) in enumerate(seen):
+    for i, (ids, pixels, _) in enumerate(looks):
         blur = SHARP_BLUR_PX**2 * np.eye(2)
         if i in draw.blurred:
             blur = blur + effects.blur_px**2 / 12 * np.outer(draw.along[i], draw.along[i])
-        noise = _corner_noise(rng, len(ids), noise_px * draw.noise_scale[i], blur)
-        wild = _errors(rng, i, ids, draw, wrong, effects)
-        detections.append(
-            Detection(
-                ids=ids,
-                pixels=pixels + noise + wild,
-                size=lens.size,
-                name=f"view {i:02d}",
-                noise_px=noise_px * draw.noise_scale[i],
-                blur=_measured_blur(rng, blur),
-            )
-        )
+        sigma_px = noise_px * draw.noise_scale[i]
+        noise = corner_noise(rng, len(ids), sigma_px, blur)
+        spoiled = effects.spoiled_px * (i == draw.spoiled_view)
+        bad = np.isin(ids, [corner for view, corner in wrong if view == i])
+        wild = _directions(rng, ids.size) * np.where(bad, effects.bad_corner_px, spoiled)[:, None]
+        measured = _measured_blur(rng, blur)
+        found = pixels + noise + wild
+        detections.append(Detection(ids, found, lens.size, f"view {i:02d}", sigma_px, measured))
+    depth_m = tuple(Z for _, _, Z in looks)
     truth = Truth(
-        lens, poses, effects, draw.focal_scale, draw.velocity_m_s, draw.blurred,
-        draw.spoiled_view, tuple(wrong), tuple(depth for _, _, depth in seen),
-    )  # fmt: skip
+        lens=lens,
+        T_camera_board=poses,
+        effects=effects,
+        focal_scale=draw.focal_scale,
+        velocity_m_s=draw.velocity_m_s,
+        blurred=draw.blurred,
+        spoiled_view=draw.spoiled_view,
+        bad_corners=wrong,
+        depth_m=depth_m,
+    )
     return Detections(detections), truth
 
 
@@ -175,54 +174,37 @@ def _pose_in_view(
     target: Floats,
     effects: Effects,
 ) -> Floats:
-    middle = np.array([(lens.width - 1) / 2, (lens.height - 1) / 2])
-    centre = board.points.mean(axis=0)
-    shares = np.linspace(1.0, 0.0, SLIDES)[:, None]
-    aims = middle + shares * (target - middle)
-    rays = deproject(aims, np.ones(SLIDES), lens.K, lens.dist)
-    for _ in range(TRIES):
+    """One pose (4, 4), tilted about the direction `azimuth`, its middle aimed at `target` (2,)."""
+    for _ in range(POSES_TRIED):
         tilt = np.radians(effects.max_tilt_deg) * np.sqrt(rng.random())
         axis = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-        roll = rng.uniform(-np.pi / 4, np.pi / 4)
-        rotation = Rotation.from_rotvec(tilt * axis) * Rotation.from_euler("z", roll)
-        T = np.eye(4)
-        T[:3, :3] = rotation.as_matrix()
-        for offset in rng.uniform(0.3, 0.8) * rays - T[:3, :3] @ centre:
-            T[:3, 3] = offset
-            if _enough_in_view(board, lens, T, effects.inner_only):
-                return T
+        roll = Rotation.from_euler("z", rng.uniform(-np.pi / 4, np.pi / 4))
+        R = (Rotation.from_rotvec(tilt * axis) * roll).as_matrix()
+        distance_m = rng.uniform(NEAREST_M, FARTHEST_M)
+        T = in_view(
+            target, distance_m, R, board.middle, lens, lambda T: _enough(board, lens, T, effects)
+        )
+        if T is not None:
+            return T
     raise ValueError(
         f"board: {board.size_m[0]:.3f} x {board.size_m[1]:.3f} m does not fit the "
-        f"{lens.width}x{lens.height} image at 0.3 to 0.8 m"
+        f"{lens.width}x{lens.height} image at {NEAREST_M} to {FARTHEST_M} m"
     )
 
 
-def _enough_in_view(board: Board, lens: Intrinsics, T: Floats, inner_only: float) -> bool:
-    if inner_only:
-        return bool(_visible(board.points, lens, T, inner_only).all())
-    if board.kind == "checkerboard":
-        ring = board.square_m * np.array([1.0, 1.0, 0.0])
-        low, high = board.points.min(axis=0) - ring, board.points.max(axis=0) + ring
-        outline = np.array([[x, y, 0.0] for x in (low[0], high[0]) for y in (low[1], high[1])])
-        everything = np.concatenate([board.points, outline])
-        return bool(_visible(everything, lens, T).all())
-    seen = _visible(board.points, lens, T)
-    return bool(seen.sum() >= max(PARTIAL_SHARE * len(seen), 12))
+def _enough(board: Board, lens: Intrinsics, T: Floats, effects: Effects) -> bool:
+    """Whether so much of the board is seen that it makes a view."""
+    if effects.inner_only or board.kind == "charuco":
+        visible = _visible(board, lens, T, effects)
+        share = 1.0 if effects.inner_only else PARTIAL_SHARE
+        return bool(visible.sum() >= max(share * len(visible), min(12, len(visible))))
+    return bool(seen(np.concatenate([board.points, board.outline]), T, lens).all())
 
 
-def _visible(
-    points: Floats, lens: Intrinsics, T: Floats, inner_only: float = 0.0
-) -> NDArray[np.bool_]:
-    """Whether each board point is in the image, BORDER_PX from its border."""
-    margin = np.maximum(BORDER_PX, inner_only * np.array(lens.size))
-    inside = points @ T[:3, :3].T + T[:3, 3]
-    pixels = project(inside, lens.K, lens.dist)
-    last = np.array(lens.size) - 1 - margin
-    seen = np.asarray(((pixels >= margin) & (pixels <= last)).all(axis=-1))
-    if lens.dist is not None:
-        # Beyond its fold a distortion brings points back into the image, but not to their ray.
-        seen &= np.hypot(*(inside[:, :2] / inside[:, 2:]).T) < fold_radius(lens.dist)
-    return seen
+def _visible(board: Board, lens: Intrinsics, T: Floats, effects: Effects) -> Bools:
+    """Which corners (N,) are in the image, as far from its border as they must be."""
+    border_px = np.maximum(BORDER_PX, effects.inner_only * np.array(lens.size))
+    return seen(board.points, T, lens, border_px)
 
 
 # --- what is seen of them ---
@@ -246,13 +228,12 @@ class _Draw:
         self.spoiled_view = chosen if effects.spoiled_px else None
 
 
-def _see(
+def _look(
     board: Board, lens: Intrinsics, T: Floats, effects: Effects, scale: float, velocity: Floats
-) -> tuple[NDArray[np.int64], Floats, Floats]:
+) -> tuple[Integers, Floats, Floats]:
     """The ids of the corners in the image, their pixels (N, 2) without noise, and their Z (N,)."""
-    ids = np.flatnonzero(_visible(board.points, lens, T, effects.inner_only))
-    on_board = bowed(board, effects.bow_m)[ids] * effects.square_scale
-    points = transform_points(T, on_board)
+    ids = np.flatnonzero(_visible(board, lens, T, effects))
+    points = transform_points(T, bowed(board, effects.bow_m)[ids] * effects.square_scale)
     K = lens.K
     K[[0, 1], [0, 1]] *= scale
     pixels = rolling_shutter(points, velocity, effects.readout_s, lens.height, K, lens.dist)
@@ -266,7 +247,7 @@ def bowed(board: Board, bow_m: float) -> Floats:
     outermost corners stay where they were.
     """
     points = board.points.copy()
-    away = points[:, :2] - points[:, :2].mean(axis=0)
+    away = points[:, :2] - board.middle[:2]
     share = (away**2).sum(axis=1)
     points[:, 2] -= bow_m * (1 - share / share.max())
     return points
@@ -301,11 +282,26 @@ def rolling_shutter(
 # --- what the detector makes of it ---
 
 
-def _corner_noise(rng: np.random.Generator, count: int, noise_px: float, blur: Floats) -> Floats:
-    """Corner errors (N, 2), px: blur flattens the edges across its direction and adds noise."""
+def corner_noise(
+    rng: np.random.Generator, count: int, noise_px: float, blur: Floats | None = None
+) -> Floats:
+    """Errors (count, 2) of detected corners, px.
+
+    noise_px: std of one coordinate in a sharp image. blur (2, 2): covariance, px^2, None for a
+    sharp image: it flattens the edges across its direction and adds noise there.
+    """
+    noise = noise_px * rng.normal(size=(count, 2))
+    if blur is None:
+        return noise
     sharp = SHARP_BLUR_PX**2 * np.eye(2)
     growth = np.eye(2) + BLUR_NOISE_GAIN * (blur - sharp) / SHARP_BLUR_PX**2
-    return noise_px * rng.normal(size=(count, 2)) @ np.linalg.cholesky(growth).T
+    return noise @ np.linalg.cholesky(growth).T
+
+
+def _directions(rng: np.random.Generator, count: int) -> Floats:
+    """Unit vectors (count, 2), each in a direction of its own."""
+    angle = rng.uniform(0, 2 * np.pi, count)
+    return np.column_stack([np.cos(angle), np.sin(angle)])
 
 
 def _measured_blur(rng: np.random.Generator, blur: Floats) -> Floats:
@@ -313,31 +309,3 @@ def _measured_blur(rng: np.random.Generator, blur: Floats) -> Floats:
     root = np.linalg.cholesky(blur)
     noise = rng.normal(size=(2, 2)) * BLUR_SCATTER
     return root @ (np.eye(2) + (noise + noise.T) / 2) @ root.T
-
-
-def _wrong_corners(
-    rng: np.random.Generator,
-    seen: list[tuple[NDArray[np.int64], Floats, Floats]],
-    effects: Effects,
-) -> list[tuple[int, int]]:
-    """(view, corner id) of the single bad corners, in different views as far as they go round."""
-    order = np.resize(rng.permutation(len(seen)), effects.bad_corners)
-    return [(int(view), int(rng.choice(seen[view][0]))) for view in order]
-
-
-def _errors(
-    rng: np.random.Generator,
-    view: int,
-    ids: NDArray[np.int64],
-    draw: _Draw,
-    wrong: list[tuple[int, int]],
-    effects: Effects,
-) -> Floats:
-    """Gross errors (N, 2), px: the spoiled view's and the bad corners'."""
-    angle = rng.uniform(0, 2 * np.pi, len(ids))
-    direction = np.column_stack([np.cos(angle), np.sin(angle)])
-    size = np.zeros(len(ids))
-    if view == draw.spoiled_view:
-        size += effects.spoiled_px
-    size[np.isin(ids, [corner for at, corner in wrong if at == view])] = effects.bad_corner_px
-    return size[:, None] * direction

@@ -1,22 +1,6 @@
-"""Infrared light on boxes as one eye of the rig sees it, compiled by numba.
+"""The active-stereo rig: two infrared eyes, a dot projector, and a matcher that knows no better.
 
-Two images come out of one pass: what the dot projector lights and what the room lights, each for a
-unit of light, so that a brighter room or another exposure needs no second pass. Boxes are the rows
-of `raycast`, in the left eye's frame; a skin row is a box's diffuse albedo, its specular share, the
-contrast of its fine texture and the code of its coarse one.
-
-Sums of absolute differences, compiled by numba: the loops of `matching`.
-
-The inner loops run along a row of unsigned 16-bit numbers, without branches, so that the compiler
-makes vector instructions of them; what a band of rows works on stays in the processor's cache.
-
-Block matching of a rectified pair: the disparity image a stereo camera computes.
-
-A window of the left image is compared with 127 windows of the right one; the disparity is where
-the sum of absolute differences is least, refined below a pixel, and kept only where three gates
-agree. Like any matcher it makes noise, holes and false matches of what it is given.
-
-The active-stereo rig: two infrared eyes, a dot projector, and a matcher that knows no better.
+    scene -> light on each eye -> photons, read noise, 8 bits -> disparity by block matching -> z16
 
 Depth noise, holes, shadows, flying pixels and the minimum range are not put in anywhere: two
 images are rendered, photons are counted, and what `match` makes of them is the depth image.
@@ -24,6 +8,17 @@ images are rendered, photons are counted, and what `match` makes of them is the 
 sigma_d, in this course, is the temporal standard deviation of one pixel's disparity: from frame to
 frame, nothing moving. The spatial one, over the pixels of one frame about a plane, is larger: it
 also holds what stays from frame to frame, the error of matching a sparse pattern through speckle.
+
+Light. Two images come out of one pass: what the dot projector lights and what the room lights, each
+for a unit of light, so that a brighter room or another exposure needs no second pass. Boxes are the
+rows of `raycast`, in the left eye's frame; a skin row is a box's diffuse albedo, its specular
+share, the contrast of its fine texture and the code of its coarse one.
+
+Matching. A window of the left image is compared with 127 windows of the right one; the disparity
+is where the sum of absolute differences is least, refined below a pixel, and kept only where three
+gates agree. Like any matcher it makes noise, holes and false matches of what it is given. Its inner
+loops run along a row of unsigned 16-bit numbers, without branches, so that the compiler makes
+vector instructions of them; what a band of rows works on stays in the processor's cache.
 """
 
 from __future__ import annotations
@@ -38,14 +33,19 @@ import cv2
 import numpy as np
 from numba import njit, prange
 
-from coursekit.arrays import ArrayLike, NDArray
+from coursekit.arrays import ArrayLike, Floats, Grey, NDArray
+from coursekit.checks import number, positive, want
 from coursekit.geometry import Intrinsics, pixel_grid
 from coursekit.simulation import raycast
 from coursekit.simulation.raycast import is_lit, nearest_hit, texture_factor
 from coursekit.simulation.scenes import TEXTURES, Scene, box_table, check_scene, rays
 
+Image = NDArray[np.float32]  # (H, W)
+
+# --- light, compiled by numba ---
+
 TEXEL_M = 0.0005
-SAMPLES = 2  # 2x2 rays a pixel: 1x1 distorts edges, 3x3 changes nothing that matters
+RAYS_PER_SIDE = 2  # 2x2 rays a pixel: 1x1 distorts edges, 3x3 changes nothing that matters
 
 
 @njit(cache=True, error_model="numpy", parallel=True)
@@ -73,9 +73,9 @@ def render_eye(
     for v in prange(laser.shape[0]):
         for u in range(laser.shape[1]):
             from_laser, from_room = 0.0, 0.0
-            for sample in range(SAMPLES * SAMPLES):
-                x = (u + (sample % SAMPLES + 0.5) / SAMPLES - 0.5 - lens[2]) / lens[0]
-                y = (v + (sample // SAMPLES + 0.5) / SAMPLES - 0.5 - lens[3]) / lens[1]
+            for sample in range(RAYS_PER_SIDE * RAYS_PER_SIDE):
+                x = (u + (sample % RAYS_PER_SIDE + 0.5) / RAYS_PER_SIDE - 0.5 - lens[2]) / lens[0]
+                y = (v + (sample // RAYS_PER_SIDE + 0.5) / RAYS_PER_SIDE - 0.5 - lens[3]) / lens[1]
                 dx = turn[0, 0] * x + turn[0, 1] * y + turn[0, 2]
                 dy = turn[1, 0] * x + turn[1, 1] * y + turn[1, 2]
                 dz = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2]
@@ -84,8 +84,8 @@ def render_eye(
                 )
                 from_laser += one
                 from_room += other
-            laser[v, u] = from_laser / (SAMPLES * SAMPLES)
-            ambient[v, u] = from_room / (SAMPLES * SAMPLES)
+            laser[v, u] = from_laser / (RAYS_PER_SIDE * RAYS_PER_SIDE)
+            ambient[v, u] = from_room / (RAYS_PER_SIDE * RAYS_PER_SIDE)
 
 
 @njit(cache=True, error_model="numpy")
@@ -200,6 +200,8 @@ def expose(
             out[eye, y, x] = np.uint8(value)
 
 
+# --- matching, compiled by numba ---
+
 HALF = 5  # windows of 11x11 px
 BAND = 40  # rows that one thread takes at a time
 
@@ -217,7 +219,7 @@ def match_bands(
     """Write the disparity (H, W) px where all gates are open; bands of rows go to the threads.
 
     left, right: high-pass images with HALF rows and columns of padding, the right one with one more
-    column on the left for every disparity above 0. For the rest see `matching.match`.
+    column on the left for every disparity above 0. For the rest see `match`.
     """
     height, width = disparity.shape
     candidates = right.shape[1] - left.shape[1] + 1
@@ -324,6 +326,8 @@ def _close(out: Any, least: Any, at: Any, gradient: Any, texture: float, left_ri
             out[x] = 0.0
 
 
+# --- matching a pair of images ---
+
 CANDIDATES = 127  # disparities 0..126 px; a match needs a neighbour on both sides: 1..125
 CAP = 63  # of the high-pass image, grey levels to either side
 _CROSS = np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]], np.float32)
@@ -335,7 +339,7 @@ def match(
     uniqueness: int = 12,
     texture: float = 12.0,
     left_right: int = 1,
-) -> NDArray[np.float32]:
+) -> Image:
     """The disparity in px of every pixel of the left image, 0 where there is none.
 
     left, right (H, W) uint8: rectified, row v of one is row v of the other. A pixel at u in the
@@ -345,8 +349,11 @@ def match(
     right pixel with disparities more than `left_right` px apart the worse match is dropped.
     Sub-pixel: equiangular lines through the three least costs (Shimizu and Okutomi, 2005).
     Raises ValueError for images that are not uint8, not 2-D, not equal in size, or too small.
-    """
 
+    >>> scene = np.random.default_rng(0).integers(0, 256, (40, 80)).astype(np.uint8)
+    >>> round(float(np.median(match(scene[:, :60], scene[:, 7:67])[10:30, 20:50])), 1)
+    7.0
+    """
     left, right = _pair(left, right)
     a = np.pad(high_pass(left), HALF)
     b = np.pad(high_pass(right), ((HALF, HALF), (HALF + CANDIDATES - 1, HALF)))
@@ -357,7 +364,7 @@ def match(
     return disparity
 
 
-def cost_curve(left: ArrayLike, right: ArrayLike, u: int, v: int) -> NDArray[np.float64]:
+def cost_curve(left: ArrayLike, right: ArrayLike, u: int, v: int) -> Floats:
     """The cost (127,) of matching the window about pixel (u, v) of the left image, by disparity.
 
     left, right (H, W) uint8 as for `match`; the cost is the sum of absolute differences of the
@@ -379,7 +386,7 @@ def cost_curve(left: ArrayLike, right: ArrayLike, u: int, v: int) -> NDArray[np.
     return costs
 
 
-def high_pass(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def high_pass(image: Grey) -> Grey:
     """The image (H, W) less its local mean, times four, 63 for none and clipped at 0 and 126.
 
     The difference of a 3x3 cross-shaped smoothing and a 9x9 mean, as OpenCV's StereoBM does with
@@ -392,20 +399,20 @@ def high_pass(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.clip((difference >> 1) + CAP, 0, 2 * CAP).astype(np.uint8)
 
 
-def _pair(left: ArrayLike, right: ArrayLike) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+def _pair(left: ArrayLike, right: ArrayLike) -> tuple[Grey, Grey]:
+    """Both images, contiguous; ValueError for what cannot be matched."""
     pair = []
     for name, image in (("left", left), ("right", right)):
-        array = np.asarray(image)
-        if array.dtype != np.uint8 or array.ndim != 2 or min(array.shape) <= 2 * HALF:
-            raise ValueError(
-                f"{name}: got {array.dtype} {array.shape}, want (H, W) uint8 of more than "
-                f"{2 * HALF} px either way"
-            )
-        pair.append(np.ascontiguousarray(array))
-    if pair[0].shape != pair[1].shape:
-        raise ValueError(f"right: got shape {pair[1].shape}, want the left image's {pair[0].shape}")
+        pixels = np.asarray(image)
+        fits = pixels.dtype == np.uint8 and pixels.ndim == 2 and min(pixels.shape) > 2 * HALF
+        got = pixels.dtype.name, pixels.shape
+        want(fits, name, got, f"(H, W) uint8 of more than {2 * HALF} px either way")
+        pair.append(np.ascontiguousarray(pixels))
+    want(pair[0].shape == pair[1].shape, "right", pair[1].shape, f"{pair[0].shape} as the left one")
     return pair[0], pair[1]
 
+
+# --- the rig ---
 
 # Plausible, not measured: no figure of this block was taken from a camera. They were chosen so
 # that one pixel's disparity varies by about 0.08 px (the vendor's planning value) at low ambient;
@@ -461,24 +468,23 @@ class Rig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.left.dist is not None:
-            raise ValueError(f"left: got coefficients {self.left.coeffs}, want none: rectified")
+        want(self.left.dist is None, "left", self.left.coeffs, "no coefficients: rectified")
         for name in ("baseline_m", "drift_time_s", "electrons_per_grey"):
-            _check(name, getattr(self, name), "a positive number", 0.0, strictly=True)
+            positive(name, getattr(self, name))
         for name in ("drift_px", "ambient", "read_noise_e"):
-            _check(name, getattr(self, name), "a number of at least 0", 0.0)
-        _check("disparity_offset_px", self.disparity_offset_px, "a finite number")
-        _check("baseline_error", self.baseline_error, "a number above -1", -1.0, strictly=True)
+            number(name, getattr(self, name), "a number of at least 0", least=0.0)
+        number("disparity_offset_px", self.disparity_offset_px)
+        number("baseline_error", self.baseline_error, "a number above -1", above=-1.0)
         if self.exposure != "auto":
-            _check("exposure", self.exposure, '"auto" or a positive number', 0.0, strictly=True)
+            positive("exposure", self.exposure, '"auto" or a positive number')
 
-    def look_at(self, scene: Scene) -> View:
+    def look_at(self, scene: Scene) -> RigView:
         """Both eyes' views of a scene, rendered once; another scene costs about 0.4 s.
 
         Raises ValueError for a wrong scene and for a camera inside a box.
         """
         check_scene(scene)
-        return View(self, tuple(scene))
+        return RigView(self, tuple(scene))
 
     def drift(self, time_s: float) -> float:
         """The right eye's turn at this time, px of disparity: the same at the same time.
@@ -496,12 +502,12 @@ class StereoFrame:
     """What the rig delivers each time: left, right (H, W) uint8; disparity (H, W) float32 px, 0
     where there is none."""
 
-    left: NDArray[np.uint8]
-    right: NDArray[np.uint8]
-    disparity: NDArray[np.float32]
+    left: Grey
+    right: Grey
+    disparity: Image
 
 
-class View:
+class RigView:
     """A rig in front of a scene that stands still.
 
     exposure_ms: of every frame, ms. truth_m: the exact depth.
@@ -541,11 +547,8 @@ class View:
         left, right = self.images(rng, time_s)
         return StereoFrame(left, right, match(left, right))
 
-    def images(
-        self, rng: np.random.Generator, time_s: float = 0.0
-    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    def images(self, rng: np.random.Generator, time_s: float = 0.0) -> tuple[Grey, Grey]:
         """The next pair of images (H, W) uint8 alone, with photon and read noise."""
-
         pair = np.empty(self._mean.shape, np.uint8)
         table = _noise_table()
         rows = rng.integers(0, NOISE_TABLE - self.rig.left.width, pair.shape[:2])
@@ -561,22 +564,20 @@ class View:
         return counts(frame.disparity, self.rig.left.fx, self.rig.baseline_m, depth_scale_m)
 
     @cached_property
-    def truth_m(self) -> NDArray[np.float64]:
+    def truth_m(self) -> Floats:
         """The exact Z (H, W) of what the left eye's pixel centres see, m, 0 where there is none."""
-
         left = self.rig.left
         truth, index = np.empty(left.size[::-1]), np.empty(left.size[::-1], np.int16)
-        raycast.render_depth(
-            box_table(self.scene, None), rays(left, pixel_grid(*left.size)), truth, index
-        )
+        boxes = box_table(self.scene, None)
+        raycast.render_depth(boxes, rays(left, pixel_grid(*left.size)), truth, index)
         return truth
 
 
 def counts(
-    disparity: NDArray[np.float32], fx: float, baseline_m: float, depth_scale_m: float
+    disparity: Image, fx: float, baseline_m: float, depth_scale_m: float
 ) -> NDArray[np.uint16]:
     """Depth fx baseline / disparity (H, W), rounded to counts of depth_scale_m; 0 is invalid."""
-    _check("depth_scale_m", depth_scale_m, "a positive number of metres", 0.0, strictly=True)
+    positive("depth_scale_m", depth_scale_m, "a positive number of metres")
     with np.errstate(divide="ignore"):
         depth = np.float32(fx * baseline_m / depth_scale_m) / disparity
     depth += np.float32(0.5)
@@ -593,38 +594,32 @@ def _light(
     offset_px: float,
     projector: bool,
     seed: int,
-) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+) -> list[tuple[Image, Image]]:
     """(laser, room) light (H, W) on each eye, of unit brightness, blurred by the lens."""
-
     boxes = box_table(scene, None)
-    skins = np.array(
-        [
-            (np.mean(b.color), b.specular, CONTRAST[b.texture], TEXTURES.index(b.texture))
-            for b in scene
-        ]
-    ).reshape(-1, 4)
+    skins = np.empty((len(scene), 4))
+    for skin, box in zip(skins, scene, strict=True):
+        skin[:3] = np.mean(box.color), box.specular, CONTRAST[box.texture]
+        skin[3] = TEXTURES.index(box.texture)
     place = np.array([PROJECTOR_AT * baseline_m, 0.0, 0.0, float(projector)])
     lens = np.array([left.fx, left.fy, left.cx, left.cy])
     dots, pattern = _pattern(left.fx)
     yaw = math.atan(offset_px / left.fx)
-    turn = np.array(
-        [[math.cos(yaw), 0, math.sin(yaw)], [0, 1, 0], [-math.sin(yaw), 0, math.cos(yaw)]]
-    )
+    c, s = math.cos(yaw), math.sin(yaw)
+    turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
     # Another scene, another speckle; the same scene, the same.
     rng = np.random.default_rng([seed, zlib.crc32(boxes.tobytes())])
     eyes = []
     for eye, facing in ((0.0, np.eye(3)), (baseline_m * (1 + baseline_error), turn)):
         laser, room = (np.empty(left.size[::-1], np.float32) for _ in range(2))
-        render_eye(
-            boxes, skins, np.array([eye, 0.0, 0.0]), facing, lens, place, dots, pattern, _grain(),
-            laser, room,
-        )  # fmt: skip
+        at = np.array([eye, 0.0, 0.0])
+        render_eye(boxes, skins, at, facing, lens, place, dots, pattern, _grain(), laser, room)
         laser *= 1 + np.float32(SPECKLE) * _speckle(rng, laser.shape)
         eyes.append((_blurred(laser, LENS_SIGMA_PX), _blurred(room, LENS_SIGMA_PX)))
     return eyes
 
 
-def _metered(radiance: NDArray[np.float32]) -> float:
+def _metered(radiance: Image) -> float:
     """The exposure in ms that makes the dots in the middle bright and hardly saturated."""
     part, percentile = METERED
     rows, columns = (
@@ -634,7 +629,7 @@ def _metered(radiance: NDArray[np.float32]) -> float:
     return min(LONGEST_MS, BRIGHT_GREY / (GREY_PER_MS * bright)) if bright > 0 else LONGEST_MS
 
 
-def _yaw_slope(image: NDArray[np.float32], left: Intrinsics) -> NDArray[np.float32]:
+def _yaw_slope(image: Image, left: Intrinsics) -> Image:
     """The change of an eye's image (H, W) per pixel of disparity offset that a yaw makes."""
     kernel = np.array([[1, -8, 0, 8, -1]], np.float32) / 12
     along = cv2.filter2D(image, -1, kernel, borderType=cv2.BORDER_REPLICATE)
@@ -645,8 +640,8 @@ def _yaw_slope(image: NDArray[np.float32], left: Intrinsics) -> NDArray[np.float
 
 
 @lru_cache(maxsize=4)
-def _pattern(fx: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The projector's dots and pattern as `infrared.dot_light` wants them; one for every unit."""
+def _pattern(fx: float) -> tuple[Floats, Floats]:
+    """The projector's dots and pattern as `dot_light` wants them; one for every unit."""
     rng = np.random.default_rng(20)
     cell = DOT_SPACING_PX / fx
     columns, rows = (2 * math.ceil(half / cell) for half in PATTERN_HALF_TAN)
@@ -663,7 +658,7 @@ def _pattern(fx: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 @lru_cache(maxsize=1)
-def _grain(size: int = 512, levels: int = 6) -> NDArray[np.float32]:
+def _grain(size: int = 512, levels: int = 6) -> Image:
     """A tile of 1/f texture of unit std (levels, size, size), each level blurred twice as far."""
     rng = np.random.default_rng(3)
     frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(size), np.fft.rfftfreq(size), indexing="ij"))
@@ -676,33 +671,25 @@ def _grain(size: int = 512, levels: int = 6) -> NDArray[np.float32]:
     return (np.stack(tiles) / tiles[0].std()).astype(np.float32)
 
 
-def _speckle(rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.float32]:
+def _speckle(rng: np.random.Generator, shape: tuple[int, ...]) -> Image:
     noise = _blurred(rng.standard_normal(shape, np.float32), SPECKLE_SIGMA_PX)
     return noise / noise.std()
 
 
-def _blurred(image: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]:
+def _blurred(image: Image, sigma_px: float) -> Image:
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px), np.float32)
 
 
 @lru_cache(maxsize=1)
-def _noise_table() -> NDArray[np.float32]:
+def _noise_table() -> Image:
     """Normal numbers to be read from a random place for each row: twenty times faster than new
     ones, and two frames share a row's numbers once in a million."""
     return np.random.default_rng(4).standard_normal(NOISE_TABLE, np.float32)
 
 
 @lru_cache(maxsize=16)
-def _drift_spectrum(seed: int, terms: int = 64) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _drift_spectrum(seed: int, terms: int = 64) -> tuple[Floats, Floats]:
     """Frequencies (rad per correlation time) of a Lorentzian spectrum, and phases."""
     rng = np.random.default_rng([seed, 2])
     quantile = (np.arange(terms) + rng.random(terms)) / terms
     return np.tan(np.pi / 2 * quantile), rng.uniform(0, 2 * np.pi, terms)
-
-
-def _check(
-    name: str, value: float, wanted: str, least: float = -math.inf, strictly: bool = False
-) -> None:
-    number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
-    if not number or not math.isfinite(value) or value < least or (strictly and value == least):
-        raise ValueError(f"{name}: got {value!r}, want {wanted}")

@@ -1,24 +1,21 @@
-"""What stands in front of the simulated camera: boxes with a size, a pose, a colour, a texture.
+"""What stands in front of the simulated camera, boxes with a size, a pose, a colour and a texture;
+and the exact image of it: depth and box at every pixel's centre, and a readable picture.
 
-The exact image of a scene: depth and box at every pixel centre, and a readable picture.
+    scene = tabletop(0.45)
+    render(scene, intrinsics).depth_m
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coursekit.arrays import ArrayLike, NDArray
-from coursekit.geometry import (
-    Intrinsics,
-    check_transform,
-    deproject,
-    invert_transform,
-    make_transform,
-    pixel_grid,
-)
+from coursekit.arrays import ArrayLike, Floats, NDArray
+from coursekit.checks import array, choice, instance, number, positive, transform, want
+from coursekit.geometry import Intrinsics, deproject, invert_transform, make_transform, pixel_grid
 from coursekit.simulation import raycast
 
 TEXTURES = ("plain", "grid", "wood")
@@ -33,6 +30,7 @@ ORANGE = (230 / 255, 159 / 255, 0.0)  # of the Okabe-Ito palette, safe for the c
 BLOCK_M = 0.060
 CUBE_M = 0.025
 TABLE_THICK_M = 0.025
+METRES = "a positive number of metres"
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,30 +45,29 @@ class Box:
     """
 
     name: str
-    size_m: NDArray[np.float64]
-    T_scene_box: NDArray[np.float64]
+    size_m: Floats
+    T_scene_box: Floats
     color: tuple[float, float, float]
     texture: str = "plain"
     specular: float = 0.0
 
     def __post_init__(self) -> None:
-        size = _three_numbers("size_m", self.size_m)
-        if (size <= 0).any():
-            raise ValueError(f"size_m: got {size.tolist()}, want three positive lengths in m")
-        color = _three_numbers("color", self.color)
-        if (color < 0).any() or (color > 1).any():
-            raise ValueError(f"color: got {color.tolist()}, want red, green, blue from 0 to 1")
-        if self.texture not in TEXTURES:
-            raise ValueError(f"texture: got {self.texture!r}, want one of {', '.join(TEXTURES)}")
-        if not 0 <= _number("specular", self.specular, "share") <= 1:
-            raise ValueError(f"specular: got {self.specular}, want a share from 0 to 1")
-        T = check_transform("T_scene_box", self.T_scene_box).copy()
-        if T.shape != (4, 4):
-            raise ValueError(f"T_scene_box: got shape {T.shape}, want one (4, 4) transform")
-        size.flags.writeable = T.flags.writeable = False
-        object.__setattr__(self, "size_m", size)
-        object.__setattr__(self, "T_scene_box", T)
+        size = array("size_m", self.size_m, (3,), finite=True)
+        want((size > 0).all(), "size_m", size, "three positive lengths in m")
+        color = array("color", self.color, (3,), finite=True)
+        want(((color >= 0) & (color <= 1)).all(), "color", color, "red, green, blue from 0 to 1")
+        choice("texture", self.texture, TEXTURES)
+        number("specular", self.specular, "a share from 0 to 1", least=0.0, most=1.0)
+        object.__setattr__(self, "size_m", _kept(size))
+        object.__setattr__(self, "T_scene_box", _kept(transform("T_scene_box", self.T_scene_box)))
         object.__setattr__(self, "color", tuple(color.tolist()))
+
+
+def _kept(values: Floats) -> Floats:
+    """A copy that nobody can write to."""
+    values = values.copy()
+    values.flags.writeable = False
+    return values
 
 
 Scene = tuple[Box, ...]
@@ -85,37 +82,23 @@ def tabletop(distance_m: float = 0.45, wall_behind_m: float = 0.50, tilt_deg: fl
     this order: "wall", "table", "60 mm block", "25 mm cube". Raises ValueError for a distance that
     is not positive.
     """
-    distance, behind = _distance(distance_m), _number("wall_behind_m", wall_behind_m)
-    if behind < 0.10:
-        raise ValueError(f"wall_behind_m: got {behind}, want at least 0.10 m, behind the cube")
-    table_y, table_front, table_back = (
-        BLOCK_M / 2,
-        min(0.20, 0.6 * distance),
-        distance + behind - 0.02,
-    )
-    turned = Rotation.from_euler("y", 28, degrees=True)
+    distance = positive("distance_m", distance_m, METRES)
+    behind = number("wall_behind_m", wall_behind_m, "at least 0.10 m, behind the cube", least=0.10)
+    top, turned = BLOCK_M / 2, Rotation.from_euler("y", 28, degrees=True)
+    front, back = min(0.20, 0.6 * distance), distance + behind - 0.02
+    table_size, table_middle = (2.00, TABLE_THICK_M, back - front), (back + front) / 2
+    table = _box("table", table_size, (0.0, top + TABLE_THICK_M / 2, table_middle), MAPLE, "wood")
+    cube_at = (0.075, top - CUBE_M / 2, distance + 0.015)
     return (
         _wall(distance + behind, tilt_deg),
-        _box(
-            "table",
-            (2.00, TABLE_THICK_M, table_back - table_front),
-            (0.0, table_y + TABLE_THICK_M / 2, (table_back + table_front) / 2),
-            MAPLE,
-            texture="wood",
-        ),
+        table,
         _box(
             "60 mm block",
-            (BLOCK_M, BLOCK_M, BLOCK_M),
-            (0.0, table_y - BLOCK_M / 2, distance + BLOCK_M / 2),
+            3 * (BLOCK_M,),
+            (0.0, top - BLOCK_M / 2, distance + BLOCK_M / 2),
             ALUMINIUM,
         ),
-        _box(
-            "25 mm cube",
-            (CUBE_M, CUBE_M, CUBE_M),
-            (0.075, table_y - CUBE_M / 2, distance + 0.015),
-            ORANGE,
-            rotation=turned,
-        ),
+        _box("25 mm cube", 3 * (CUBE_M,), cube_at, ORANGE, rotation=turned),
     )
 
 
@@ -127,7 +110,7 @@ def wall_scene(distance_m: float = 1.0, tilt_deg: float = 7.0) -> Scene:
     A wall square to the camera has one disparity, so one sub-pixel phase; a tilted one has all.
     Raises ValueError for a distance that is not positive and for too large a tilt.
     """
-    return (_wall(_distance(distance_m), tilt_deg),)
+    return (_wall(positive("distance_m", distance_m, METRES), tilt_deg),)
 
 
 def artefact_scene(distance_m: float = 0.60) -> Scene:
@@ -139,34 +122,31 @@ def artefact_scene(distance_m: float = 0.60) -> Scene:
     0.05) and "shiny plate" (95 % mirror); and "finger", 0.13 m in front of the camera on the left.
     Raises ValueError for a shorter distance.
     """
-    distance = _distance(distance_m)
-    if distance < 0.30:
-        raise ValueError(f"distance_m: got {distance}, want at least 0.30 m, behind the finger")
+    wanted = "at least 0.30 m, behind the finger"
+    distance = number("distance_m", distance_m, wanted, least=0.30)
     looks_down = Rotation.from_euler("x", 35, degrees=True)
     stage = make_transform(looks_down, (0.0, 0.0, distance))  # x right, y down, z along the table
     turned = Rotation.from_euler("y", 28, degrees=True)
-    foot = -BLOCK_M / 2
+    block, cube, card = 3 * (BLOCK_M,), 3 * (CUBE_M,), (0.12, 0.002, 0.12)
+    plate = _box("shiny plate", card, (0.20, -0.001, 0.02), ALUMINIUM)
     on_table = (
-        _box("wall", (6.0, 4.0, 0.10), (0.0, 0.0, 0.45), WALL_PAINT, texture="grid"),
+        _box("wall", (6.0, 4.0, 0.10), (0.0, 0.0, 0.45), WALL_PAINT, "grid"),
         _box("table", (1.4, TABLE_THICK_M, 0.88), (0.0, TABLE_THICK_M / 2, -0.05), MAPLE, "wood"),
-        _box("60 mm block", (BLOCK_M, BLOCK_M, BLOCK_M), (0.0, foot, 0.0), ALUMINIUM),
-        _box("25 mm cube", (CUBE_M, CUBE_M, CUBE_M), (0.09, -CUBE_M / 2, -0.05), ORANGE,
-             rotation=turned),
+        _box("60 mm block", block, (0.0, -BLOCK_M / 2, 0.0), ALUMINIUM),
+        _box("25 mm cube", cube, (0.09, -CUBE_M / 2, -0.05), ORANGE, rotation=turned),
         _box("tall box", (0.06, 0.20, 0.06), (0.33, -0.10, 0.02), WALL_PAINT),
-        _box("dark card", (0.12, 0.002, 0.12), (-0.17, -0.001, 0.0), DARK),
-        replace(_box("shiny plate", (0.12, 0.002, 0.12), (0.20, -0.001, 0.02), ALUMINIUM),
-                specular=0.95),
-    )  # fmt: skip
+        _box("dark card", card, (-0.17, -0.001, 0.0), DARK),
+        replace(plate, specular=0.95),
+    )
     finger = _box("finger", (0.018, 0.070, 0.018), (-0.070, -0.055, 0.139), SKIN)
     return (*(replace(box, T_scene_box=stage @ box.T_scene_box) for box in on_table), finger)
 
 
 def _wall(distance: float, tilt_deg: float) -> Box:
     """A wall of 100 mm whose front crosses the optical axis at this Z."""
-    tilt = _number("tilt_deg", tilt_deg, "degrees")
-    if not abs(tilt) < 60:
-        raise ValueError(f"tilt_deg: got {tilt}, want less than 60 degrees to either side")
-    turned = Rotation.from_euler("y", -tilt, degrees=True)
+    number("tilt_deg", tilt_deg)
+    want(abs(tilt_deg) < 60, "tilt_deg", tilt_deg, "less than 60 degrees to either side")
+    turned = Rotation.from_euler("y", -tilt_deg, degrees=True)
     thick = 0.10
     center = np.array([0.0, 0.0, distance]) + turned.apply([0.0, 0.0, thick / 2])
     size = (8.0 * distance, 5.0 * distance, thick)
@@ -185,30 +165,7 @@ def _box(
     return Box(name, np.array(size_m), pose, color, texture)
 
 
-def _distance(value: float) -> float:
-    distance = _number("distance_m", value)
-    if distance <= 0:
-        raise ValueError(f"distance_m: got {distance}, want a positive number of metres")
-    return distance
-
-
-def _number(name: str, value: float, unit: str = "metres") -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
-        raise ValueError(f"{name}: got {value!r}, want a number of {unit}")
-    if not np.isfinite(value):
-        raise ValueError(f"{name}: got {value!r}, want a finite number of {unit}")
-    return float(value)
-
-
-def _three_numbers(name: str, values: ArrayLike) -> NDArray[np.float64]:
-    try:
-        array = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name}: got {values!r}, want three numbers") from None
-    if array.shape != (3,) or not np.isfinite(array).all():
-        raise ValueError(f"{name}: got {values!r}, want three finite numbers")
-    return array
-
+# --- the image of a scene ---
 
 LAMP_M = np.array([-0.25, -0.40, -0.10])  # beside the camera, in its frame
 
@@ -221,7 +178,7 @@ class RenderResult:
     object_index (H, W) int16: which box of the scene, -1 for none. color (H, W, 3) uint8: RGB.
     """
 
-    depth_m: NDArray[np.float64]
+    depth_m: Floats
     object_index: NDArray[np.int16]
     color: NDArray[np.uint8]
 
@@ -236,42 +193,44 @@ def render(
     that they give no ray hits nothing. Depth and index are exact at pixel centres, colour is the
     mean of 2x2 rays with Lambert's law, a lamp beside the camera and its shadows.
     Raises ValueError for a wrong argument and for a camera inside a box.
-    """
 
+    >>> camera = Intrinsics(64, 48, 60.0, 60.0, 31.5, 23.5)
+    >>> round(float(render(tabletop(0.45), camera).depth_m[24, 32]), 3)  # of the block
+    0.45
+    """
     check_scene(scene)
-    if not isinstance(intrinsics, Intrinsics):
-        raise ValueError(f"intrinsics: got {type(intrinsics).__name__}, want Intrinsics")
+    instance("intrinsics", intrinsics, Intrinsics)
     boxes = box_table(scene, T_scene_camera)
     width, height = intrinsics.size
     depth, index = np.empty((height, width)), np.empty((height, width), np.int16)
     raycast.render_depth(boxes, rays(intrinsics, pixel_grid(width, height)), depth, index)
     color = np.empty((height, width, 3), np.uint8)
-    raycast.render_color(
-        boxes,
-        np.array([box.color for box in scene]).reshape(-1, 3),
-        np.array([TEXTURES.index(box.texture) for box in scene], np.int64),
-        rays(intrinsics, pixel_grid(width + 1, height + 1) - 0.5),
-        LAMP_M,
-        1.0 / intrinsics.fx,
-        color,
-    )
+    paint = np.array([box.color for box in scene]).reshape(-1, 3)
+    textures = np.array([TEXTURES.index(box.texture) for box in scene], np.int64)
+    corners, pixel = corner_rays(intrinsics), 1.0 / intrinsics.fx
+    raycast.render_color(boxes, paint, textures, corners, LAMP_M, pixel, color)
     return RenderResult(depth, index, color)
 
 
-def rays(intrinsics: Intrinsics, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+def rays(intrinsics: Intrinsics, pixels: Floats) -> Floats:
     """The points at Z = 1 m behind pixels (H, W, 2): (H, W, 3), NaN where there is none."""
     return deproject(pixels, np.ones(pixels.shape[:2]), intrinsics.K, intrinsics.dist)
 
 
-def box_table(scene: Scene, T_scene_camera: ArrayLike | None) -> NDArray[np.float64]:
+@lru_cache(maxsize=4)
+def corner_rays(intrinsics: Intrinsics) -> Floats:
+    """The points at Z = 1 m behind the pixels' corners, (H + 1, W + 1, 3), NaN for no ray."""
+    width, height = intrinsics.size
+    return rays(intrinsics, pixel_grid(width + 1, height + 1) - 0.5)
+
+
+def box_table(scene: Scene, T_scene_camera: ArrayLike | None) -> Floats:
     """The boxes as `raycast` wants them, (N, 15), in the camera frame.
 
     Raises ValueError for a camera inside a box.
     """
-    T = check_transform("T_scene_camera", np.eye(4) if T_scene_camera is None else T_scene_camera)
-    if T.shape != (4, 4):
-        raise ValueError(f"T_scene_camera: got shape {T.shape}, want one (4, 4) transform")
-    T_camera_scene = invert_transform(T)
+    T = np.eye(4) if T_scene_camera is None else T_scene_camera
+    T_camera_scene = invert_transform(transform("T_scene_camera", T))
     boxes = np.empty((len(scene), 15))
     for row, box in zip(boxes, scene, strict=True):
         T_camera_box = T_camera_scene @ box.T_scene_box
@@ -283,5 +242,5 @@ def box_table(scene: Scene, T_scene_camera: ArrayLike | None) -> NDArray[np.floa
 
 def check_scene(scene: Scene) -> None:
     """Raises ValueError for anything but a tuple or list of Box."""
-    if not isinstance(scene, (tuple, list)) or not all(isinstance(box, Box) for box in scene):
-        raise ValueError(f"scene: got {scene!r}, want a tuple of Box, e.g. tabletop()")
+    boxes = isinstance(scene, (tuple, list)) and all(isinstance(box, Box) for box in scene)
+    want(boxes, "scene", scene, "a tuple of Box, e.g. tabletop()")

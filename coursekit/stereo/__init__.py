@@ -31,12 +31,11 @@ A window is (left, top, width, height) in px. Intervals are 95 %.
 from __future__ import annotations
 
 from coursekit.stereo.face import BlockFace, block_face
-from coursekit.stereo.fits import BiasFit, NoiseFit, fit_bias, fit_noise
+from coursekit.stereo.fits import BiasFit, BiasPriors, NoiseFit, fit_bias, fit_noise
 from coursekit.stereo.law import (
     depth_from_disparity,
     depth_noise,
     depth_slope,
-    disparity_from_depth,
     robust_depth,
     rounded_variance,
     unrounded_std,
@@ -46,6 +45,7 @@ from coursekit.stereo.windows import AveragingCurve, WindowStats, averaging_curv
 __all__ = [
     "AveragingCurve",
     "BiasFit",
+    "BiasPriors",
     "BlockFace",
     "NoiseFit",
     "WindowStats",
@@ -54,7 +54,6 @@ __all__ = [
     "depth_from_disparity",
     "depth_noise",
     "depth_slope",
-    "disparity_from_depth",
     "fit_bias",
     "fit_noise",
     "robust_depth",

@@ -1,4 +1,9 @@
-"""A block's front face in a depth stack: its plane, its edges, its width."""
+"""Where a block's front face is in a depth stack, and how wide it looks.
+
+The face is found around a pixel as what hangs together at about one depth and is as wide as a block
+(`_find_face`). A plane through it gives its depth and tilt, and straight lines through the last
+pixels on that plane, row by row, give its two upright edges to sub-pixel.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from coursekit.arrays import Bools, Floats, Interval, NDArray, Window
-from coursekit.checks import positive
+from coursekit.arrays import AnyArray, Bools, Floats, Interval, Window
+from coursekit.checks import instance, positive
 from coursekit.geometry import Intrinsics, deproject
 from coursekit.stereo.law import rounded_variance, unrounded_std
 from coursekit.stereo.windows import (
@@ -26,7 +31,6 @@ from coursekit.stereo.windows import (
     std_error,
     valid_mean,
     valid_median,
-    valid_std,
     window_stats,
 )
 from coursekit.words import wrapped
@@ -35,6 +39,7 @@ HALF_WINDOW_PX = 5.5  # of the matching window; edges are pushed out by up to th
 EDGE_BAND_PX = 8  # on either side of an edge, where flying pixels are counted
 GAP_PX = 4  # holes up to this wide do not end a face
 FACE_WINDOW_PX = 40
+USUAL_WIDTH_M = 0.060
 NEAR_FACE = 0.35  # of the width: tilt, noise and pattern move no pixel of a face farther
 
 
@@ -49,9 +54,9 @@ class BlockFace:
     widths_m, depths_m (N,): width, with its edges found anew, and depth of each frame; width_std_m:
     std of the first. width_held_std_m: std of the width when the edges are held and only the
     plane's depth changes. edge_jitter_px: std of an edge from row to row. fattening_px: what
-    each edge is pushed outwards if the depth is right, against the known width, and standard error;
-    1 % of scale error would change it by `fattening_per_percent_px`. flying_fraction: of the valid
-    pixels within 8 px of the edges, those on neither the face nor what is behind it.
+    each edge is pushed outwards if the depth is right, against the known width, and standard error.
+    flying_fraction: of the valid pixels within 8 px of the edges, those on neither the face nor
+    what is behind it.
     window: on the face. stats: what `window_stats` says there.
     """
 
@@ -66,7 +71,6 @@ class BlockFace:
     edge_jitter_px: float
     fattening_px: float
     fattening_error_px: float
-    fattening_per_percent_px: float
     flying_fraction: float
     window: Window
     stats: WindowStats
@@ -103,30 +107,54 @@ class BlockFace:
         return wrapped(said, 84, indent="    ")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Patch:
-    """A part of a depth stack around the face: z (N, h, w), its corner, rows and columns of the
-    face in it, and the tolerance (m) within which a pixel is on the face's plane."""
+    """The part of a depth stack around the face, and where in it the face is.
 
-    z: Any
+    z (N, h, w): depths in m, NaN invalid. left, top: of its first pixel in the image. rows,
+    columns: of the face in it. plane (3,): 1/Z = plane . (1, u - u0, v - v0) about the middle of
+    the patch. tolerance: within which a pixel is on the face's plane, m.
+    """
+
+    intrinsics: Intrinsics
+    z: Floats
     left: int
     top: int
     rows: slice
     columns: slice
-    plane: Any  # (3,): 1/Z = plane . (1, u - u0, v - v0) about the centre of the patch
+    plane: Floats
     tolerance: float
+
+    def measure(self, lines: Floats, plane: Floats) -> tuple[float, float, float]:
+        """Width, depth at the face's centre (m) and tilt (degrees) of a face with these edges.
+
+        lines (2, 2): u at the middle row and du/dv of both edges. From 1/Z = n . (x, y, 1) /
+        distance: the normal's slopes are those of 1/Z.
+        """
+        camera, corner = self.intrinsics, np.array([self.left, self.top])
+        v = (self.rows.start + self.rows.stop - 1) / 2
+        pixels = np.array([[u, v] for u in (*lines[:, 0], lines[:, 0].mean())])
+        middle = (np.array(self.z.shape[:0:-1]) - 1) / 2
+        inverse = np.column_stack([np.ones(3), pixels - middle]) @ plane
+        left, right, centre = deproject(pixels + corner, 1 / inverse, camera.K, camera.dist)
+        lean = math.cos(math.atan(float(lines[:, 1].mean())))
+        slopes = plane[1:] * [camera.fx, camera.fy]
+        ray = (pixels[2] + corner - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+        facing = float(inverse[2] - slopes @ ray)
+        tilt = math.degrees(math.atan2(math.hypot(*slopes), facing))
+        return float(np.linalg.norm(right - left)) * lean, float(centre[2]), tilt
 
 
 def block_face(
     depth: Any,
     intrinsics: Intrinsics | None = None,
     depth_scale_m: float | None = None,
-    width_m: float | None = 0.060,
+    width_m: float | None = USUAL_WIDTH_M,
     near: tuple[float, float] | None = None,
 ) -> BlockFace:
     """The front face of a block: its plane, its two upright edges to sub-pixel, its width.
 
-    depth: stack or frames, see the module. width_m: the block's true width, by caliper, or None.
+    depth: stack or frames, see the room. width_m: the block's true width, by caliper, or None.
     near: a pixel (u, v) on the face; None takes the image's centre.
 
     In each frame and row the face reaches to the last pixel within tolerance of its plane; the
@@ -135,41 +163,46 @@ def block_face(
     own error (`rounded_variance`) is in width_error_m. Rows correlate over CORRELATION_PX.
     Raises ValueError for no frames, a unit or intrinsics that are missing, and when no face is
     found: the message says what was seen.
+
+    >>> camera = Intrinsics(120, 90, 400.0, 400.0, 59.5, 44.5)
+    >>> image = np.full((90, 120), 0.9)
+    >>> image[20:70, 33:87] = 0.4  # 54 px of 0.4 m / 400 px each: 54 mm
+    >>> print(f"{1e3 * block_face(image, camera, width_m=0.054).width_m:.1f} mm")
+    54.0 mm
     """
     stack, step = depth_stack(depth, depth_scale_m)
-    intrinsics = _intrinsics_of(depth, intrinsics, stack)
+    intrinsics = intrinsics or getattr(first_frame(depth), "depth_intrinsics", None)
+    camera = instance("intrinsics", intrinsics, Intrinsics)
+    if stack.shape[1:] != (camera.height, camera.width):
+        raise ValueError(f"depth: got images {stack.shape[1:]}, want the intrinsics' size")
     if width_m is not None:
         width_m = positive("width_m", width_m)
-    patch = _find_face(stack, step, intrinsics, width_m, near)
-    inner = _inner(patch)
-    planes = _frame_planes(patch, inner)
+    patch = _find_face(stack, step, camera, width_m, near)
+    planes = _frame_planes(patch)
     edges = _edges(patch)
     line, jitter, edge_error = _edge_lines(edges)
     window = _face_window(patch)
     stats = window_stats(stack, window, step)
-    place = _Place(intrinsics, patch)
-    width, level, tilt = place.measure(line, patch.plane)
-    held = np.array([place.measure(line, plane)[0] for plane in planes])
+    width, level, tilt = patch.measure(line, patch.plane)
+    held = np.array([patch.measure(line, plane)[0] for plane in planes])
     found = [
-        place.measure(_edge_lines(edges[:, i : i + 1])[0], plane) for i, plane in enumerate(planes)
+        patch.measure(_edge_lines(edges[:, i : i + 1])[0], plane) for i, plane in enumerate(planes)
     ]
     widths, depths = (np.array([value[k] for value in found]) for k in (0, 1))
     per_pixel = width / float(line[1, 0] - line[0, 0])
-    fattening = math.nan if width_m is None else (width - width_m) / per_pixel / 2
-    middle = (line[:, 0] + patch.left).tolist()
+    left, right = (line[:, 0] + patch.left).tolist()
     return BlockFace(
         depth_m=level,
         depth_error_m=stats.depth_error_m,
         tilt_deg=tilt,
-        edges_px=(middle[0], middle[1]),
+        edges_px=(left, right),
         width_m=width,
         width_error_m=math.hypot(per_pixel * edge_error, width / level * stats.depth_error_m),
-        width_std_m=valid_std(widths),
-        width_held_std_m=valid_std(held),
+        width_std_m=_std(widths),
+        width_held_std_m=_std(held),
         edge_jitter_px=jitter,
-        fattening_px=fattening,
-        fattening_error_px=edge_error / 2 if width_m is not None else math.nan,
-        fattening_per_percent_px=0.005 * width / per_pixel,
+        fattening_px=math.nan if width_m is None else (width - width_m) / per_pixel / 2,
+        fattening_error_px=math.nan if width_m is None else edge_error / 2,
         flying_fraction=_flying(patch, edges),
         window=window,
         stats=stats,
@@ -178,19 +211,16 @@ def block_face(
     )
 
 
-def _intrinsics_of(depth: Any, intrinsics: Intrinsics | None, stack: NDArray[Any]) -> Intrinsics:
-    """The intrinsics given, else those of the first frame; ValueError if they do not fit."""
-    if intrinsics is None:
-        intrinsics = getattr(first_frame(depth), "depth_intrinsics", None)
-    if not isinstance(intrinsics, Intrinsics):
-        raise ValueError(f"intrinsics: got {type(intrinsics).__name__}, want Intrinsics")
-    if stack.shape[1:] != (intrinsics.height, intrinsics.width):
-        raise ValueError(f"depth: got images {stack.shape[1:]}, want the intrinsics' size")
-    return intrinsics
+def _std(values: Floats) -> float:
+    known = values[np.isfinite(values)]
+    return float(known.std(ddof=1)) if known.size > 1 else math.nan
+
+
+# --- finding the face ---
 
 
 def _find_face(
-    stack: Any,
+    stack: AnyArray,
     step: float | None,
     intrinsics: Intrinsics,
     width_m: float | None,
@@ -206,7 +236,7 @@ def _find_face(
         raise ValueError(
             f"depth: no valid pixel near ({u:.0f}, {v:.0f}), so no face is found there"
         )
-    size = width_m or 0.060
+    size = width_m or USUAL_WIDTH_M
     z0 = float(np.percentile(seen, 25))  # the block, even where it fills only part of the window
     z0 = float(np.median(seen[np.abs(seen - z0) < NEAR_FACE * size]))
     half = round(1.2 * intrinsics.fx * size / z0) + 30
@@ -219,7 +249,7 @@ def _find_face(
     )
     plane, tolerance = _face_plane(image, rows, columns, step)
     z = cut(stack, window, step)
-    return _Patch(z, left, top, rows, columns, plane, tolerance)
+    return _Patch(intrinsics, z, left, top, rows, columns, plane, tolerance)
 
 
 def _rows_and_columns(
@@ -262,20 +292,26 @@ def _run(line: Bools, at: int) -> tuple[int, int]:
     return int(off[off < at].max(initial=-1)) + 1, int(off[off > at].min(initial=len(line)))
 
 
+def _inner(shape: tuple[int, ...], rows: slice, columns: slice) -> Bools:
+    """The pixels (h, w) of a face away from its edges."""
+    inset = min(EDGE_BAND_PX, (columns.stop - columns.start) // 5)
+    inner = np.zeros(shape, bool)
+    inner[rows, columns.start + inset : columns.stop - inset] = True
+    return inner
+
+
 def _face_plane(
     image: Floats, rows: slice, columns: slice, step: float | None
-) -> tuple[Any, float]:
+) -> tuple[Floats, float]:
     """The plane of the face and how far off it a pixel of the face may be, m."""
-    inset = min(EDGE_BAND_PX, (columns.stop - columns.start) // 5)
-    box = np.zeros(image.shape, bool)
-    box[rows, columns.start + inset : columns.stop - inset] = True
+    box = _inner(image.shape, rows, columns)
     use = box & np.isfinite(image)
     for _ in range(4):
         v, u = np.nonzero(use)
         if len(u) < 12:
             raise ValueError(f"depth: only {len(u)} valid pixels on the face, want at least 12")
         design = plane_design(u, v, image.shape)
-        plane, *_ = np.linalg.lstsq(design, 1 / image[use], rcond=None)
+        plane = np.asarray(np.linalg.lstsq(design, 1 / image[use], rcond=None)[0], float)
         off = image - 1 / plane_image(plane, image.shape)
         spread = 1.4826 * float(np.median(np.abs(off[use])))
         tolerance = max(6 * spread, 3 * (step or 0.0), 0.001)
@@ -283,28 +319,21 @@ def _face_plane(
     return plane, tolerance
 
 
-def _inner(patch: _Patch) -> Bools:
-    """The pixels of the face away from its edges, (h, w)."""
-    inset = min(EDGE_BAND_PX, (patch.columns.stop - patch.columns.start) // 5)
-    inner = np.zeros(patch.z.shape[1:], bool)
-    inner[patch.rows, patch.columns.start + inset : patch.columns.stop - inset] = True
-    return inner
+# --- its planes and edges, frame by frame ---
 
 
-def _frame_planes(patch: _Patch, inner: Bools) -> Floats:
+def _frame_planes(patch: _Patch) -> Floats:
     """The face's plane in each frame, (N, 3); the stack's where a frame has too few pixels."""
+    inner = _inner(patch.z.shape[1:], patch.rows, patch.columns)
     v, u = np.nonzero(inner)
     design = plane_design(u, v, inner.shape)
     base = 1 / (design @ patch.plane)
     planes = []
-    for frame in patch.z:
-        values = frame[inner]
+    for values in patch.z[:, inner]:
         use = np.abs(values - base) < 2 * patch.tolerance
-        planes.append(
-            np.linalg.lstsq(design[use], 1 / values[use], rcond=None)[0]
-            if use.sum() >= 12
-            else patch.plane
-        )
+        enough = use.sum() >= 12
+        fitted = np.linalg.lstsq(design[use], 1 / values[use], rcond=None)[0] if enough else None
+        planes.append(patch.plane if fitted is None else fitted)
     return np.array(planes)
 
 
@@ -346,7 +375,8 @@ def _edge_lines(edges: Floats) -> tuple[Floats, float, float]:
 
 def _edge_line(edges: Floats) -> tuple[float, float, float, float]:
     """u at the middle row, du/dv, jitter (px) and standard error (px) of one edge (N, rows)."""
-    good = _without_mismatches(edges)
+    off_median = np.abs(edges - np.nanmedian(edges))
+    good = np.where(off_median <= 2 * HALF_WINDOW_PX, edges, np.nan)  # no matching pushes farther
     mean = valid_mean(good, axis=0)
     known = np.isfinite(mean)
     if known.sum() < 3:
@@ -363,37 +393,7 @@ def _edge_line(edges: Floats) -> tuple[float, float, float, float]:
     return float(at), float(slope), jitter, error
 
 
-def _without_mismatches(edges: Floats) -> Floats:
-    """Edges (N, rows) with NaN for those farther from the median than matching can push them."""
-    return np.where(np.abs(edges - np.nanmedian(edges)) <= 2 * HALF_WINDOW_PX, edges, np.nan)
-
-
-class _Place:
-    """Where a patch's planes and edges are in space."""
-
-    def __init__(self, intrinsics: Intrinsics, patch: _Patch) -> None:
-        self.intrinsics, self.patch = intrinsics, patch
-        height, width = patch.z.shape[1:]
-        self.centre = (width - 1) / 2, (height - 1) / 2
-        self.row = (patch.rows.start + patch.rows.stop - 1) / 2
-
-    def measure(self, lines: Floats, plane: Floats) -> tuple[float, float, float]:
-        """Width, depth at the face's centre (m) and tilt (degrees) of a face with these edges."""
-        u = np.array([lines[0, 0], lines[1, 0], lines[:, 0].mean()])
-        pixels = np.stack([u, np.full(3, self.row)], axis=-1)
-        inverse = np.column_stack([np.ones(3), pixels - self.centre]) @ plane
-        corner = (self.patch.left, self.patch.top)
-        points = deproject(pixels + corner, 1 / inverse, self.intrinsics.K, self.intrinsics.dist)
-        lean = math.cos(math.atan(float(lines[:, 1].mean())))
-        width = float(np.linalg.norm(points[1] - points[0])) * lean
-        return width, float(points[2, 2]), self._tilt(plane, float(inverse[2]), pixels[2] + corner)
-
-    def _tilt(self, plane: Floats, inverse: float, pixel: Floats) -> float:
-        """From 1/Z = n . (x, y, 1) / distance: the normal's slopes are those of 1/Z."""
-        fx, fy, cx, cy = (getattr(self.intrinsics, k) for k in ("fx", "fy", "cx", "cy"))
-        along, down = plane[1] * fx, plane[2] * fy
-        facing = inverse - along * (pixel[0] - cx) / fx - down * (pixel[1] - cy) / fy
-        return math.degrees(math.atan2(math.hypot(along, down), facing))
+# --- a window on it, and flying pixels beside it ---
 
 
 def _face_window(patch: _Patch) -> Window:
@@ -418,9 +418,9 @@ def _flying(patch: _Patch, edges: Floats) -> float:
     flying = valid = 0
     for side, outwards in ((0, -1), (1, 1)):
         at = round(float(np.nanmedian(edges[side])))
-        band = _columns(at - EDGE_BAND_PX, at + EDGE_BAND_PX, z.shape[2])
-        beyond = sorted((at + outwards * EDGE_BAND_PX, at + outwards * 2 * EDGE_BAND_PX))
-        behind = z[..., _columns(beyond[0], beyond[1], z.shape[2])]
+        band = slice(max(at - EDGE_BAND_PX, 0), at + EDGE_BAND_PX)
+        start, stop = sorted((at + outwards * EDGE_BAND_PX, at + outwards * 2 * EDGE_BAND_PX))
+        behind = z[..., max(start, 0) : max(stop, 0)]
         rows = np.moveaxis(behind, 1, 2).reshape(-1, behind.shape[1])
         far = np.nan_to_num(valid_median(rows), nan=np.inf)[:, None]
         part, face = z[..., band], plane[:, band]
@@ -429,7 +429,3 @@ def _flying(patch: _Patch, edges: Floats) -> float:
             flying += int(((part > face + patch.tolerance) & (part < far - slack)).sum())
         valid += int(np.isfinite(part).sum())
     return flying / valid if valid else math.nan
-
-
-def _columns(start: int, stop: int, width: int) -> slice:
-    return slice(min(max(start, 0), width), min(max(stop, 0), width))

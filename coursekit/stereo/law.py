@@ -3,30 +3,23 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
 from coursekit.arrays import ArrayLike, Floats
-from coursekit.checks import positive
+from coursekit.checks import array, number, positive, want, whole
 
 
 def depth_from_disparity(disparity_px: ArrayLike, fx: float, baseline_m: float | None) -> Floats:
     """Z = fx baseline / d in m, for disparities (...) in px; NaN where d is not positive.
 
     Raises ValueError for a focal length (px) or baseline (m) that is not positive.
+
+    >>> print(depth_from_disparity([44.7, 0.0], fx=447.0, baseline_m=0.05))
+    [0.5 nan]
     """
-    d = numbers("disparity_px", disparity_px)
+    d = array("disparity_px", disparity_px, leading=True)
     return fx_baseline(fx, baseline_m) / np.where((d > 0) & np.isfinite(d), d, np.nan)
-
-
-def disparity_from_depth(depth_m: ArrayLike, fx: float, baseline_m: float | None) -> Floats:
-    """d = fx baseline / Z in px, for depths (...) in m; NaN where Z is not positive.
-
-    Raises ValueError for a focal length (px) or baseline (m) that is not positive.
-    """
-    z = numbers("depth_m", depth_m)
-    return fx_baseline(fx, baseline_m) / np.where((z > 0) & np.isfinite(z), z, np.nan)
 
 
 def depth_slope(depth_m: ArrayLike, fx: float, baseline_m: float | None) -> Floats:
@@ -34,7 +27,7 @@ def depth_slope(depth_m: ArrayLike, fx: float, baseline_m: float | None) -> Floa
 
     depth_m (...): m. Returns (...) in m/px, negative: more disparity is nearer.
     """
-    return -np.square(numbers("depth_m", depth_m)) / fx_baseline(fx, baseline_m)
+    return -np.square(array("depth_m", depth_m, leading=True)) / fx_baseline(fx, baseline_m)
 
 
 def depth_noise(
@@ -43,8 +36,12 @@ def depth_noise(
     """The law: sigma_Z = Z^2 sigma_d / (fx baseline), m, for depths (...) in m.
 
     Raises ValueError for a focal length or baseline that is not positive.
+
+    >>> print(depth_noise([0.4, 0.8], fx=447.0, baseline_m=0.05, sigma_d_px=0.08).round(5))
+    [0.00057 0.00229]
     """
-    return np.abs(depth_slope(depth_m, fx, baseline_m)) * numbers("sigma_d_px", sigma_d_px)
+    sigma = array("sigma_d_px", sigma_d_px, leading=True)
+    return np.abs(depth_slope(depth_m, fx, baseline_m)) * sigma
 
 
 def robust_depth(
@@ -56,16 +53,15 @@ def robust_depth(
     cut, never wrapped. NaN where fewer than `min_valid` pixels are valid, off the image included.
     Raises ValueError for an image that is not 2-D and for u, v, half or min_valid that are no
     numbers.
+
+    >>> robust_depth(np.full((5, 5), 0.45), u=2.2, v=1.8)
+    0.45
     """
     image = np.asarray(depth_m)
-    if image.ndim != 2:
-        raise ValueError(f"depth_m: got shape {image.shape}, want one image (H, W)")
-    for name, value in (("u", u), ("v", v)):
-        if not np.isfinite(value):
-            raise ValueError(f"{name}: got {value!r}, want a pixel coordinate")
-    if half < 0 or min_valid < 1:
-        raise ValueError(f"half, min_valid: got {half}, {min_valid}, want >= 0 and >= 1")
-    column, row = round(float(u)), round(float(v))
+    want(image.ndim == 2, "depth_m", image.shape, "one image (H, W)")
+    column, row = (round(number(name, at)) for name, at in (("u", u), ("v", v)))
+    whole("half", half, least=0)
+    whole("min_valid", min_valid)
     rows = slice(max(row - half, 0), max(row + half + 1, 0))
     columns = slice(max(column - half, 0), max(column + half + 1, 0))
     values = image[rows, columns].astype(np.float64)
@@ -86,7 +82,7 @@ def rounded_variance(sigma: ArrayLike, step: float) -> Floats:
     From sigma = step / 2 on this is Sheppard's correction, sigma^2 + step^2 / 12, whatever mu;
     below it needs pixels at many mu; for small sigma it tends to sigma step / sqrt(pi).
     """
-    s = numbers("sigma", sigma) / step
+    s = array("sigma", sigma, leading=True) / step
     k = np.arange(1, 6)
     series = (np.exp(-np.square(2 * np.pi * s[..., None] * k)) / k**2).sum(axis=-1)
     exact = s**2 + 1 / 12 - series / (2 * np.pi**2)
@@ -105,26 +101,8 @@ def unrounded_std(std: float, step: float | None) -> float:
     return float(brentq(lambda s: float(rounded_variance(s, step)) - std**2, 0.0, std))
 
 
-def numbers(name: str, values: ArrayLike, shape: tuple[int, ...] | None = None) -> Floats:
-    try:
-        array = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name}: got {values!r}, want numbers") from None
-    if shape is not None and array.shape != shape:
-        raise ValueError(f"{name}: got shape {array.shape}, want {shape}, one for each distance")
-    return array
-
-
-def increasing(name: str, values: ArrayLike) -> Floats:
-    array = np.atleast_1d(numbers(name, values))
-    if array.ndim != 1 or array.size == 0 or not (np.isfinite(array) & (array > 0)).all():
-        raise ValueError(f"{name}: got {array.tolist()}, want positive distances in m")
-    if (np.diff(array) <= 0).any():
-        raise ValueError(f"{name}: got {array.tolist()}, want them to increase")
-    return array
-
-
-def fx_baseline(fx: Any, baseline_m: Any) -> float:
+def fx_baseline(fx: float, baseline_m: float | None) -> float:
+    """fx baseline, px m, of a focal length and a baseline that are known and positive."""
     if baseline_m is None:
         raise ValueError(
             "baseline_m: got None: this recording does not say how far apart its eyes are; give "

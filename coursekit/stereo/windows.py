@@ -1,6 +1,9 @@
-"""Depth stacks, windows of them and planes through them; checks at the boundary.
+"""What a depth stack says in a window: its level, its noise over time, what averaging buys.
 
-Noise, level and holes of a depth stack in a window, and what averaging its frames buys.
+A window lies on one smooth surface. Its noise over time is that of single pixels, pooled, and how
+well it is known depends on how many of the samples are independent: neighbours share their
+matching window, and frames can share a drift (`window_stats`). The same drift limits what the mean
+of many frames buys (`averaging_curve`, `effective_frames`).
 """
 
 from __future__ import annotations
@@ -12,64 +15,53 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from coursekit.arrays import ArrayLike, Bools, Floats, Interval, NDArray, Window
-from coursekit.checks import positive
-from coursekit.stereo.law import numbers, unrounded_std
+from coursekit.arrays import AnyArray, ArrayLike, Bools, Floats, Integers, Interval, Window
+from coursekit.checks import array, positive, want
+from coursekit.stereo.law import unrounded_std
 from coursekit.words import counted, wrapped
 
-LINE = 84  # characters
+CORRELATION_PX = 12  # disparities farther apart than the matching window (11 px) are independent
+JUMP_SIGMAS = 8.0  # a sample this far from the rest is a mismatch, not noise
+CHI2_95 = 3.84  # 95 % of chi-squared with one degree of freedom lies below
+SLACK = 0.05  # of 2 log likelihood: a drift that explains no more than this is not assumed
+
+
+# --- stacks and windows of them ---
 
 
 def first_frame(depth: Any) -> Any:
     """The first of a camera's frames, or None for an array."""
-    if isinstance(depth, np.ndarray) or not hasattr(depth, "__getitem__"):
-        return None
-    return depth[0] if len(depth) else None
+    return depth[0] if hasattr(depth, "__getitem__") and len(depth) else None
 
 
-def depth_stack(depth: Any, depth_scale_m: float | None) -> tuple[NDArray[Any], float | None]:
+def depth_stack(depth: Any, depth_scale_m: float | None) -> tuple[AnyArray, float | None]:
     """The stack (N, H, W) as it came, and its unit; frames bring both."""
     if hasattr(depth, "__len__") and len(depth) == 0:
         raise ValueError("depth: got 0 frames, want at least one")
-    frame = first_frame(depth)
-    if frame is not None and hasattr(frame, "depth_scale_m"):
-        depth, depth_scale_m = np.stack([f.depth for f in depth]), frame.depth_scale_m
+    if hasattr(first_frame(depth), "depth_scale_m"):
+        depth, depth_scale_m = np.stack([f.depth for f in depth]), depth[0].depth_scale_m
     stack = np.asarray(depth)
-    if stack.ndim == 2:
-        stack = stack[None]
-    if stack.ndim != 3 or stack.dtype.kind not in "uf":
-        raise ValueError(
-            f"depth: got shape {stack.shape} of {stack.dtype}, want (N, H, W) of unsigned counts "
-            "or floats in m"
-        )
+    stack = stack[None] if stack.ndim == 2 else stack
+    want(stack.ndim == 3, "depth", stack.shape, "(N, H, W)")
+    want(stack.dtype.kind in "uf", "depth", stack.dtype, "unsigned counts or floats in m")
     if depth_scale_m is not None:
         depth_scale_m = positive("depth_scale_m", depth_scale_m)
-    elif stack.dtype.kind == "u":
-        raise ValueError("depth_scale_m: got None, want the metres of a count")
+    counts = stack.dtype.kind == "u"
+    want(depth_scale_m or not counts, "depth_scale_m", None, "the metres of a count")
     return stack, depth_scale_m
 
 
-def cut(stack: NDArray[Any], window: Window, step: float | None) -> Floats:
+def cut(stack: AnyArray, window: Window, step: float | None) -> Floats:
     """The window's depths (N, h, w) in m, NaN where invalid; ValueError off the image."""
     rows, columns = stack.shape[1:]
     try:
-        left, top, width, height = (int(v) for v in window)
-        whole = (left, top, width, height) == tuple(window)
+        left, top, width, height = given = tuple(int(v) for v in window)
+        inside = 0 <= left < left + width <= columns and 0 <= top < top + height <= rows
+        fits = inside and given == tuple(window)
     except (TypeError, ValueError):
-        whole = False
-    if not whole:
-        raise ValueError(f"window: got {window!r}, want (left, top, width, height) in whole px")
-    if (
-        width < 1
-        or height < 1
-        or left < 0
-        or top < 0
-        or left + width > columns
-        or (top + height > rows)
-    ):
-        raise ValueError(
-            f"window: got {window!r}, want a window inside the image of {columns}x{rows} px"
-        )
+        fits = False
+    wanted = f"(left, top, width, height) in whole px inside the image of {columns}x{rows} px"
+    want(fits, "window", window, wanted)
     part = stack[:, top : top + height, left : left + width]
     z = part.astype(np.float64)
     if part.dtype.kind == "u":
@@ -78,7 +70,7 @@ def cut(stack: NDArray[Any], window: Window, step: float | None) -> Floats:
     return z
 
 
-def clip_window(window: Window, stack: NDArray[Any]) -> Window:
+def clip_window(window: Window, stack: AnyArray) -> Window:
     """The part of a window that is on the image; ValueError when there is none."""
     left, top = max(window[0], 0), max(window[1], 0)
     right = min(window[0] + window[2], stack.shape[2])
@@ -88,78 +80,7 @@ def clip_window(window: Window, stack: NDArray[Any]) -> Window:
     return left, top, right - left, bottom - top
 
 
-def valid_mean(values: Floats, axis: int) -> Floats:
-    """The mean without NaN, NaN where there is nothing else."""
-    known = np.isfinite(values)
-    counts = known.sum(axis=axis)
-    total = np.where(known, values, 0.0).sum(axis=axis)
-    return np.where(counts > 0, total / np.maximum(counts, 1), np.nan)
-
-
-def valid_median(stack: Floats) -> Floats:
-    """The median over frames (N, ...) without NaN, NaN where there is nothing else."""
-    ordered = np.sort(stack, axis=0)  # NaN last
-    counts = np.isfinite(stack).sum(axis=0)
-    low, high = np.maximum((counts - 1) // 2, 0), np.minimum(counts // 2, len(stack) - 1)
-    pick = [np.take_along_axis(ordered, i[None], axis=0)[0] for i in (low, high)]
-    return np.where(counts > 0, (pick[0] + pick[1]) / 2, np.nan)
-
-
-def rms(parts: list[Floats]) -> float:
-    values = np.concatenate([p[np.isfinite(p)] for p in parts])
-    return float(np.sqrt(np.square(values).mean())) if values.size else math.nan
-
-
-def valid_std(values: Floats) -> float:
-    known = values[np.isfinite(values)]
-    return float(known.std(ddof=1)) if known.size > 1 else math.nan
-
-
-def about_plane(image: Floats) -> tuple[Floats, float]:
-    """What an image (h, w) of depths is off its plane, and the plane's depth at the centre.
-
-    A plane in space is linear in 1/Z, so that is fitted. NaN is invalid; fewer than three valid
-    pixels leave NaN.
-    """
-    known = np.isfinite(image)
-    rows, columns = np.nonzero(known)
-    if len(rows) < 3:
-        return np.full(image.shape, np.nan), math.nan
-    design = plane_design(columns, rows, image.shape)
-    coefficients, *_ = np.linalg.lstsq(design, 1 / image[known], rcond=None)
-    residual = np.full(image.shape, np.nan)
-    residual[known] = image[known] - 1 / (design @ coefficients)
-    return residual, float(1 / coefficients[0])
-
-
-def plane_design(columns: Any, rows: Any, shape: tuple[int, ...]) -> Floats:
-    u, v = columns - (shape[1] - 1) / 2, rows - (shape[0] - 1) / 2
-    return np.stack([np.ones(len(u)), u, v], axis=-1)
-
-
-def plane_image(plane: Any, shape: tuple[int, ...]) -> Floats:
-    """1/Z of a plane at the pixels of a patch (h, w)."""
-    v, u = np.indices(shape)
-    return (plane_design(u.ravel(), v.ravel(), shape) @ plane).reshape(shape)
-
-
-def std_error(std: float, dof: float) -> float:
-    return std / math.sqrt(2 * dof) if dof > 0 else math.nan
-
-
-def std_interval(std: float, dof: float) -> Interval:
-    from scipy import stats
-
-    if not dof > 0:
-        return math.nan, math.nan
-    high, low = stats.chi2.ppf([0.025, 0.975], dof)
-    return std * math.sqrt(dof / low), std * math.sqrt(dof / high)
-
-
-CORRELATION_PX = 12  # disparities farther apart than the matching window (11 px) are independent
-JUMP_SIGMAS = 8.0  # a sample this far from the rest is a mismatch, not noise
-CHI2_95 = 3.84  # 95 % of chi-squared with one degree of freedom lies below
-SLACK = 0.05  # of 2 log likelihood: a drift that explains no more than this is not assumed
+# --- one window ---
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -198,11 +119,6 @@ class WindowStats:
         return std_error(self.pixel_std_m, self.pixel_dof)
 
     @property
-    def mean_std_error_m(self) -> float:
-        """Standard error of `mean_std_m`: std / sqrt(2 dof)."""
-        return std_error(self.mean_std_m, self.mean_dof)
-
-    @property
     def pixel_std_interval_m(self) -> Interval:
         """95 % interval of `pixel_std_m`: dof s^2 / sigma^2 is chi-squared with pixel_dof."""
         return std_interval(self.pixel_std_m, self.pixel_dof)
@@ -210,9 +126,14 @@ class WindowStats:
     @property
     def rounding(self) -> str:
         """What the depth unit does to `pixel_std_m`, in words; empty when it does little."""
-        if self.depth_scale_m is None or math.isnan(self.pixel_std_m):
+        std, step = self.pixel_std_unrounded_m, self.depth_scale_m
+        if step is None or math.isnan(std) or std >= step / 2:
             return ""
-        return _rounding_note(self.pixel_std_unrounded_m, self.depth_scale_m, self.frozen_fraction)
+        return (
+            f"the depth unit of {1e3 * step:g} mm hides it: {self.frozen_fraction:.0%} of the "
+            f"pixels never change, before rounding it was {1e3 * std:.3f} mm if true depths lie "
+            "anywhere between two steps"
+        )
 
     def __repr__(self) -> str:
         start = f"{self.n_pixels} px, {counted(self.n_frames, 'frame')}"
@@ -234,7 +155,7 @@ class WindowStats:
 def window_stats(depth: Any, window: Window, depth_scale_m: float | None = None) -> WindowStats:
     """Noise, level and holes of a depth stack in a window that lies on one smooth surface.
 
-    depth: stack or frames, see the module. window: (left, top, width, height) px.
+    depth: stack or frames, see the room. window: (left, top, width, height) px.
     depth_scale_m: m per count; for floats, what they were rounded to, or None.
 
     Model of `pixel_dof`: Gaussian noise with an unknown covariance over the window's pixels, plus
@@ -246,6 +167,10 @@ def window_stats(depth: Any, window: Window, depth_scale_m: float | None = None)
 
     One frame gives NaN for everything over time; a window without valid pixels NaN for all
     lengths. Raises ValueError for no frames, a window off the image, or counts without a unit.
+
+    >>> frames = 0.5 + 0.001 * np.random.default_rng(2).standard_normal((50, 20, 20))
+    >>> print(f"{1e3 * window_stats(frames, (0, 0, 20, 20)).pixel_std_m:.2f} mm")
+    1.00 mm
     """
     stack, step = depth_stack(depth, depth_scale_m)
     z = cut(stack, window, step)
@@ -325,6 +250,44 @@ def _temporal(deviation: Floats) -> tuple[float, float, Floats]:
     common = min(float(drift @ drift) / (n - 1), variance)
     shares = (variance - common) ** 2 / _pixel_dof(own) + common**2 / series_std(drift)[1]
     return math.sqrt(variance), variance**2 / shares, drift
+
+
+def _frozen(deviation: Floats) -> float:
+    """The fraction of pixels (N, P) that have more than one value and never change."""
+    if deviation.shape[0] < 2 or deviation.size == 0:
+        return math.nan
+    return float((np.nanmax(np.abs(deviation), axis=0) < 1e-12).mean())
+
+
+def _spatial_std(z: Floats) -> float:
+    """RMS of a stack (N, h, w) about each frame's own plane in 1/Z; see `about_plane`.
+
+    All frames at once, by normal equations: the design has three columns and is centred.
+    """
+    rows, columns = np.indices(z.shape[1:]).reshape(2, -1)
+    design = plane_design(columns, rows, z.shape[1:])
+    flat = z.reshape(len(z), -1)
+    known = np.isfinite(flat)
+    squares = (design[:, :, None] * design[:, None, :]).reshape(-1, 9)
+    normal = (known.astype(np.float64) @ squares).reshape(-1, 3, 3)
+    sure = np.linalg.det(normal) > 1e-3 * np.prod(np.diagonal(normal, axis1=1, axis2=2), axis=1)
+    sure &= known.sum(axis=1) > 3
+    right = np.where(known, 1 / np.where(known, flat, 1.0), 0.0) @ design
+    plane = np.linalg.solve(normal[sure], right[sure, :, None])[..., 0]
+    rest = [about_plane(frame)[0] for frame in z[~sure]]
+    return rms([flat[sure] - 1 / (plane @ design.T), *rest])
+
+
+def _patch_error(residual: Floats) -> float:
+    """Standard error of the mean of residuals (h, w) that correlate over CORRELATION_PX px."""
+    known = residual[np.isfinite(residual)]
+    if known.size < 4:
+        return math.nan
+    patches = known.size / CORRELATION_PX**2
+    return float(known.std()) / math.sqrt(max(patches, 1.0))
+
+
+# --- how many samples are independent ---
 
 
 def _pixel_dof(deviation: Floats) -> float:
@@ -434,7 +397,7 @@ class _DriftModels(NamedTuple):
     inverse: Floats
     log_spectra: Floats
     weights: Floats
-    starts: NDArray[np.int64]
+    starts: Integers
 
 
 @lru_cache(maxsize=8)
@@ -457,48 +420,7 @@ def _drift_models(n: int) -> _DriftModels:
     return _DriftModels(effective, np.array(inverse), np.array(log_spectra), weights, starts)
 
 
-def _frozen(deviation: Floats) -> float:
-    """The fraction of pixels (N, P) that have more than one value and never change."""
-    if deviation.shape[0] < 2 or deviation.size == 0:
-        return math.nan
-    return float((np.nanmax(np.abs(deviation), axis=0) < 1e-12).mean())
-
-
-def _spatial_std(z: Floats) -> float:
-    """RMS of a stack (N, h, w) about each frame's own plane in 1/Z; see `about_plane`.
-
-    All frames at once, by normal equations: the design has three columns and is centred.
-    """
-    rows, columns = np.indices(z.shape[1:]).reshape(2, -1)
-    design = plane_design(columns, rows, z.shape[1:])
-    flat = z.reshape(len(z), -1)
-    known = np.isfinite(flat)
-    squares = (design[:, :, None] * design[:, None, :]).reshape(-1, 9)
-    normal = (known.astype(np.float64) @ squares).reshape(-1, 3, 3)
-    sure = np.linalg.det(normal) > 1e-3 * np.prod(np.diagonal(normal, axis1=1, axis2=2), axis=1)
-    sure &= known.sum(axis=1) > 3
-    right = np.where(known, 1 / np.where(known, flat, 1.0), 0.0) @ design
-    plane = np.linalg.solve(normal[sure], right[sure, :, None])[..., 0]
-    rest = [about_plane(frame)[0] for frame in z[~sure]]
-    return rms([flat[sure] - 1 / (plane @ design.T), *rest])
-
-
-def _patch_error(residual: Floats) -> float:
-    """Standard error of the mean of residuals (h, w) that correlate over CORRELATION_PX px."""
-    known = residual[np.isfinite(residual)]
-    if known.size < 4:
-        return math.nan
-    patches = known.size / CORRELATION_PX**2
-    return float(known.std()) / math.sqrt(max(patches, 1.0))
-
-
-def _rounding_note(std: float, step: float, frozen: float) -> str:
-    if std >= step / 2:
-        return ""
-    return (
-        f"the depth unit of {1e3 * step:g} mm hides it: {frozen:.0%} of the pixels never change, "
-        f"before rounding it was {1e3 * std:.3f} mm if true depths lie anywhere between two steps"
-    )
+# --- averaging ---
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -513,7 +435,7 @@ class AveragingCurve:
     ends: the pattern that every frame repeats. Both None for a series without pixels.
     """
 
-    counts: NDArray[np.int64]
+    counts: Integers
     std_m: Floats
     errors_m: Floats
     ideal_m: Floats
@@ -546,8 +468,12 @@ def averaging_curve(series_m: ArrayLike) -> AveragingCurve:
     how the number of independent ones follows. Its interval is as wide as one series makes it:
     pixels share the drift, so more of them do not narrow it.
     Raises ValueError for fewer than 8 frames, where no autocorrelation can be had.
+
+    >>> print(averaging_curve(0.5 + 0.001 * np.random.default_rng(1).standard_normal(64)))
+    64 frames are worth 64 independent ones (95 %: 2 to 64);
+        their mean is 8.0 times quieter than one frame (8.0 if they were independent)
     """
-    values = numbers("series_m", series_m)
+    values = array("series_m", series_m, leading=True)
     n = len(values) if values.ndim else 0
     if values.ndim not in (1, 3) or n < 8:
         raise ValueError(f"series_m: got shape {values.shape}, want (N,) or (N, h, w) with N >= 8")
@@ -558,15 +484,12 @@ def averaging_curve(series_m: ArrayLike) -> AveragingCurve:
     if pixels.shape[1] == 0:
         raise ValueError("series_m: no pixel is valid in every frame")
     deviation = pixels - pixels.mean(axis=0)
-    sizes = [2**k for k in range(int(math.log2(n // 4)) + 1)]
-    counts = np.array(sizes)
-    std = np.array([_std_of_means(deviation, count) for count in sizes])
-    single = std[0]
+    counts = 2 ** np.arange(int(math.log2(n // 4)) + 1)
+    std = np.sqrt([_means(deviation, c).var(axis=0, ddof=1).mean() for c in counts])
     effective, interval = effective_frames(deviation)
-    spatial = None
-    floor = None
+    spatial, floor = None, None
     if values.ndim == 3:
-        spatial = np.array([rms([about_plane(m)[0] for m in _means(values, c)]) for c in sizes])
+        spatial = np.array([rms([about_plane(m)[0] for m in _means(values, c)]) for c in counts])
         own = deviation - deviation.mean(axis=1, keepdims=True)  # without the drift all share
         noise = np.square(own).sum() / own.shape[1] / (n - 1) / (n / _correlation_time(own))
         floor = math.sqrt(max(rms([about_plane(values.mean(axis=0))[0]]) ** 2 - noise, 0.0))
@@ -574,7 +497,7 @@ def averaging_curve(series_m: ArrayLike) -> AveragingCurve:
         counts=counts,
         std_m=std,
         errors_m=std / np.sqrt(2 * (n // counts - 1)),
-        ideal_m=single / np.sqrt(counts),
+        ideal_m=std[0] / np.sqrt(counts),
         n_frames=n,
         effective_frames=effective,
         effective_frames_interval=interval,
@@ -584,14 +507,73 @@ def averaging_curve(series_m: ArrayLike) -> AveragingCurve:
     )
 
 
-def _means(values: Floats, count: int) -> Floats:
+def _means(values: Floats, count: Any) -> Floats:
     """Means of consecutive blocks of `count` frames: (N // count, ...)."""
     blocks = len(values) // count
     return values[: blocks * count].reshape(blocks, count, *values.shape[1:]).mean(axis=1)
 
 
-def _std_of_means(deviation: Floats, count: int) -> float:
-    means = _means(deviation, count)
-    return float(
-        math.sqrt(np.square(means - means.mean(axis=0)).sum(axis=0).mean() / (len(means) - 1))
-    )
+# --- means, planes and errors, where NaN is invalid ---
+
+
+def valid_mean(values: Floats, axis: int) -> Floats:
+    """The mean without NaN, NaN where there is nothing else."""
+    known = np.isfinite(values)
+    counts = known.sum(axis=axis)
+    total = np.where(known, values, 0.0).sum(axis=axis)
+    return np.where(counts > 0, total / np.maximum(counts, 1), np.nan)
+
+
+def valid_median(stack: Floats) -> Floats:
+    """The median over frames (N, ...) without NaN, NaN where there is nothing else."""
+    ordered = np.sort(stack, axis=0)  # NaN last
+    counts = np.isfinite(stack).sum(axis=0)
+    low, high = np.maximum((counts - 1) // 2, 0), np.minimum(counts // 2, len(stack) - 1)
+    pick = [np.take_along_axis(ordered, i[None], axis=0)[0] for i in (low, high)]
+    return np.where(counts > 0, (pick[0] + pick[1]) / 2, np.nan)
+
+
+def rms(parts: list[Floats]) -> float:
+    values = np.concatenate([p[np.isfinite(p)] for p in parts])
+    return float(np.sqrt(np.square(values).mean())) if values.size else math.nan
+
+
+def about_plane(image: Floats) -> tuple[Floats, float]:
+    """What an image (h, w) of depths is off its plane, and the plane's depth at the centre.
+
+    A plane in space is linear in 1/Z, so that is fitted. NaN is invalid; fewer than three valid
+    pixels leave NaN.
+    """
+    known = np.isfinite(image)
+    rows, columns = np.nonzero(known)
+    if len(rows) < 3:
+        return np.full(image.shape, np.nan), math.nan
+    design = plane_design(columns, rows, image.shape)
+    coefficients, *_ = np.linalg.lstsq(design, 1 / image[known], rcond=None)
+    residual = np.full(image.shape, np.nan)
+    residual[known] = image[known] - 1 / (design @ coefficients)
+    return residual, float(1 / coefficients[0])
+
+
+def plane_design(columns: Any, rows: Any, shape: tuple[int, ...]) -> Floats:
+    u, v = columns - (shape[1] - 1) / 2, rows - (shape[0] - 1) / 2
+    return np.stack([np.ones(len(u)), u, v], axis=-1)
+
+
+def plane_image(plane: Any, shape: tuple[int, ...]) -> Floats:
+    """1/Z of a plane at the pixels of a patch (h, w)."""
+    v, u = np.indices(shape)
+    return (plane_design(u.ravel(), v.ravel(), shape) @ plane).reshape(shape)
+
+
+def std_error(std: float, dof: float) -> float:
+    return std / math.sqrt(2 * dof) if dof > 0 else math.nan
+
+
+def std_interval(std: float, dof: float) -> Interval:
+    from scipy import stats
+
+    if not dof > 0:
+        return math.nan, math.nan
+    high, low = stats.chi2.ppf([0.025, 0.975], dof)
+    return std * math.sqrt(dof / low), std * math.sqrt(dof / high)

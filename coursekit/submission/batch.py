@@ -24,29 +24,32 @@ import threading
 import time
 import unicodedata
 import warnings
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, TimeoutError, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from pebble import ProcessExpired, ProcessPool
+from tqdm.auto import tqdm
 
 from coursekit import results
+from coursekit.submission.format import slug
+from coursekit.submission.recompute import grading_rules
 from coursekit.submission.report import (
-    PARAGRAPHS,
-    Line,
+    ReportLine,
     across,
     class_page,
+    grade_file,
     grades_csv,
     not_graded,
+    out_of_memory,
     paragraphs_page,
 )
-from coursekit.submission.rules import rules
-from coursekit.submission.submit import slug
-from coursekit.submission.worker import grade_file, out_of_memory
+from coursekit.words import counted
 
 TIMEOUT_S = 10.0
 MEMORY_BYTES = 512 * 2**20  # above what a warm process has
@@ -56,20 +59,19 @@ AHEAD = 3  # bundles a worker that wait in the pool
 HASHED_BYTES = 6 * 2**20  # of a file; larger ones are refused anyway
 
 FAILED = ("timeout", "died", "memory", "error", "lost")  # tried anew by the next run
-CSV, PAGE, STUDENTS, ROWS = "grades.csv", "index.html", "students", ".rows"
+CSV, PAGE, PARAGRAPHS = "grades.csv", "index.html", "paragraphs.html"
+STUDENTS, ROWS = "students", ".rows"
 ONE_THREAD = {
     f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL", "NUMBA", "BLIS")
 } | {"VECLIB_MAXIMUM_THREADS": "1"}
-
-WORKER = "coursekit.submission.worker"
 
 CANNOT_START = (
     "the processes that grade cannot be started, or end at once. Try --workers 1; if that fails "
     "too, more memory is needed, or the installation is broken (run `python3 course.py test`)"
 )
 
-Outcome = tuple[Line, str]  # a line in the class, and the page of the student
-Work = Callable[[str, str, str], Outcome]  # of the file's path, its name and the page's
+Graded = tuple[ReportLine, str]  # a line in the class, and the page of the student
+Work = Callable[[str, str, str], Graded]  # of the file's path, its name and the page's
 
 
 class Stopped(KeyboardInterrupt):
@@ -118,14 +120,12 @@ class Summary:
             parts.append(f"{self.failed} not graded (time, memory or a crash)")
         if self.flagged:
             parts.append(f"{self.flagged} flagged")
-        lines = [f"{_counted(n, 'bundle')} in {self.seconds:.0f} s: {', '.join(parts)}."]
+        lines = [f"{counted(n, 'bundle')} in {self.seconds:.0f} s: {', '.join(parts)}."]
         if self.kept:
             lines.append(f"{self.kept} of them had been graded before and have not changed.")
         if self.left_out:
             shown = ", ".join(self.left_out[:5]) + (", ..." if len(self.left_out) > 5 else "")
-            lines.append(
-                f"No bundles, so left out: {_counted(len(self.left_out), 'file')}: {shown}"
-            )
+            lines.append(f"No bundles, so left out: {counted(len(self.left_out), 'file')}: {shown}")
         lines.append(f"Open {self.out / PAGE}; {CSV} beside it goes into a spreadsheet.")
         return "\n".join(lines)
 
@@ -151,20 +151,22 @@ def grade_folder(
     Raises ValueError for a folder that will not do, before any work, Stopped on Ctrl-C, and
     ChildProcessError when no process can be started.
     """
-    rules()  # a typing error in rubric.toml is said before anything starts
+    grading_rules()  # a typing error in rubric.toml is said before anything starts
     started = time.monotonic()
     folder, out = Path(folder), Path(out)
-    workers = _cores() if workers is None else workers
+    if workers is None:
+        free = getattr(os, "sched_getaffinity", None)  # what this process may use
+        workers = len(free(0)) if free else os.cpu_count() or 1
     for name, value in (("workers", workers), ("timeout_s", timeout_s), ("memory", memory_bytes)):
         if not value > 0:
             raise ValueError(f"{name}: got {value!r}, want more than 0")
     _check_out(out, overwrite)
-    paths, left_out = find(folder, out)
+    paths, left_out = find_bundles(folder, out)
     for part in (out / STUDENTS, out / ROWS):
         part.mkdir(parents=True, exist_ok=True)
     bundles = list(_bundles(folder, paths))
     kept = finished = 0
-    with _bar(len(bundles), progress) as bar:
+    with tqdm(total=len(bundles), unit="bundle", disable=not progress, smoothing=0.1) as bar:
 
         def unfinished() -> Iterator[Bundle]:
             nonlocal kept
@@ -179,7 +181,7 @@ def grade_folder(
         try:
             with (
                 _noted_interrupts() as interrupted,
-                contextlib.closing(run(unfinished(), grade_file, limits)) as outcomes,
+                contextlib.closing(work_through(unfinished(), grade_file, limits)) as outcomes,
             ):
                 for bundle, outcome in outcomes:
                     _store(out, bundle, outcome)  # and not here: a class of any size fits
@@ -189,7 +191,7 @@ def grade_folder(
                         raise KeyboardInterrupt
         except KeyboardInterrupt:
             raise Stopped(
-                f"stopped after {kept + finished} of {_counted(len(bundles), 'bundle')}, which are "
+                f"stopped after {kept + finished} of {counted(len(bundles), 'bundle')}, which are "
                 "kept. The same command goes on from there."
             ) from None
     done = _finish(out, bundles)
@@ -199,7 +201,7 @@ def grade_folder(
         counts["graded"],
         counts["refused"],
         counts["failed"],
-        sum(any(not flag.note for flag in line.flags) for line in done),
+        sum(line.flagged for line in done),
         kept,
         left_out,
         time.monotonic() - started,
@@ -217,24 +219,17 @@ def _noted_interrupts() -> Iterator[list[int]]:
         signal.default_int_handler(number, frame)
 
     here = threading.current_thread() is threading.main_thread()
-    if not here or before is not signal.default_int_handler:  # somebody else's to decide
-        yield noted
-        return
-    signal.signal(signal.SIGINT, note)
+    ours = here and before is signal.default_int_handler  # else it is somebody else's to decide
+    if ours:
+        signal.signal(signal.SIGINT, note)
     try:
         yield noted
     finally:
-        signal.signal(signal.SIGINT, before)
+        if ours:
+            signal.signal(signal.SIGINT, before)
 
 
-def _cores() -> int:
-    """How many processors this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-def find(folder: Path, out: Path) -> tuple[list[Path], tuple[str, ...]]:
+def find_bundles(folder: Path, out: Path) -> tuple[list[Path], tuple[str, ...]]:
     """The .zip files in a folder and below in the order of their names, and what else is there.
 
     Links are not followed, hidden files and reports of ours are not looked at.
@@ -255,7 +250,7 @@ def find(folder: Path, out: Path) -> tuple[list[Path], tuple[str, ...]]:
             if not name.startswith("."):
                 (found if name.lower().endswith(".zip") else others).append(at / name)
     if not found:
-        there = f", only {_counted(len(others), 'other file')}" if others else " or below it"
+        there = f", only {counted(len(others), 'other file')}" if others else " or below it"
         raise ValueError(
             f"{folder}: there is no bundle (.zip) in it{there}; "
             "want the folder with what students handed in"
@@ -286,19 +281,15 @@ def _key(path: Path, name: str) -> str:
     return hashed.hexdigest()
 
 
-_VERSION: list[str] = []
-
-
+@cache
 def grader_version() -> str:
-    """A hash of everything that decides a grade: the code of this room and of `stereo`, rubric."""
-    if not _VERSION:
-        here = Path(__file__).resolve().parent
-        files = [*here.glob("*.py"), *here.glob("*.toml"), *(here.parent / "stereo").glob("*.py")]
-        hashed = hashlib.sha256()
-        for file in sorted(files):
-            hashed.update(file.name.encode() + b"\0" + file.read_bytes() + b"\0")
-        _VERSION.append(hashed.hexdigest())
-    return _VERSION[0]
+    """A hash of everything that decides a grade: this room, but its FORMAT.md, and `stereo`."""
+    here = Path(__file__).resolve().parent
+    files = [file for file in here.iterdir() if file.is_file() and file.suffix != ".md"]
+    hashed = hashlib.sha256()
+    for file in sorted([*files, *(here.parent / "stereo").glob("*.py")]):
+        hashed.update(file.name.encode() + b"\0" + file.read_bytes() + b"\0")
+    return hashed.hexdigest()
 
 
 def printable(text: str) -> str:
@@ -319,27 +310,25 @@ class Limits:
     memory_bytes: int = MEMORY_BYTES
 
 
-def run(
+def work_through(
     bundles: Iterable[Bundle], work: Work, limits: Limits
-) -> Generator[tuple[Bundle, Outcome], None, None]:
+) -> Generator[tuple[Bundle, Graded], None, None]:
     """`work` of each bundle, in processes, as it is finished; never an exception of one.
 
     A bundle that ends its process, or takes too long, has a line that says so. When the pool itself
     breaks, what was in it is tried once more in a new one.
     Raises ChildProcessError when no process can be started.
     """
-    left, lost = iter(bundles), set[str]()
-    again: deque[Bundle] = deque()  # from a pool that broke: one at a time, to find the culprit
+    left, again, tried = iter(bundles), list[Bundle](), set[str]()
     while True:
-        running: dict[Future[Outcome], Bundle] = {}
+        running: dict[Future[Graded], Bundle] = {}
         with _pool(limits) as pool, contextlib.suppress(BrokenProcessPool):
             while True:
-                alone = again or any(bundle.key in lost for bundle in running.values())
-                while len(running) < (1 if alone else (1 + AHEAD) * limits.workers):
-                    bundle = again.popleft() if again else next(left, None)
+                while len(running) < (1 + AHEAD) * limits.workers:
+                    bundle = again.pop() if again else next(left, None)
                     if bundle is None:
                         break
-                    running[_schedule(pool, work, bundle, limits)] = bundle
+                    running[_scheduled(pool, work, bundle, limits)] = bundle
                 if not running:
                     return
                 done, _ = wait(running, limits.timeout_s + PATIENCE_S, FIRST_COMPLETED)
@@ -349,24 +338,24 @@ def run(
                     outcome = _outcome(future, running[future], limits)  # or BrokenProcessPool
                     yield running.pop(future), outcome
         for bundle in running.values():
-            if bundle.key in lost:
+            if bundle.key in tried:
                 yield bundle, _failed(bundle, "lost", "All processes ended with it, twice.")
             else:
-                lost.add(bundle.key)
+                tried.add(bundle.key)
                 again.append(bundle)
 
 
-def _schedule(pool: ProcessPool, work: Work, bundle: Bundle, limits: Limits) -> Future[Outcome]:
-    arguments = (str(bundle.path), bundle.name, bundle.page)
+def _scheduled(pool: ProcessPool, work: Work, bundle: Bundle, limits: Limits) -> Future[Graded]:
     try:
+        arguments = (str(bundle.path), bundle.name, bundle.page)
         return pool.schedule(work, arguments, timeout=limits.timeout_s)
     except RuntimeError as error:  # the pool is no more; the bundle is lost with it
-        lost: Future[Outcome] = Future()
+        lost: Future[Graded] = Future()
         lost.set_exception(BrokenProcessPool(str(error)))
         return lost
 
 
-def _outcome(future: Future[Outcome], bundle: Bundle, limits: Limits) -> Outcome:
+def _outcome(future: Future[Graded], bundle: Bundle, limits: Limits) -> Graded:
     error = future.exception()  # of a worker: even a SystemExit must not be raised here
     if error is None:
         return future.result()
@@ -384,7 +373,7 @@ def _outcome(future: Future[Outcome], bundle: Bundle, limits: Limits) -> Outcome
     return _failed(bundle, "error", says)
 
 
-def _failed(bundle: Bundle, reason: str, says: str) -> Outcome:
+def _failed(bundle: Bundle, reason: str, says: str) -> Graded:
     return not_graded(bundle.name, reason, says), ""
 
 
@@ -452,7 +441,7 @@ def _context() -> Any:
     if sys.platform != "linux":
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([WORKER])
+    context.set_forkserver_preload([grade_file.__module__])
     return context
 
 
@@ -530,10 +519,10 @@ def _is_report(folder: Path) -> bool:
         return False
 
 
-def _load(out: Path, bundle: Bundle) -> Line | None:
+def _load(out: Path, bundle: Bundle) -> ReportLine | None:
     """The line of a bundle that is kept."""
     try:
-        return Line.from_dict(json.loads((out / ROWS / f"{bundle.key}.json").read_bytes()))
+        return ReportLine.from_dict(json.loads((out / ROWS / f"{bundle.key}.json").read_bytes()))
     except (OSError, AttributeError, KeyError, TypeError, ValueError):
         return None
 
@@ -546,7 +535,7 @@ def _is_done(out: Path, bundle: Bundle) -> bool:
     return not line.page or (out / line.page).exists()
 
 
-def _store(out: Path, bundle: Bundle, outcome: Outcome) -> None:
+def _store(out: Path, bundle: Bundle, outcome: Graded) -> None:
     """Keep a finished bundle: its page first, so that a line never lacks it."""
     line, page = outcome
     if page:
@@ -555,7 +544,7 @@ def _store(out: Path, bundle: Bundle, outcome: Outcome) -> None:
     results.write_bytes(out / ROWS / f"{bundle.key}.json", content)
 
 
-def _finish(out: Path, bundles: list[Bundle]) -> list[Line]:
+def _finish(out: Path, bundles: list[Bundle]) -> list[ReportLine]:
     """Write what takes the whole class; returns the lines with what they share."""
     gone = "What was kept of it is gone. Run the same command again."
     lines = across(
@@ -571,17 +560,7 @@ def _finish(out: Path, bundles: list[Bundle]) -> list[Line]:
     return lines
 
 
-def _kind(line: Line) -> str:
+def _kind(line: ReportLine) -> str:
     if line.points is not None:
         return "graded"
     return "failed" if line.reason in FAILED else "refused"
-
-
-def _bar(total: int, progress: bool) -> Any:
-    from tqdm.auto import tqdm
-
-    return tqdm(total=total, unit="bundle", disable=not progress, smoothing=0.1)
-
-
-def _counted(n: int, what: str) -> str:
-    return f"{n} {what}{'s' * (n != 1)}"

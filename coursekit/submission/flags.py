@@ -10,33 +10,28 @@ import hashlib
 import math
 import re
 import unicodedata
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from coursekit.submission.rules import rules
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from coursekit.submission.contents import CameraFacts, Stack, Submission
-    from coursekit.submission.recompute import Measured, Recomputed
-
-    Floats = NDArray[np.float64]
+from coursekit import specifications
+from coursekit.arrays import Bools, Floats, NDArray
+from coursekit.submission.format import CameraFacts, Stack, Submission
+from coursekit.submission.recompute import Recomputed, grading_rules
 
 TILES = 6  # a side of the grid on which the noise of a frame is remembered
-SAME_PATTERN = 0.8  # correlation of two time means on that grid
-SAME_FRAME = 0.85  # of two frames' noise
-QUERIES = 12  # frames of a stack that are looked for in others
-FOUND = 8  # of these, for the stacks to be the same measurement
-CLIP = 4.0  # times what is typical: a few changed values must not hide a copy
-CLOCK_S = 1e-8  # no real clock keeps step so well
-RUN = 3  # words in a row, by which paragraphs are compared
-SAME_WORDS = 0.7  # part of the runs of the shorter of two paragraphs that the other one has too
+PATTERN_LIKENESS = 0.8  # correlation of two time means on that grid
+FRAME_LIKENESS = 0.85  # of two frames' noise
+FRAMES_ASKED = 12  # frames of a stack that are looked for in others
+FRAMES_FOUND = 8  # of these, for the stacks to be the same measurement
+CLIPPED_AT = 4.0  # times what is typical: a few changed values must not hide a copy
+PERFECT_CLOCK_S = 1e-8  # no real clock keeps step so well
+WORDS_IN_A_ROW = 3  # words in a row, by which paragraphs are compared
+SHARED_RUNS = 0.7  # part of the runs of the shorter of two paragraphs that the other one has too
 
 
 @dataclass(frozen=True)
@@ -50,101 +45,78 @@ class Flag:
 
 def data_flags(submission: Submission, found: Recomputed, prints: Fingerprint) -> tuple[Flag, ...]:
     """Flags of one submission, from its raw data alone; prints: its own `fingerprint`."""
-    limits = rules()["flags"]
-    seen = [
+    limits = grading_rules()["flags"]
+    return (
         *_too_clean(submission.camera, found, limits),
         *_flat(found, limits),
         *_random_numbers(found, limits),
         *_simulated(submission),
         *_times(submission, limits),
         *_one_stack_twice(prints.stacks),
-    ]
-    return tuple(seen)
+    )
 
 
-def _too_clean(camera: CameraFacts, found: Recomputed, limits: dict[str, float]) -> list[Flag]:
-    flags = []
-    for m in found.at:
-        if m.stats.n_frames > 1 and not m.stats.frozen_fraction > 0.5:
-            frames = {frame.tobytes() for frame in m.stack.counts}
-            if len(frames) < m.stats.n_frames:
-                flags.append(
-                    Flag(
-                        "repeated_frames",
-                        f"At {m.distance_m:.2f} m only {len(frames)} of {m.stats.n_frames} frames "
-                        "differ; noise makes every frame different.",
-                    )
-                )
+def _too_clean(camera: CameraFacts, found: Recomputed, limits: dict[str, float]) -> Iterator[Flag]:
+    several = [m for m in found.at if m.stats.n_frames > 1]
+    for m in several:
+        different, n = len({frame.tobytes() for frame in m.stack.counts}), m.stats.n_frames
+        if different < n and not m.stats.frozen_fraction > 0.5:
+            says = f"At {m.distance_m:.2f} m only {different} of {n} frames differ;"
+            yield Flag("repeated_frames", f"{says} noise makes every frame different.")
     product = camera.fx * (camera.baseline_m or 0.05)
-    sigma_d = [
-        m.stats.pixel_std_unrounded_m * product / m.distance_m**2
-        for m in found.at
-        if m.std is not None and m.stats.n_frames > 1
-    ]
+    known = [m for m in several if m.std is not None]
+    sigma_d = [m.stats.pixel_std_unrounded_m * product / m.distance_m**2 for m in known]
     if sigma_d and max(sigma_d) < limits["least_sigma_d_px"]:
-        flags.append(
-            Flag(
-                "too_clean",
-                f"The noise is that of a disparity good to {max(sigma_d):.4f} px or better, under "
-                f"{limits['least_sigma_d_px']:g} px at every distance: filtered in time, or not "
-                "measured by stereo.",
-            )
+        says = (
+            f"The noise is that of a disparity good to {max(sigma_d):.4f} px or better, under "
+            f"{limits['least_sigma_d_px']:g} px at every distance: filtered in time, or not "
+            "measured by stereo."
         )
-    return flags
+        yield Flag("too_clean", says)
 
 
-def _flat(found: Recomputed, limits: dict[str, float]) -> list[Flag]:
+def _flat(found: Recomputed, limits: dict[str, float]) -> Iterator[Flag]:
     """Noise that does not grow with distance; intervals without the widening for scatter."""
     free = found.free
     if free is None or free.exponent is None or free.n_distances < 2:
-        return []
+        return
     most = free.exponent + 2 * math.sqrt(free.covariance[1, 1])
-    if most >= limits["flat_exponent"]:
-        return []
-    return [
-        Flag(
-            "not_distance_dependent",
+    if most < limits["flat_exponent"]:
+        says = (
             f"The noise grows as distance to the power {free.exponent:.2f} (at most {most:.2f}); "
-            "stereo noise grows with its square.",
+            "stereo noise grows with its square."
         )
+        yield Flag("not_distance_dependent", says)
+
+
+def _random_numbers(found: Recomputed, limits: dict[str, float]) -> Iterator[Flag]:
+    pairs = [
+        _space(m.stack.counts)
+        for m in found.at
+        if m.std is not None
+        and m.std.value >= 0.35e3 * m.scale_m  # else rounded away
+        and m.stats.n_frames >= 8
     ]
-
-
-def _random_numbers(found: Recomputed, limits: dict[str, float]) -> list[Flag]:
-    neighbours, patterns = [], []
-    for m in found.at:
-        step_mm = 1e3 * m.scale_m
-        if m.std is None or m.std.value < 0.35 * step_mm or m.stats.n_frames < 8:
-            continue  # rounded away
-        pair = _space(m)
-        if pair is not None:
-            neighbours.append(pair[0])
-            patterns.append(pair[1])
-    flags = []
-    if neighbours and max(neighbours) < limits["white"]:
-        flags.append(
-            Flag(
-                "white_in_space",
-                f"Neighbouring pixels share nothing of their noise (correlation "
-                f"{max(neighbours):+.2f} at most); those of a stereo camera share their matching "
-                "window. Random numbers look like this.",
-            )
+    likeness = max((pair[0] for pair in pairs if pair), default=math.inf)
+    pattern = max((pair[1] for pair in pairs if pair), default=math.inf)
+    if likeness < limits["white"]:
+        says = (
+            f"Neighbouring pixels share nothing of their noise (correlation {likeness:+.2f} at "
+            "most); those of a stereo camera share their matching window. Random numbers look "
+            "like this."
         )
-    if patterns and max(patterns) < limits["pattern"]:
-        flags.append(
-            Flag(
-                "no_pattern",
-                f"The mean of all frames is as flat as independent noise leaves it "
-                f"({max(patterns):.1f} times); a stereo camera repeats a pattern in every frame.",
-            )
+        yield Flag("white_in_space", says)
+    if pattern < limits["pattern"]:
+        says = (
+            "The mean of all frames is as flat as independent noise leaves it "
+            f"({pattern:.1f} times); a stereo camera repeats a pattern in every frame."
         )
-    return flags
+        yield Flag("no_pattern", says)
 
 
-def _space(m: Measured) -> tuple[float, float] | None:
+def _space(counts: NDArray[np.uint16]) -> tuple[float, float] | None:
     """Correlation of neighbours' noise in time, and the pattern in the mean, in units of what
     averaging leaves of noise; None where too few pixels are valid."""
-    counts = m.stack.counts
     n, height, width = counts.shape
     good = (counts > 0).all(axis=0)
     if good.sum() < 25 or height < 4 or width < 4:
@@ -173,11 +145,8 @@ def _space(m: Measured) -> tuple[float, float] | None:
     return max(rho, default=1.0), float(residual.std()) / left
 
 
-def _simulated(submission: Submission) -> list[Flag]:
-    camera = submission.camera
-    if camera.source == "simulated":
-        return []
-    reasons = []
+def _simulated(submission: Submission) -> Iterator[Flag]:
+    camera, reasons = submission.camera, []
     words = f"{camera.name} {camera.serial}".lower()
     if "simul" in words or "seed-" in words:
         reasons.append(f"its name is {camera.name}, {camera.serial}")
@@ -186,75 +155,63 @@ def _simulated(submission: Submission) -> list[Flag]:
         reasons.append("its intrinsics are those of the simulated camera to the last digit")
     if camera.source == "live" and any(_perfect_clock(s.times_s) for s in submission.stacks):
         reasons.append("its clock has no jitter")
-    if not reasons:
-        return []
-    return [Flag("simulated_as_live", f"Declared as {camera.source}, but {'; '.join(reasons)}.")]
+    if reasons and camera.source != "simulated":
+        says = f"Declared as {camera.source}, but {'; '.join(reasons)}."
+        yield Flag("simulated_as_live", says)
 
 
 @lru_cache(maxsize=1)
 def _simulated_devices() -> tuple[tuple[float, ...], ...]:
-    from coursekit import specifications
-
     lenses = [specifications.device(name).unit.depth for name in specifications.device_names()]
     return tuple((k.width, k.height, k.fx, k.fy, k.cx, k.cy) for k in lenses)
 
 
 def _perfect_clock(times: Floats) -> bool:
-    if len(times) < 8 or np.spacing(np.abs(times).max()) > CLOCK_S / 4:
+    if len(times) < 8 or np.spacing(np.abs(times).max()) > PERFECT_CLOCK_S / 4:
         return False
     even = times[0] + (times[-1] - times[0]) / (len(times) - 1) * np.arange(len(times))
-    return bool(np.abs(times - even).max() < CLOCK_S)
+    return bool(np.abs(times - even).max() < PERFECT_CLOCK_S)
 
 
-def _times(submission: Submission, limits: dict[str, float]) -> list[Flag]:
+def _times(submission: Submission, limits: dict[str, float]) -> Iterator[Flag]:
     reasons = []
     for stack in submission.stacks:
-        steps = np.diff(stack.times_s)
-        if steps.size == 0:
-            continue
+        steps, where = np.diff(stack.times_s), f"at {stack.distance_m:.2f} m they"
         back = int((steps <= 0).sum())
         if back:
-            reasons.append(f"at {stack.distance_m:.2f} m they stand still or go back {back} times")
-        elif float(np.median(steps)) < 1 / limits["fastest_hz"]:
-            rate = 1 / float(np.median(steps))
-            reasons.append(f"at {stack.distance_m:.2f} m they say {rate:.3g} frames a second")
+            reasons.append(f"{where} stand still or go back {back} times")
+        elif steps.size and np.median(steps) < 1 / limits["fastest_hz"]:
+            reasons.append(f"{where} say {1 / float(np.median(steps)):.3g} frames a second")
     reasons += _times_together(submission)
-    if not reasons:
-        return []
-    return [Flag("impossible_times", f"Time stamps that cannot be: {'; '.join(reasons)}.")]
+    if reasons:
+        yield Flag("impossible_times", f"Time stamps that cannot be: {'; '.join(reasons)}.")
 
 
-def _times_together(submission: Submission) -> list[str]:
+def _times_together(submission: Submission) -> Iterator[str]:
     stacks = [stack for stack in submission.stacks if len(stack.times_s) > 1]
-    reasons = []
     for i, one in enumerate(stacks):
         for two in stacks[:i]:
             both = f"{two.distance_m:.2f} and {one.distance_m:.2f} m"
             first, second = one.times_s, two.times_s
             epoch = min(first.min(), second.min()) > 1e9  # a clock that nothing sets back
             if np.array_equal(first, second):
-                reasons.append(f"those of {both} are the same")
+                yield f"those of {both} are the same"
             elif epoch and first.min() <= second.max() and second.min() <= first.max():
-                reasons.append(f"{both} were measured at the same time")
+                yield f"{both} were measured at the same time"
     made = datetime.fromisoformat(submission.made).timestamp()
     last = max((float(stack.times_s.max()) for stack in stacks), default=0.0)
     if 1e9 < last < 1e10 and last > made + 86_400:
-        reasons.append(f"the last is {(last - made) / 86_400:.0f} days after the bundle was made")
-    return reasons
+        yield f"the last is {(last - made) / 86_400:.0f} days after the bundle was made"
 
 
-def _one_stack_twice(prints: Sequence[StackPrint]) -> list[Flag]:
+def _one_stack_twice(prints: Sequence[StackPrint]) -> Iterator[Flag]:
     """Whether one distance was made out of another."""
-    flags = []
     for i, one in enumerate(prints):
         for two in prints[:i]:
             alike = max(_shared(one, two)[0], _shared(two, one)[0])
-            if one.digest == two.digest or alike >= FOUND:
+            if one.digest == two.digest or alike >= FRAMES_FOUND:
                 both = f"{two.distance_m:.2f} m and {one.distance_m:.2f} m"
-                flags.append(
-                    Flag("one_stack_twice", f"The noise at {both} is the same, frame by frame.")
-                )
-    return flags
+                yield Flag("one_stack_twice", f"The noise at {both} is the same, frame by frame.")
 
 
 # --- fingerprints, and who shares what ------------------------------------------------------
@@ -289,35 +246,27 @@ class Fingerprint:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain text and numbers only."""
+
+        def text(values: NDArray[np.int8]) -> str:
+            return base64.b64encode(values.tobytes()).decode("ascii")
+
         stacks = [
-            {
-                "distance_m": s.distance_m,
-                "digest": s.digest,
-                "pattern": base64.b64encode(s.pattern.tobytes()).decode("ascii"),
-                "frames": base64.b64encode(s.frames.tobytes()).decode("ascii"),
-            }
-            for s in self.stacks
+            vars(s) | {"pattern": text(s.pattern), "frames": text(s.frames)} for s in self.stacks
         ]
-        return {
-            "student": self.student,
-            "source": self.source,
-            "camera": self.camera,
-            "stacks": stacks,
-        }
+        return vars(self) | {"stacks": stacks}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Fingerprint:
         """The inverse of `to_dict`."""
-        stacks = tuple(
-            StackPrint(
-                s["distance_m"],
-                s["digest"],
-                np.frombuffer(base64.b64decode(s["pattern"]), np.int8),
-                np.frombuffer(base64.b64decode(s["frames"]), np.int8).reshape(-1, TILES**2),
-            )
-            for s in data["stacks"]
-        )
-        return cls(data["student"], data["source"], data["camera"], stacks)
+
+        def array(text: str) -> NDArray[np.int8]:
+            return np.frombuffer(base64.b64decode(text), np.int8)
+
+        stacks = []
+        for s in data["stacks"]:
+            frames = array(s["frames"]).reshape(-1, TILES**2)
+            stacks.append(StackPrint(**s | {"pattern": array(s["pattern"]), "frames": frames}))
+        return cls(**{**data, "stacks": tuple(stacks)})
 
 
 @dataclass(frozen=True)
@@ -335,13 +284,9 @@ class Copy:
 
 def fingerprint(submission: Submission) -> Fingerprint:
     """See `Fingerprint`."""
-    camera = submission.camera
-    return Fingerprint(
-        submission.student,
-        camera.source,
-        f"{camera.name}, {camera.serial}",
-        tuple(_stack_print(stack) for stack in submission.stacks),
-    )
+    camera, stacks = submission.camera, tuple(map(_stack_print, submission.stacks))
+    name = f"{camera.name}, {camera.serial}"
+    return Fingerprint(submission.student, camera.source, name, stacks)
 
 
 def _stack_print(stack: Stack) -> StackPrint:
@@ -360,15 +305,17 @@ def _stack_print(stack: Stack) -> StackPrint:
     few = np.abs(deviation[:: max(1, n // 16)])
     scale = max(float(np.sqrt(np.square(few).mean())), 1e-9)
     scale = max(float(np.sqrt(np.square(np.minimum(few, 3 * scale)).mean())), 0.25)
-    clipped = np.clip(deviation, -CLIP * scale, CLIP * scale)
+    clipped = np.clip(deviation, -CLIPPED_AT * scale, CLIPPED_AT * scale)
     mean = mean + clipped.sum(axis=0) / np.maximum(seen, 1)  # a wild value no longer moves it
-    deviation = np.clip((counts - mean.astype(np.float32)) * valid, -CLIP * scale, CLIP * scale)
+    deviation = np.clip(
+        (counts - mean.astype(np.float32)) * valid, -CLIPPED_AT * scale, CLIPPED_AT * scale
+    )
     tiles = _tiles(deviation)
     tiles -= tiles.mean(axis=1, keepdims=True)
     return StackPrint(stack.distance_m, digest, _bytes(_pattern(mean, seen > 0)), _bytes(tiles))
 
 
-def _pattern(mean: Floats, known: NDArray[np.bool_]) -> Floats:
+def _pattern(mean: Floats, known: Bools) -> Floats:
     """A mean image (h, w) without its plane, on the grid (36,); a hole counts as on the plane."""
     if known.sum() < 12:
         return np.zeros(TILES**2)
@@ -415,24 +362,24 @@ def _unit(values: NDArray[np.int8]) -> NDArray[np.float32]:
 
 
 def _queries(frames: NDArray[np.int8]) -> NDArray[np.int8]:
-    """Up to QUERIES frames, evenly spread."""
-    if len(frames) <= QUERIES:
+    """Up to FRAMES_ASKED frames, evenly spread."""
+    if len(frames) <= FRAMES_ASKED:
         return frames
-    return frames[np.linspace(0, len(frames) - 1, QUERIES).round().astype(int)]
+    return frames[np.linspace(0, len(frames) - 1, FRAMES_ASKED).round().astype(int)]
 
 
 def _shared(one: StackPrint, two: StackPrint) -> tuple[int, bool]:
     """How many of some frames of `one` are in `two`, and whether they are exactly the same."""
     ask = _queries(one.frames)
-    if len(ask) < FOUND or len(two.frames) < FOUND:
+    if len(ask) < FRAMES_FOUND or len(two.frames) < FRAMES_FOUND:
         return 0, False
     likeness = _unit(ask) @ _unit(two.frames).T
-    hits = likeness.max(axis=1) >= SAME_FRAME
+    hits = likeness.max(axis=1) >= FRAME_LIKENESS
     best = two.frames[likeness.argmax(axis=1)]
     return int(hits.sum()), bool((best[hits] == ask[hits]).all())
 
 
-def compare(prints: Mapping[str, Fingerprint]) -> list[Copy]:
+def copies(prints: Mapping[str, Fingerprint]) -> list[Copy]:
     """Bundles whose raw data are identical or nearly so, by the keys of `prints`.
 
     Found whatever the order and number of the frames, with a few values changed, a constant added,
@@ -440,17 +387,21 @@ def compare(prints: Mapping[str, Fingerprint]) -> list[Copy]:
     pair; of several identical bundles the first is compared further, for all of them.
     """
     groups: dict[tuple[str, ...], list[str]] = {}
-    for key, fingerprint_ in prints.items():
-        digests = tuple(sorted(stack.digest for stack in fingerprint_.stacks))
+    for key, prints_of_one in prints.items():
+        digests = tuple(sorted(stack.digest for stack in prints_of_one.stacks))
         groups.setdefault(digests or (key,), []).append(key)
-    copies = [_identical(keys, prints) for keys in groups.values() if len(keys) > 1]
-    return copies + _nearly({keys[0]: tuple(keys) for keys in groups.values()}, prints)
+    found = []
+    for keys in groups.values():
+        if len(keys) > 1:
+            many = f"{len(keys)} bundles have" if len(keys) > 2 else "Two bundles have"
+            says = f"{many} the same raw depths, byte for byte"
+            found.append(_copy(keys, "identical", says, _innocent(keys, prints, True)))
+    return found + _nearly({keys[0]: tuple(keys) for keys in groups.values()}, prints)
 
 
-def _identical(keys: Sequence[str], prints: Mapping[str, Fingerprint]) -> Copy:
-    many = f"{len(keys)} bundles have" if len(keys) > 2 else "Two bundles have"
-    says, note = f"{many} the same raw depths, byte for byte", _innocent(keys, prints, True)
-    return Copy(tuple(keys), "identical", f"{says}{': ' + note if note else ''}.", bool(note))
+def _copy(keys: Sequence[str], code: str, says: str, innocent: str) -> Copy:
+    """innocent: why they may well be the same, or nothing."""
+    return Copy(tuple(keys), code, f"{says}{': ' * bool(innocent)}{innocent}.", bool(innocent))
 
 
 def _innocent(keys: Sequence[str], prints: Mapping[str, Fingerprint], exact: bool) -> str:
@@ -472,40 +423,35 @@ def _nearly(groups: Mapping[str, tuple[str, ...]], prints: Mapping[str, Fingerpr
     found: dict[tuple[str, str], dict[float, tuple[int, bool]]] = {}
     rank = {key: i for i, key in enumerate(groups)}
     for i, (key, stack) in enumerate(stacks):
-        alike = np.flatnonzero(patterns @ patterns[i] > SAME_PATTERN)
-        others = [j for j in alike if stacks[j][0] != key and len(stacks[j][1].frames) >= FOUND]
+        alike = np.flatnonzero(patterns @ patterns[i] > PATTERN_LIKENESS)
+        others = [
+            j for j in alike if stacks[j][0] != key and len(stacks[j][1].frames) >= FRAMES_FOUND
+        ]
         ask = _queries(stack.frames)
-        if not others or len(ask) < FOUND:
+        if not others or len(ask) < FRAMES_FOUND:
             continue
         frames = [_unit(stacks[j][1].frames) for j in others]
         likeness = _unit(ask) @ np.concatenate(frames).T
         starts = np.cumsum([0, *(len(some) for some in frames[:-1])])
-        hits = (np.maximum.reduceat(likeness, starts, axis=1) >= SAME_FRAME).sum(axis=0)
+        hits = (np.maximum.reduceat(likeness, starts, axis=1) >= FRAME_LIKENESS).sum(axis=0)
         for j, number in zip(others, hits.tolist(), strict=True):
-            if number >= FOUND:
+            if number >= FRAMES_FOUND:
                 other = stacks[j][0]
                 pair = (key, other) if rank[key] < rank[other] else (other, key)
                 exact = stack.digest == stacks[j][1].digest or _shared(stack, stacks[j][1])[1]
                 part = found.setdefault(pair, {})
                 before = part.get(stack.distance_m, (0, False))
                 part[stack.distance_m] = max(before, (number, exact))
-    return [
-        _near_pair(groups[one] + groups[two], part, prints) for (one, two), part in found.items()
-    ]
-
-
-def _near_pair(
-    keys: tuple[str, ...],
-    part: Mapping[float, tuple[int, bool]],
-    prints: Mapping[str, Fingerprint],
-) -> Copy:
-    exact = all(same for _, same in part.values())
-    where = " and ".join(f"{z:.2f} m" for z in sorted(part))
-    share = sum(number for number, _ in part.values()) / (QUERIES * len(part))
-    kind = "the same" if exact else "nearly the same"
-    says = f"The frames at {where} are {kind} ({min(share, 1):.0%} of those looked for were found)"
-    note = _innocent(keys, prints, exact)
-    return Copy(keys, "nearly_identical", f"{says}{': ' + note if note else ''}.", bool(note))
+    copies_found = []
+    for (one, two), part in found.items():
+        keys, exact = groups[one] + groups[two], all(same for _, same in part.values())
+        where = " and ".join(f"{z:.2f} m" for z in sorted(part))
+        share = sum(number for number, _ in part.values()) / (FRAMES_ASKED * len(part))
+        kind = "the same" if exact else "nearly the same"
+        says = f"The frames at {where} are {kind} ({min(share, 1):.0%} of those looked for were"
+        innocent = _innocent(keys, prints, exact)
+        copies_found.append(_copy(keys, "nearly_identical", f"{says} found)", innocent))
+    return copies_found
 
 
 # --- who shares words -----------------------------------------------------------------------
@@ -522,14 +468,14 @@ def same_words(said: Mapping[str, tuple[str, str]]) -> list[Copy]:
     said: student and paragraph of each bundle, by its key. Case and punctuation do not matter;
     paragraphs that are too short for the rubric are not compared.
     """
-    least = rules()["exercise"]["words"]
+    least = grading_rules()["exercise"]["words"]
     who: dict[tuple[str, ...], list[str]] = {}
     for key, (_, paragraph) in said.items():
         words = re.findall(r"\w+", unicodedata.normalize("NFKC", paragraph).casefold())
         if len(words) >= least:
             who.setdefault(tuple(words), []).append(key)
     copies = []
-    for texts in _alike(list(who), least - RUN + 1):
+    for texts in _alike(list(who), least - WORDS_IN_A_ROW + 1):
         keys = tuple(key for text in texts for key in who[text])
         students = {person(said[key][0]) for key in keys}
         if len(students) > 1:
@@ -551,7 +497,7 @@ def _alike(texts: Sequence[tuple[str, ...]], least: int) -> list[list[tuple[str,
     rows: list[int] = []
     columns: list[int] = []
     for i, words in enumerate(texts):
-        runs = {words[j : j + RUN] for j in range(len(words) - RUN + 1)}
+        runs = {words[j : j + WORDS_IN_A_ROW] for j in range(len(words) - WORDS_IN_A_ROW + 1)}
         rows += [i] * len(runs)
         columns += [number.setdefault(run, len(number)) for run in runs]
     ones = np.ones(len(rows), np.float32)
@@ -563,7 +509,7 @@ def _alike(texts: Sequence[tuple[str, ...]], least: int) -> list[list[tuple[str,
     for start in range(0, len(texts), 256):  # so that a class that says the same fits the memory
         shared = coo_array(has[start : start + 256] @ has.T)
         one, two = shared.row + start, shared.col
-        near = shared.data >= SAME_WORDS * np.minimum(size[one], size[two])
+        near = shared.data >= SHARED_RUNS * np.minimum(size[one], size[two])
         pairs.append(np.stack([one[near], two[near]]))
     one, two = np.concatenate(pairs, axis=1)
     graph = coo_array((np.ones(len(one)), (one, two)), shape=(len(texts), len(texts)))

@@ -1,24 +1,87 @@
-"""What the raw depths of a submission say: bias, noise and holes at each distance, and the law."""
+"""What the raw depths of a submission say: bias, noise and holes at each distance, and the law.
+
+Also what rubric.toml holds, `grading_rules`: points, tolerances and thresholds. Whoever edits that
+file makes typing errors; each is one line that names the file and the key.
+"""
 
 from __future__ import annotations
 
 import math
+import tomllib
+from collections.abc import Collection
 from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from coursekit.arrays import Floats
+from coursekit.checks import number, want, whole
 from coursekit.stereo import NoiseFit, WindowStats, fit_noise, window_stats
 from coursekit.stereo.windows import effective_frames, series_std
+from coursekit.submission.format import Stack, Submission
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+RULES = Path(__file__).with_name("rubric.toml")
+WORDS = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding="utf-8"))
+LABELS: dict[str, str] = WORDS["labels"]  # of what is asked for, by topic
+MISTAKES: dict[str, str] = WORDS["mistakes"]
+EXERCISE = ("distances_m", "slack_m", "frames", "window_px", "words", "tape_at_most_m")
+TOLERANCES = ("standard_errors", "error_of_an_error", "prediction", "prediction_factor", "near")
+FLAGS = ("least_sigma_d_px", "flat_exponent", "white", "pattern", "fastest_hz")
+KEYS: dict[str, tuple[float, Collection[str]]] = {  # of rubric.toml: the largest value, the keys
+    "exercise": (2000, EXERCISE),
+    "points": (1000, LABELS),
+    "tolerance": (1000, TOLERANCES),
+    "digits": (9, [*LABELS][1:6] + [*LABELS][7:10]),
+    "credit": (1, MISTAKES),
+    "flags": (1e6, FLAGS),
+}
+AT_LEAST_ONE = ("frames", "window_px", "prediction_factor", "near")
+WHOLE_NUMBERS = ("frames", "window_px", "words")
 
-    from coursekit.submission.contents import Stack, Submission
 
-    Floats = NDArray[np.float64]
-    Interval = tuple[float, float]
+@lru_cache(maxsize=1)
+def grading_rules() -> dict[str, Any]:
+    """What rubric.toml holds. Raises ValueError, one line that names the file and the key."""
+    try:
+        found = tomllib.loads(RULES.read_text(encoding="utf-8"))
+    except ValueError as error:  # TOML's own, which says the line, or text that is not UTF-8
+        raise ValueError(f"{RULES.name}: cannot be read: {' '.join(str(error).split())}") from None
+    try:
+        _check_keys("", found, KEYS)
+        for section, (most, keys) in KEYS.items():
+            want(isinstance(found[section], dict), section, found[section], "a section of keys")
+            _check_keys(f"{section}.", found[section], keys)
+            for key, value in found[section].items():
+                _check_rule(section, key, value, most)
+    except ValueError as error:
+        raise ValueError(f"{RULES.name}: {error}") from None
+    return found
+
+
+def _check_keys(where: str, found: dict[str, Any], wanted: Collection[str]) -> None:
+    """ValueError for a key too many or too few; where both are, one may be the other mistyped."""
+    missing = [f"{where}{key}" for key in wanted if key not in found]
+    for key in found:
+        if key not in wanted:
+            also = f" ({missing[0]} is missing)" if missing else ""
+            raise ValueError(f"{where}{key!s:.40}: is no key of this file{also}")
+    if missing:
+        raise ValueError(f"{missing[0]}: is missing")
+
+
+def _check_rule(section: str, key: str, value: Any, most: float) -> None:
+    name, least = f"{section}.{key}", float(key in AT_LEAST_ONE)
+    if key == "distances_m":
+        want(isinstance(value, list) and value, name, value, "a list of numbers")
+        for one in value:
+            number(name, one, "a number from 0.01 to 100", least=0.01, most=100)
+        want(len(set(value)) == len(value), name, value, "different numbers")
+    elif section == "digits" or key in WHOLE_NUMBERS:
+        whole(name, value, f"a whole number from {least:g} to {most:g}", least=least, most=most)
+    else:
+        number(name, value, f"a number from {least:g} to {most:g}", least=least, most=most)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,46 +7,50 @@ grader look at it, and packs.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
+from typing import Any, Literal, ParamSpec, TypeVar, cast
 
 import numpy as np
 
 from coursekit import results
-from coursekit.submission.contents import (
+from coursekit.cameras import Camera, Frames
+from coursekit.checks import want
+from coursekit.lessons import progress
+from coursekit.stereo import NoiseFit
+from coursekit.submission.format import (
     CameraFacts,
-    Cause,
     Claims,
     Conclusion,
     Outcome,
     Plot,
-    Row,
+    Refused,
     Stack,
     Submission,
-    shown,
+    TableRow,
+    bundle_bytes,
+    read_bundle,
+    slug,
 )
-
-if TYPE_CHECKING:
-    import os
-
-    from coursekit.cameras import Camera, Frames
-    from coursekit.stereo import NoiseFit
-
-    Table = Mapping[float, Sequence[float | None]]
+from coursekit.submission.rubric import shortcomings
+from coursekit.words import counted
 
 MEASURED = "studio_1.measured"  # in results/
 CHECKPOINTS = "depth_noise."  # what the names of the lesson's checkpoints and exercises begin with
-PARTS = ("depth_bias_mm", "depth_bias_se_mm", "depth_std_mm", "depth_std_se_mm", "invalid_fraction")
+COLUMNS = (
+    *("depth_bias_mm", "depth_bias_se_mm", "depth_std_mm", "depth_std_se_mm"),
+    "invalid_fraction",
+)
 UNITS = {  # of a quantity that is handed in, and what one of it is in the table's own
     "depth_bias": {"mm": 1.0, "m": 1e3},
     "depth_std": {"mm": 1.0, "m": 1e3},
     "invalid": {"1": 1.0, "%": 0.01},
 }
-LONGEST_SLUG = 40  # characters of a name that go into the name of a file
 NOBODY = "nobody"  # stands in for a name while there is none
+Table = Mapping[float, Sequence[float | None]]
 
 MEASURE_FIRST = (
     "The studio exercise is not measured yet: run the studio cells of notebook 02 (with a camera, "
@@ -72,6 +76,8 @@ def _in_one_line(function: Callable[P, T]) -> Callable[P, T]:
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> T:
         try:
             return function(*args, **kwargs)
+        except Refused as refused:  # what is wrong; the cure is for whoever grades
+            raise CannotHandIn(refused.wrong) from refused
         except ValueError as error:
             raise CannotHandIn(str(error)) from error
 
@@ -93,41 +99,18 @@ class Handed:
         return "\n".join([self.headline, *(f"- {line}" for line in self.says)])
 
     def _repr_html_(self) -> str:
-        from coursekit.lessons.verdict import Verdict
-
         kind = "not attempted" if self.path is None else "wrong" if self.says else "right"
-        return Verdict("submit", kind, self.headline, self.says)._repr_html_()  # type: ignore[arg-type]
+        return progress.Verdict("submit", kind, self.headline, self.says)._repr_html_()  # type: ignore[arg-type]
 
 
 def stack(frames: Frames, window: tuple[int, int, int, int], distance_m: float) -> Stack:
     """The raw depth of frames in a window (left, top, width, height) px, and their times.
 
-    distance_m: of what the frames show, by tape. Raises ValueError as `Stack` does.
+    distance_m: of what the frames show, by tape. What a bundle cannot hold is said by `keep`.
     """
     left, top, width, height = window
-    counts = frames.depth[:, top : top + height, left : left + width]
+    counts = frames.depth[:, top : top + height, left : left + width].copy()
     return Stack(distance_m, window, counts, np.array([frame.time_s for frame in frames], float))
-
-
-@_in_one_line
-def keep(
-    camera: Camera,
-    stacks: Iterable[Stack],
-    quantities: Mapping[str, results.Quantity],
-    fit: NoiseFit,
-    predicted_mm: Sequence[float] | None,
-    tape_sigma_m: float,
-    caliper_m: float,
-    table: Table | None = None,
-) -> Path:
-    """Keep a measured studio exercise in `results/`, for `submit`; returns the file.
-
-    The arguments are those of `measured`, and so are the errors; nothing is written then.
-    """
-    from coursekit.submission.bundle import write_bundle
-
-    kept = measured(camera, stacks, quantities, fit, predicted_mm, tape_sigma_m, caliper_m, table)
-    return write_bundle(results.folder() / MEASURED, kept, overwrite=True)
 
 
 def measured(
@@ -152,11 +135,12 @@ def measured(
     """
     stacks = tuple(stacks)
     rows = _with_own(tuple(_row(s.distance_m, quantities) for s in stacks), table or {})
-    if predicted_mm is not None and np.shape(predicted_mm) != (len(stacks),):
-        raise ValueError(
-            f"predicted_mm: got {np.size(predicted_mm)}, want {len(stacks)}: one number in mm for "
-            "each distance"
-        )
+    want(
+        predicted_mm is None or np.shape(predicted_mm) == (len(stacks),),
+        "predicted_mm",
+        predicted_mm,
+        f"{len(stacks)}: one number in mm for each distance",
+    )
     free = fit.exponent if fit.exponent_interval is not None else None
     stds = [row.depth_std_mm for row in rows if row.depth_std_mm is not None]
     predicted = None if predicted_mm is None else tuple(predicted_mm)
@@ -166,8 +150,15 @@ def measured(
     return Submission(
         student=NOBODY,
         made=results.now(),
-        versions=results._versions(),
-        camera=facts(camera),
+        versions=results.versions(),
+        camera=CameraFacts(
+            name=camera.name,
+            serial=camera.serial,
+            source=camera.source,
+            **asdict(camera.depth),
+            baseline_m=camera.baseline_m,
+            depth_scale_m=camera.depth_scale_m,
+        ),
         tape_sigma_m=tape_sigma_m,
         caliper_m=caliper_m,
         stacks=stacks,
@@ -178,31 +169,23 @@ def measured(
     )
 
 
-def facts(camera: Camera) -> CameraFacts:
-    """What the camera says about its depth stream."""
-    K = camera.depth
-    return CameraFacts(
-        camera.name,
-        camera.serial,
-        camera.source,
-        K.width,
-        K.height,
-        K.fx,
-        K.fy,
-        K.cx,
-        K.cy,
-        K.model,
-        K.coeffs,
-        camera.baseline_m,
-        camera.depth_scale_m,
-    )
+@_in_one_line
+@wraps(measured, assigned=())  # its arguments
+def keep(*arguments: Any, **named: Any) -> Path:
+    """Keep a measured studio exercise in `results/`, for `submit`; returns the file.
+
+    The arguments are those of `measured`, and so are the errors; nothing is written then.
+    """
+    path, kept = results.folder() / MEASURED, measured(*arguments, **named)
+    results.write_bytes(path, bundle_bytes(kept))
+    return path
 
 
 @_in_one_line
 def submit(
     student: str = "",
     distance_m: float | None = None,
-    dominates: Cause | None = None,
+    dominates: Literal["bias", "noise"] | None = None,
     paragraph: str = "",
     frames: int = 1,
     folder: str | os.PathLike[str] | None = None,
@@ -218,11 +201,10 @@ def submit(
     Raises ValueError for an argument that cannot be, naming it.
     """
     if isinstance(dominates, str):  # "Bias" is meant as well
-        dominates = cast("Cause", dominates.strip().lower())
+        dominates = cast(Literal["bias", "noise"], dominates.strip().lower())
     if isinstance(frames, float) and float(frames).is_integer():
         frames = int(frames)
-    conclusion = Conclusion(distance_m, frames, dominates, (paragraph or "").strip())
-    kept = load()
+    kept = load_measured()
     if kept is None:
         return Handed(None, MEASURE_FIRST)
     name = (student or "").strip()
@@ -230,51 +212,29 @@ def submit(
         kept,
         student=name or NOBODY,
         made=results.now(),
-        conclusion=conclusion,
+        conclusion=Conclusion(distance_m, frames, dominates, (paragraph or "").strip()),
         outcomes=outcomes(),
     )
-    return _checked(whole) if not name else _packed(whole, folder, overwrite)
-
-
-def _checked(submission: Submission) -> Handed:
-    from coursekit.submission.rubric import check
-
-    headline = "Nothing is written yet: a bundle needs your name (`student`)."
-    says = check(submission)
-    return Handed(
-        None, f"{headline} This is what the grader would say:" if says else headline, says
-    )
-
-
-def _packed(submission: Submission, folder: Any, overwrite: bool) -> Handed:
-    from coursekit.submission.bundle import write_bundle
-    from coursekit.submission.rubric import check
-
-    path = (Path(folder) if folder else results.folder()) / bundle_name(submission.student)
-    if path.exists() and not overwrite:
+    data = bundle_bytes(whole)  # Refused for what no bundle can hold
+    path = (Path(folder) if folder else results.folder()) / bundle_name(name)
+    if name and path.exists() and not overwrite:
         there = f"{relative(path)} is there already and stays as it is."
         return Handed(None, f"{there} To replace it: `overwrite=True` (or --overwrite).")
-    says = check(submission)
-    write_bundle(path, submission, overwrite=overwrite)
-    n = len(submission.stacks)
-    measured_with = f"{n} distance{'s' * (n != 1)} with {submission.camera.name}"
+    says = shortcomings(whole)
+    if not name:
+        headline = "Nothing is written yet: a bundle needs your name (`student`)."
+        headline += " This is what the grader would say:" if says else ""
+        return Handed(None, headline, says)
+    results.write_bytes(path, data)
+    measured_with = f"{counted(len(whole.stacks), 'distance')} with {whole.camera.name}"
     headline = f"Wrote {relative(path)}, {measured_with}: hand in this one file. "
-    if says:
-        headline += "What the grader will say is missing or weak:"
-    else:
-        headline += "The grader misses nothing in it."
-    return Handed(path, headline, says)
+    headline += "What the grader will say is missing or weak:" if says else ""
+    return Handed(path, headline + "The grader misses nothing in it." * (not says), says)
 
 
 def bundle_name(student: str) -> str:
     """The file name of a student's bundle: letters and digits of the name, nothing else."""
     return f"studio_1_{slug(student)}.zip"
-
-
-def slug(text: str) -> str:
-    """The letters and digits of a text with _ for what is between, for the name of a file."""
-    kept = "".join(sign if sign.isalnum() else " " for sign in text)
-    return "_".join(kept.split())[:LONGEST_SLUG].strip("_") or "unnamed"
 
 
 def relative(path: Path) -> str:
@@ -287,8 +247,6 @@ def relative(path: Path) -> str:
 
 def outcomes() -> dict[str, Outcome]:
     """How the checkpoints and exercises of notebook 02 stand that were attempted, by name."""
-    from coursekit.lessons import progress
-
     return {
         name: Outcome(any(a.get("kind") == "right" for a in attempts), len(attempts))
         for name, attempts in progress.read().items()
@@ -296,13 +254,11 @@ def outcomes() -> dict[str, Outcome]:
     }
 
 
-def load() -> Submission | None:
+def load_measured() -> Submission | None:
     """What `keep` wrote, without a name and a conclusion; None if there is nothing.
 
     Raises ValueError for a damaged file.
     """
-    from coursekit.submission.reader import Refused, read_bundle
-
     path = results.folder() / MEASURED
     if not path.exists():
         return None
@@ -314,7 +270,7 @@ def load() -> Submission | None:
         ) from error
 
 
-def _row(distance_m: float, quantities: Mapping[str, results.Quantity]) -> Row:
+def _row(distance_m: float, quantities: Mapping[str, results.Quantity]) -> TableRow:
     """The line of the table at one distance; what was not measured is left out."""
 
     def found(name: str) -> tuple[float | None, float | None]:
@@ -322,37 +278,28 @@ def _row(distance_m: float, quantities: Mapping[str, results.Quantity]) -> Row:
         quantity = quantities.get(full)
         if quantity is None:
             return None, None
-        if not isinstance(quantity, results.Quantity):
-            got, unit = type(quantity).__name__, next(iter(UNITS[name]))
-            raise ValueError(f"{full}: got a {got}, want Quantity(value, {unit!r}, standard error)")
-        factor = UNITS[name].get(quantity.unit)
-        if factor is None:
-            raise ValueError(f"{full}: got the unit {quantity.unit!r}, want {_or(UNITS[name])}")
+        units = UNITS[name]
+        wanted = f"Quantity(value, {next(iter(units))!r}, standard error)"
+        want(isinstance(quantity, results.Quantity), full, quantity, wanted)
+        unit = quantity.unit
+        want(unit in units, full, unit, f"the unit {' or '.join(map(repr, units))}")
+        factor = units[unit]
         sigma = None if quantity.sigma is None else factor * quantity.sigma
         return factor * quantity.value, sigma
 
-    return Row(distance_m, *found("depth_bias"), *found("depth_std"), found("invalid")[0])
+    return TableRow(distance_m, *found("depth_bias"), *found("depth_std"), found("invalid")[0])
 
 
-def _or(words: Iterable[str]) -> str:
-    return " or ".join(repr(word) for word in words)
-
-
-def _with_own(rows: tuple[Row, ...], table: Table) -> tuple[Row, ...]:
+def _with_own(rows: tuple[TableRow, ...], table: Table) -> tuple[TableRow, ...]:
     """The rows with the student's own numbers in them, wherever these are not None."""
-    if not isinstance(table, Mapping):
-        raise ValueError(f"table: got {shown(table)}, want {{0.30: (five numbers), ...}}")
+    want(isinstance(table, Mapping), "table", table, "{0.30: (five numbers), ...}")
     at = [row.distance_m for row in rows]
+    five = "five: bias, its standard error, std, its standard error (mm), invalid part"
     for z, numbers in table.items():
-        if z not in at:
-            measured_at = ", ".join(f"{distance:g}" for distance in at)
-            raise ValueError(f"table: got the distance {shown(z)}, want one of {measured_at}")
-        if not isinstance(numbers, (tuple, list, np.ndarray)) or len(numbers) != len(PARTS):
-            raise ValueError(
-                f"table at {z:g} m: got {shown(numbers)}, want five: bias, its standard error, "
-                "std, its standard error (mm), invalid part"
-            )
-        own = {part: n for part, n in zip(PARTS, numbers, strict=True) if n is not None}
+        want(z in at, "table", z, f"one of the distances {', '.join(f'{d:g}' for d in at)}")
+        several = isinstance(numbers, (tuple, list, np.ndarray)) and len(numbers) == len(COLUMNS)
+        want(several, f"table at {z:g} m", numbers, five)
+        own = {part: n for part, n in zip(COLUMNS, numbers, strict=True) if n is not None}
         i = at.index(z)
         rows = (*rows[:i], replace(rows[i], **own), *rows[i + 1 :])
     return rows

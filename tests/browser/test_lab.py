@@ -17,7 +17,7 @@ import urllib.request
 import pytest
 
 import coursekit as ck
-from coursekit.lessons.checkpoints import Choice
+from coursekit.lessons.questions import Choice
 from tools import build_notebooks
 
 pytestmark = pytest.mark.browser
@@ -170,7 +170,7 @@ def plain(text):
 
 def checkpoints(name):
     lesson = name.partition("_")[2]
-    return [c for n, c in ck.lessons.checkpoints().items() if n.startswith(f"{lesson}.")]
+    return [c for n, c in ck.lessons.CHECKPOINTS.items() if n.startswith(f"{lesson}.")]
 
 
 def test_answers_are_collapsed_on_load(opened, name):

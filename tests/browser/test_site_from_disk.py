@@ -14,7 +14,8 @@ CHROMIUM = next(
 )
 QUIET = "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-sync"
 NO_NEWS = "--disable-background-networking --disable-component-update"
-PAGES = [*build_site.page_names().values()]
+PAGES = [*build_site.page_names().values(), "reference/coursekit.html"]
+PAGES.append("reference/coursekit/cameras.html")
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,11 @@
-"""Blank, right and wrong answers to every exercise of the notebooks get the verdict they should."""
+"""Blank, right and wrong answers to every exercise of the notebooks get the verdict they should.
 
-import copy
+And a notebook runs for somebody who leaves out every section marked deeper or studio.
+COURSEKIT_NIGHTLY=1 runs the whole notebooks with all answers as well.
+"""
+
+import ast
+import os
 
 import nbformat
 import numpy as np
@@ -11,7 +16,9 @@ import coursekit as ck
 from tools import build_notebooks
 
 PATHS = build_notebooks.find([])
-EXERCISES = ck.lessons.exercises()
+NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
+MARKS = ("deeper", "studio")
+EXERCISES = ck.lessons.EXERCISES
 
 
 def parts_of(path):
@@ -76,9 +83,22 @@ def test_every_mistake_that_a_check_names_has_a_wrong_answer(name):
     assert {mistake.name for mistake in EXERCISES[name].mistakes} <= named
 
 
+@pytest.mark.parametrize("whole", [False, True] if NIGHTLY else [False])
 @pytest.mark.parametrize("path", PATHS, ids=lambda path: path.stem)
-def test_a_notebook_with_all_answers_runs_and_finds_them_right(path, tmp_path):
-    notebook = solved(nbformat.read(path, as_version=4))
+def test_a_notebook_with_all_answers_runs_and_finds_them_right(path, whole, tmp_path):
+    """The core alone, as for somebody who skips the rest; then the exercises of the rest."""
+    notebook = nbformat.read(path, as_version=4)
+    cells = {build_notebooks.role(cell): cell for cell in notebook.cells}
+    for (exercise, part), cell in cells.items():
+        if part == "stub":
+            cell.source = injected({"answer": cells[exercise, "answer"].source}, exercise)
+    if not whole:
+        names = {exercise for exercise, _ in cells if exercise}
+        core, rest = split(notebook.cells)
+        assert rest, "no section is marked deeper or studio"
+        done = nbformat.v4.new_code_cell(f"assert ck.results.load({path.stem!r}).quantities")
+        left = [c for c in rest if build_notebooks.role(c)[0] or names & names_used(c)]
+        notebook.cells = [*core, done, *left]
     environment = build_notebooks.kernel_environment(tmp_path)
     build_notebooks.execute(notebook, path.stem, path.parent, environment)
     said = {
@@ -87,15 +107,31 @@ def test_a_notebook_with_all_answers_runs_and_finds_them_right(path, tmp_path):
         for exercise, part in [build_notebooks.role(cell)]
         if part == "check"
     }
-    assert {name: text.partition(".")[0] for name, text in said.items()} == {
-        name: f"{name}: right" for name in said
-    }
+    lesson = path.stem.partition("_")[2]
+    assert {f"{lesson}.{name}" for name in said} == {n for n in SOURCES if n.startswith(lesson)}
+    assert {text.partition(".")[0] for text in said.values()} == {f"{n}: right" for n in said}
 
 
-def solved(notebook):
-    notebook = copy.deepcopy(notebook)
-    cells = {build_notebooks.role(cell): cell for cell in notebook.cells}
-    for (exercise, part), cell in cells.items():
-        if part == "stub":
-            cell.source = injected({"answer": cells[exercise, "answer"].source}, exercise)
-    return notebook
+def split(cells):
+    """The cells of the core, and those of the sections whose headings begin with a mark."""
+    core, rest = [], []
+    left_out = None  # the level of the heading that began the gap
+    for cell in cells:
+        level, title = heading(cell)
+        if level and (left_out is None or level <= left_out):
+            left_out = level if title.lower().startswith(MARKS) else None
+        (core if left_out is None else rest).append(cell)
+    return core, rest
+
+
+def heading(cell):
+    """Level and text of the heading that a cell begins with; 0 if it begins with none."""
+    marks, _, title = cell.source.partition("\n")[0].partition(" ")
+    is_one = cell.cell_type == "markdown" and marks and set(marks) == {"#"}
+    return (len(marks), title) if is_one else (0, "")
+
+
+def names_used(cell):
+    if cell.cell_type != "code":
+        return set()
+    return {node.id for node in ast.walk(ast.parse(cell.source)) if isinstance(node, ast.Name)}

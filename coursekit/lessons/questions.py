@@ -1,8 +1,8 @@
 """Questions that the student answers before the notebook shows the answer.
 
-The question and its options stand in the notebook's Markdown, where they can be read without a
-kernel; a test keeps both texts equal. An answer is committed by clicking, or by a plain call:
-`ck.checkpoint("pinhole.zoom").answer("B")`.
+All texts come from the lesson's TOML file. The question and its options stand in the notebook's
+Markdown as well, where they can be read without a kernel; a test keeps both equal. An answer is
+committed by clicking, or by a plain call: `ck.checkpoint("pinhole.zoom").answer("B")`.
 """
 
 from __future__ import annotations
@@ -10,11 +10,17 @@ from __future__ import annotations
 import html
 import math
 import re
+import tomllib
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from coursekit.lessons import progress
-from coursekit.lessons.verdict import Verdict
+from coursekit.lessons.progress import Verdict
+
+EXAMPLES = "0.37 or 150"  # of numbers, and no checkpoint's answer
+LENGTHS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+LETTERS = "ABCDEFGH"
 
 
 @dataclass(frozen=True)
@@ -35,6 +41,14 @@ class Classic:
 
 
 @dataclass(frozen=True)
+class Objective:
+    """What a student can do after a lesson, and the checkpoints and exercises that show it."""
+
+    text: str
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class Checkpoint:
     """A question; `answer` commits one answer and says why it is right or wrong."""
 
@@ -43,8 +57,7 @@ class Checkpoint:
 
     def answer(self, given: Any) -> Verdict:
         """The verdict on an answer; the first one given is what `progress` keeps as first try."""
-        verdict = self.judge(given)
-        return verdict if verdict.kind == "not attempted" else progress.noted(verdict, str(given))
+        return progress.noted(self.judge(given), str(given))
 
     def judge(self, given: Any) -> Verdict:
         """The verdict on an answer, without noting it."""
@@ -67,7 +80,7 @@ class Checkpoint:
         raise NotImplementedError
 
     def _repr_mimebundle_(self, **kwargs: Any) -> dict[str, Any]:
-        widget: dict[str, Any] = _panel(self)._repr_mimebundle_(**kwargs)
+        widget: dict[str, Any] = panel(self)._repr_mimebundle_(**kwargs)
         return widget | {"text/plain": repr(self), "text/html": self._without_kernel()}
 
     def _without_kernel(self) -> str:
@@ -81,13 +94,21 @@ class Checkpoint:
 
 @dataclass(frozen=True, repr=False)
 class Choice(Checkpoint):
-    """A question with options A, B, C, ..., exactly one of them right."""
+    """A question with options A, B, C, ..., exactly one of them right.
+
+    >>> near = Option("nearer", "The farther one is smaller.", right=True)
+    >>> choice = Choice("a.b", "Which is larger?", (near, Option("farther", "It looks smaller.")))
+    >>> choice.judge("B")
+    B, farther: not this one.
+    It looks smaller.
+    Think again, and choose another.
+    """
 
     options: tuple[Option, ...]
 
     def lettered(self) -> dict[str, Option]:
         """The options by letter."""
-        return {chr(ord("A") + i): option for i, option in enumerate(self.options)}
+        return dict(zip(LETTERS, self.options, strict=False))
 
     def judge(self, given: Any) -> Verdict:
         """The verdict on a letter; a right one also says why each other option is wrong."""
@@ -123,14 +144,18 @@ class Choice(Checkpoint):
 
 @dataclass(frozen=True, repr=False)
 class Number(Checkpoint):
-    """A question whose answer is a number; classic wrong numbers are recognised."""
+    """A question whose answer is a number; classic wrong numbers are recognised.
+
+    value, and those of the classics: in `unit`. why: said with the right answer. hint: said with a
+    wrong one that is no classic. tolerance: relative, of the right one and of each classic.
+    """
 
     value: float
     unit: str
     why: str
-    classics: tuple[Classic, ...]
     hint: str
-    tolerance: float = 0.02  # relative
+    classics: tuple[Classic, ...]
+    tolerance: float = 0.02
 
     def judge(self, given: Any) -> Verdict:
         """The verdict on a number, or on text such as "2.4" or "2,4 mm"."""
@@ -178,10 +203,6 @@ class Number(Checkpoint):
         return ipywidgets.Text(placeholder=f"a number ({self.unit})")
 
 
-EXAMPLES = "0.37 or 150"  # of numbers, and no checkpoint's answer
-LENGTHS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
-
-
 def _readings(given: Any, unit: str) -> list[float]:
     """The number in the student's answer, in `unit`; none for what is no number.
 
@@ -204,7 +225,7 @@ def _readings(given: Any, unit: str) -> list[float]:
     return [number for number in numbers if math.isfinite(number) and factor]
 
 
-def _panel(checkpoint: Checkpoint) -> Any:
+def panel(checkpoint: Checkpoint) -> Any:
     """The widget: input, a button that commits, and the verdict below."""
     import ipywidgets
 
@@ -229,3 +250,38 @@ def _earlier(name: str) -> str:
         return ""
     last = attempts[-1]
     return f"<em>You have answered this one before ({html.escape(last['kind'])}).</em>"
+
+
+def load(lesson: str) -> tuple[tuple[Checkpoint, ...], tuple[Objective, ...]]:
+    """The checkpoints and the objectives of a lesson, in the order of its TOML file.
+
+    A choice has its options under A, B, C, ..., each with why it is right or wrong, and the right
+    letter; a number has slips, each a wrong number with what leads to it. Names in the file are
+    without the lesson's.
+    """
+    text = Path(__file__).with_name(f"{lesson}.toml").read_text(encoding="utf-8")
+    content = tomllib.loads(text)
+
+    def checkpoint(name: str, asked: dict[str, Any]) -> Checkpoint:
+        question = _single_spaced(asked["question"])
+        if "right" in asked:
+            texts = {k: map(_single_spaced, asked[k]) for k in LETTERS if k in asked}
+            options = (Option(next(t), next(t), k == asked["right"]) for k, t in texts.items())
+            return Choice(name, question, tuple(options))
+        slips = tuple(Classic(value, _single_spaced(why)) for value, why in asked["slips"])
+        why, hint = _single_spaced(asked["why"]), _single_spaced(asked["hint"])
+        return Number(name, question, asked["value"], asked["unit"], why, hint, slips)
+
+    return (
+        tuple(
+            checkpoint(f"{lesson}.{key}", asked) for key, asked in content["checkpoints"].items()
+        ),
+        tuple(
+            Objective(_single_spaced(o["text"]), tuple(f"{lesson}.{n}" for n in o["shown_by"]))
+            for o in content["objectives"]
+        ),
+    )
+
+
+def _single_spaced(text: str) -> str:
+    return " ".join(text.split())
