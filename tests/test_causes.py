@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import doctest
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,12 +11,6 @@ from scipy.stats import f as f_distribution
 
 from coursekit import causes
 from coursekit.causes import Hypothesis, Projection, likelihood_ratios, search
-
-
-def test_the_worked_example() -> None:
-    result = doctest.testmod(causes)
-    assert result.failed == 0
-    assert result.attempted > 5
 
 
 def test_the_f_test_and_the_likelihood_ratio_are_the_textbooks() -> None:

@@ -19,6 +19,7 @@ ROOMS = (
     "results",
     "stereo",
     "boards",
+    "causes",
     "intrinsics",
     "arm",
     "hand_eye",
