@@ -445,7 +445,7 @@ class DiagnosisTexts:
             findings[key] = {"name": name, **tables["shared"].get(name, {}), **entry}
         return cls(findings, **tables[room])
 
-    def finding(self, key: str, p_value: float | None = None, **figures: object) -> Finding:
+    def finding(self, key: str, p_value: float | None = None, /, **figures: Any) -> Finding:
         """A finding with its figures."""
         entry = self.findings[key]
         says, evidence, remedy = (

@@ -78,7 +78,7 @@ class Means:
     def matters(self, test) -> bool:
         return abs(test.coefficients[0]) > self.least
 
-    def accept(self, test: Tested):
+    def accept(self, test):
         kept = replace(self, taken=(*self.taken, test.at))
         return None if test.at in self.stubborn else kept
 

@@ -165,7 +165,8 @@ def test_two_inversions_that_cancel_are_named_by_what_they_imply() -> None:
     assert truth.mount == "eye_in_hand"
 
 
-@pytest.mark.parametrize("order", ["xyz", "XYZ", "zyx"])
+# Angles about fixed axes in the order zyx are those about the body's own in the order XYZ.
+@pytest.mark.parametrize("order", ["xyz", "XYZ", "zyx"] if NIGHTLY else ["xyz", "zyx"])
 @pytest.mark.parametrize("way", ["degrees taken as radians", "radians taken as degrees"])
 def test_euler_angles_in_the_wrong_unit(order: str, way: str) -> None:
     given, _ = session(FIRST_SEED + 1, M())

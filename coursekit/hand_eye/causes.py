@@ -93,8 +93,6 @@ class MendedPairs:
 
     def tested(self, hypotheses: Sequence[Hypothesis]) -> list[Tested]:
         """Each hypothesis with its most likely size of the arm's errors."""
-        if not hypotheses:
-            return []
         residuals = self.fit.twists.ravel()
         along = [h.columns for h in self._suspects if (h.cause, h.at) in self.smooth]
         columns = np.hstack([self.fit.columns.reshape(len(residuals), -1), *along])
@@ -109,8 +107,7 @@ class MendedPairs:
             return bool(abs(test.coefficients[0]) > normal)
         if test.cause == OUTLIER and self.odd >= (n + self.odd) // MOST_OUTLIERS:
             return False
-        known = self.fit.pairs.image.any() and self.arms.q is not None
-        rough = 1.0 if known else ROUGH_DATA
+        rough = 1.0 if self.fit.pairs.image.any() and self.arms.q is not None else ROUGH_DATA
         usual = OVER_USUAL[test.cause] if self.arms.q is None else 0.0
         least_turn = max(rough * NORMAL_TURN_RAD[test.cause], usual * self.fit.turn_rad)
         least_shift = max(rough * normal, usual * self.fit.shift_m)
@@ -146,26 +143,22 @@ class MendedPairs:
 
     @cached_property
     def _suspects(self) -> list[Hypothesis]:
-        return list(self._all())
-
-    def _all(self) -> Iterator[Hypothesis]:
         """Every hypothesis, the smooth ones that were accepted too."""
         fit, pairs, n = self.fit, self.fit.pairs, len(self.fit.pairs)
         scale = np.zeros((n, 6))
         scale[:, 3:] = -pairs.T_camera_board[:, :3, 3]
-        yield Hypothesis(SCALE, scale.reshape(-1, 1))
+        found = [Hypothesis(SCALE, scale.reshape(-1, 1))]
         if self.arms.velocity is not None:
             moved = np.einsum("nij,nj->ni", self._by_arm, self.arms.velocity[pairs.row])
-            yield Hypothesis(LATE, -moved.reshape(-1, 1))
+            found.append(Hypothesis(LATE, -moved.reshape(-1, 1)))
         if self.arms.q is not None:
             turned_joint = (self._by_arm @ self._jacobian()).reshape(6 * n, 6)
             # The first joint turns the base and the last the gripper: so do X and Y.
             for joint in range(1, 5):
                 column = turned_joint[:, joint : joint + 1]
-                yield Hypothesis(ARM_ERROR, column, joint, tried=4)
+                found.append(Hypothesis(ARM_ERROR, column, joint, tried=4))
         rows = np.arange(6 * n).reshape(n, 6)
-        for view in range(n):
-            yield Hypothesis(OUTLIER, np.eye(6), view, rows[view], tried=n)
+        found += [Hypothesis(OUTLIER, np.eye(6), i, rows[i], tried=n) for i in range(n)]
         by_Y = fit.columns[:, :, 6:].reshape(n, 6, -1, 6).sum(axis=2)
         later = {}
         for at in range(1, n):
@@ -175,7 +168,8 @@ class MendedPairs:
                 later[at] = after
         for at, after in later.items():
             columns = by_Y[after].reshape(-1, 6)
-            yield Hypothesis(SLIP, columns, at, rows[after].ravel(), tried=len(later))
+            found.append(Hypothesis(SLIP, columns, at, rows[after].ravel(), tried=len(later)))
+        return found
 
     def covariances(self) -> Iterator[Floats]:
         """Of all residuals, (6 n, 6 n), for each factor of the arm's errors."""

@@ -78,12 +78,8 @@ class _Case:
     found: list[Finding] = field(default_factory=list)
     hopeless: bool = False
 
-    def add(
-        self, key: str, given: Fit | None = None, mended: Fit | None = None, **figures: Any
-    ) -> None:
-        """A finding; given, mended: the fits between which arm and camera came closer."""
-        if given is not None and mended is not None:
-            figures |= _change(given, mended)
+    def add(self, key: str, **figures: Any) -> None:
+        """A finding."""
         self.found.append(TEXTS.finding(key, **figures))
 
     def findings(self, *unseen: str) -> Findings:
@@ -109,8 +105,8 @@ class _Case:
             evidence.append(f"typically {what} {far:.4g} m away")
         if sides:
             whose, text = " and ".join(sides), "; ".join(evidence)
-            words = {"whose": whose, "Whose": _first_upper(whose), "evidence": text}
-            self.add("millimetres", given, self.pairs.fit, **words)
+            words = {"whose": whose, "Whose": whose.capitalize(), "evidence": text}
+            self.add("millimetres", **words, **_change(given, self.pairs.fit))
 
     def joints_in_degrees(self) -> None:
         """Degrees in q, by size alone; and the arm poses that were computed from them."""
@@ -125,7 +121,7 @@ class _Case:
             mended = self.pairs.fit
         most = f"no joint turns by more than {2 * np.pi:.1f}"
         evidence = f"joint angles up to {largest:.0f}, where {most}"
-        self.add("degrees", given, mended, evidence=evidence, how="")
+        self.add("degrees", evidence=evidence, how="", **_change(given, mended))
 
     # --- poses ---
 
@@ -157,7 +153,7 @@ class _Case:
         if better:
             self.pairs = better[0].fit.pairs
         if better and better[0].name.startswith("off_by_one"):
-            self.add("off_by_one", given, better[0].fit, reading=better[0].says)
+            self.add("off_by_one", reading=better[0].says, **_change(given, better[0].fit))
         elif better:
             options = misread.candidates(better[0].fit, self.session, misread.INVERTED)
             if self._off_joints(self.session.T_base_gripper, self.q) < AS_COMPUTED_M:
@@ -167,7 +163,7 @@ class _Case:
                 arm, mount = given.pairs.T_base_gripper, misread.other_mount(given.pairs.mount)
                 self.pairs = replace(self.pairs, T_base_gripper=arm, mount=mount)
             words = {"candidates": _listed(options), "choice": _choice(options)}
-            self.add("inconsistent_convention", given, better[0].fit, **words)
+            self.add("inconsistent_convention", **words, **_change(given, better[0].fit))
         elif given.turn_rad > POOR_RAD:
             self._rotations(given)
         elif given.shift_m < POOR_M:
@@ -194,8 +190,8 @@ class _Case:
             evidence = f"the {side}'s positions agree with the other side (within "
             evidence += f"{1e3 * places.gap_m:.1f} mm), its rotations do not"
             words = {"evidence": evidence, "reading": reading.says, "side": side}
-            key = "degrees" if reading.name == "degrees" else "other_rotations"
-            self.add(key, fit, reading.fit, how=f" (suspected: {reading.says})", **words)
+            words |= _change(fit, reading.fit) | {"how": f" (suspected: {reading.says})"}
+            self.add("degrees" if reading.name == "degrees" else "other_rotations", **words)
             if side == "arm":
                 self.pairs = reading.fit.pairs
             else:
@@ -282,11 +278,7 @@ def _turns(T: Floats) -> tuple[Floats, Floats, float]:
 def _change(given: Fit, mended: Fit) -> dict[str, str]:
     """The typical disagreement of arm and camera before and after, with a small letter and not."""
     text = f"arm and camera disagree by {given.says()} as given, by {mended.says()} as suspected"
-    return {"change": text, "Change": _first_upper(text)}
-
-
-def _first_upper(text: str) -> str:
-    return text[0].upper() + text[1:]
+    return {"change": text, "Change": text.capitalize()}
 
 
 def _listed(options: list[misread.Candidate]) -> str:
@@ -309,13 +301,14 @@ def _choice(options: list[misread.Candidate]) -> str:
 def _from_residuals(search: CauseSearch[MendedPairs], session: HandEyeSession) -> list[Finding]:
     """The accepted causes as findings, outliers together in one."""
     found, odd = [], search.of(causes.OUTLIER)
+    of_odd = [_figures(step, search.model, session) for step in odd]
+    names = ["{name} ({shift:.0f} mm, {turn:.1f} deg)".format(**figures) for figures in of_odd]
     for step in search.accepted:
         if step in odd[1:]:
             continue
         figures = _figures(step, search.model, session) | _change(step.before.fit, step.after.fit)
         if odd:
-            names = ", ".join(_odd_pose(one, session) for one in odd)
-            figures |= {"names": names, "left": odd[-1].after.fit.says()}
+            figures |= {"names": ", ".join(names), "left": odd[-1].after.fit.says()}
         found.append(TEXTS.finding(step.test.cause, step.test.p_value, **figures))
     return found
 
@@ -338,14 +331,5 @@ def _figures(
         size = np.degrees(model.offsets[test.at])
         return {"joint": test.at, "size": size, "half": np.degrees(half)}
     turn, shift = causes.turn_and_shift(test)
-    return {"name": _name(step, session), "turn": np.degrees(turn), "shift": 1e3 * shift}
-
-
-def _name(step: Accepted[MendedPairs], session: HandEyeSession) -> str:
-    """The view of an odd pose, or the first after a slip."""
-    return session.names[step.before.fit.pairs.view[step.test.at]]
-
-
-def _odd_pose(step: Accepted[MendedPairs], session: HandEyeSession) -> str:
-    turn, shift = causes.turn_and_shift(step.test)
-    return f"{_name(step, session)} ({1e3 * shift:.0f} mm, {np.degrees(turn):.1f} deg)"
+    name = session.names[step.before.fit.pairs.view[test.at]]  # the odd one, or the first after
+    return {"name": name, "turn": np.degrees(turn), "shift": 1e3 * shift}

@@ -184,18 +184,14 @@ def undo_degrees(given: Fit, expected: Floats) -> Reading | None:
             continue
         fit = with_rotations(given.pairs, R).fit
         # `expected` leans on positions alone; with X and Y a pose's neighbours are told apart
-        R = _nearest(given.pairs.T_base_gripper[:, :3, :3], _arm_rotations(fit), kind)
+        M = fit.X @ fit.pairs.T_camera_board @ invert_transform(fit.Y[0])
+        arm = M if fit.pairs.mount == "eye_to_hand" else invert_transform(M)
+        R = _nearest(given.pairs.T_base_gripper[:, :3, :3], arm[:, :3, :3], kind)
         fit = with_rotations(given.pairs, R).fit
         if fit.better_than(given) > CLEARLY_BETTER:
             what = kind if kind not in EULER else f"Euler angles ({kind})"
             return Reading("degrees", f"the {what} read as degrees", fit)
     return None
-
-
-def _arm_rotations(fit: Fit) -> Floats:
-    """The arm's rotations (n, 3, 3) that the camera, X and Y imply."""
-    M = fit.X @ fit.pairs.T_camera_board @ invert_transform(fit.Y[0])
-    return (M if fit.pairs.mount == "eye_to_hand" else invert_transform(M))[:, :3, :3]
 
 
 def _decoded(given: Floats, expected: Floats, kind: str) -> Rotation | None:
@@ -245,17 +241,15 @@ def _angles(R: Floats, kind: str) -> Floats:
     return turn.as_rotvec() if kind == ROTATION_VECTORS else turn.as_euler(kind)
 
 
-def _as_radians(R: Floats, kind: str) -> Rotation:
-    """What becomes of rotations (m, 3, 3) whose angles in degrees are taken as radians."""
-    angles = PER_RADIAN * _angles(R, kind)
-    if kind == ROTATION_VECTORS:
-        return Rotation.from_rotvec(angles)
-    return Rotation.from_euler(kind, angles)
-
-
 def _misses(given: Floats, R: Floats, kind: str) -> Floats:
-    """Angles (m,), rad, between given (3, 3) or (m, 3, 3) and what R (m, 3, 3) would become."""
-    return np.asarray((_as_radians(R, kind).inv() * Rotation.from_matrix(given)).magnitude())
+    """Angles (m,), rad, between given rotations and what R (m, 3, 3) in degrees would become.
+
+    given (3, 3) or (m, 3, 3): what was made of angles in degrees that were taken as radians.
+    """
+    angles = PER_RADIAN * _angles(R, kind)
+    vectors = kind == ROTATION_VECTORS
+    became = Rotation.from_rotvec(angles) if vectors else Rotation.from_euler(kind, angles)
+    return np.asarray((became.inv() * Rotation.from_matrix(given)).magnitude())
 
 
 def _nearest(given: Floats, near: Floats, kind: str) -> Rotation:

@@ -129,23 +129,13 @@ class Calibration:
         view = np.repeat(np.arange(n), [len(d.ids) for d in detections])
         estimated = selection(result.names)
         left_out = int((~estimated[4:].any(axis=1)).sum())
+        corners = Corners(points[ids], pixels, view, ids)
+        names = tuple(d.name or f"view {i}" for i, d in enumerate(detections))
+        half_diagonal = float(np.linalg.norm(points - centre, axis=1).max())
         values = {BOW: np.zeros(3), LENS: np.zeros(5 + left_out)}
-        return cls(
-            camera=result.intrinsics,
-            estimated=estimated,
-            poses=result.T_camera_board,
-            corners=Corners(points[ids], pixels, view, ids),
-            names=tuple(d.name or f"view {i}" for i, d in enumerate(detections)),
-            centre=centre,
-            half_diagonal=float(np.linalg.norm(points - centre, axis=1).max()),
-            values=values | {cause: np.zeros((n, width)) for cause, width in OWN.items()},
-            sizes={},
-        )
-
-    @property
-    def causes(self) -> tuple[str, ...]:
-        """The causes that were added."""
-        return tuple(self.sizes)
+        values |= {cause: np.zeros((n, width)) for cause, width in OWN.items()}
+        camera, poses = result.intrinsics, result.T_camera_board
+        return cls(camera, estimated, poses, corners, names, centre, half_diagonal, values, {})
 
     @cached_property
     def views(self) -> NDArray[np.intp]:
@@ -153,21 +143,54 @@ class Calibration:
         return np.unique(self.corners.view)
 
     @cached_property
+    def index(self) -> NDArray[np.intp]:
+        """The place (N,) of each corner's view among `views`."""
+        return np.searchsorted(self.views, self.corners.view)
+
+    @cached_property
     def linear(self) -> Linear:
-        """Residuals and derivatives."""
-        return linearise(self)
+        """Residuals and derivatives at the corners."""
+        corners, camera, values = self.corners, self.camera, self.values
+        R, t = self.poses[corners.view, :3, :3], self.poses[corners.view, :3, 3]
+        shape = bow_shape(self, corners.points)
+        on_board = corners.points + (shape @ values[BOW])[:, None] * NORMAL
+        still = np.einsum("nij,nj->ni", R, on_board) + t
+        # The row at which a corner was seen is measured: nothing has to be solved for it.
+        time = (corners.pixels[:, 1] + 0.5) / camera.height - 0.5
+        points = still + time[:, None] * values[SHUTTER][corners.view]
+        pixels, by_camera, by_point = project_with_derivatives(points, camera)
+        left_out = by_camera[:, :, 4:][:, :, ~self.estimated[4:].any(axis=1)]
+        terms = lens_terms(points[:, :2] / points[:, 2:]) * np.array([[camera.fx], [camera.fy]])
+        terms = np.concatenate([terms, left_out], axis=2)
+        principal = np.array([camera.cx, camera.cy])
+        from_axis = pixels - principal + terms @ values[LENS]
+        scale = 1.0 + values[FOCUS][corners.view][:, :, None]
+        by_point = by_point * scale
+        by_camera = by_camera * scale
+        by_camera[:, [0, 1], [2, 3]] = 1.0
+        columns = {
+            BOW: np.einsum("nij,nj->ni", by_point, R[:, :, 2])[..., None] * shape[:, None, :],
+            FOCUS: from_axis[..., None],
+            SHUTTER: by_point * time[:, None, None],
+            LENS: terms * scale,
+        }
+        shared = [by_camera @ self.estimated, *(columns[c] for c in self.sizes if c not in OWN)]
+        own = [twist_columns(points, by_point), *(columns[c] for c in self.sizes if c in OWN)]
+        return Linear(
+            corners.pixels - principal - from_axis * scale[:, 0],
+            np.concatenate(shared, axis=2),
+            np.concatenate(own, axis=2),
+            columns,
+        )
 
     def projection(self, weights: Floats | None = None) -> Projection:
         """The residuals without what the model imitates; weights (N,), one a corner."""
         linear, view = self.linear, np.repeat(self.corners.view, 2)
         own = linear.own.reshape(len(view), -1)
-        rows = [np.flatnonzero(view == v) for v in self.views]
-        return Projection(
-            linear.residuals.ravel(),
-            linear.shared.reshape(len(view), -1),
-            [(mine, own[mine]) for mine in rows],
-            None if weights is None else np.repeat(weights, 2),
-        )
+        blocks = [(rows, own[rows]) for rows in (np.flatnonzero(view == v) for v in self.views)]
+        residuals, shared = linear.residuals.ravel(), linear.shared.reshape(len(view), -1)
+        by_row = None if weights is None else np.repeat(weights, 2)
+        return Projection(residuals, shared, blocks, by_row)
 
     @cached_property
     def plain(self) -> Projection:
@@ -179,7 +202,7 @@ class Calibration:
     def hypotheses(self) -> Iterator[Hypothesis]:
         """The physical causes that were not added, the worst view, and corners far out."""
         for cause in PHYSICAL:
-            if cause not in self.causes:
+            if cause not in self.sizes:
                 yield self.hypothesis(cause)
         rms = self._rms_by_view()
         if len(rms) >= 4 and len(self.names) - len(rms) < len(rms) // 4:
@@ -196,8 +219,7 @@ class Calibration:
         n, _, width = columns.shape
         if cause in OWN:
             by_view = np.zeros((n, 2, len(self.views), width))
-            at_view = np.searchsorted(self.views, self.corners.view)
-            by_view[np.arange(n), :, at_view] = columns
+            by_view[np.arange(n), :, self.index] = columns
             columns = by_view
         columns = columns.reshape(2 * n, -1)
         if cause == LENS:  # terms of different units: each as the px that it moves corners by
@@ -244,7 +266,7 @@ class Calibration:
 
     def _rms_by_view(self) -> Floats:
         squares = (self.plain.residuals.reshape(-1, 2) ** 2).mean(axis=1)
-        return np.array([np.sqrt(squares[self.corners.view == v].mean()) for v in self.views])
+        return np.sqrt(np.bincount(self.index, squares) / np.bincount(self.index))
 
     def _wrong_corners(self) -> NDArray[np.intp]:
         """Single corners too far out for the noise of the session and of their view."""
@@ -260,13 +282,10 @@ class Calibration:
         """1 / sigma of each corner (N,), from the residuals of its view, shrunk to the common."""
         squares = (explained.after.reshape(-1, 2) ** 2).sum(axis=1)
         dof = max(explained.dof - int(explained.visible.sum()), 1)
-        weights = np.empty(len(squares))
-        for view in self.views:
-            mine = self.corners.view == view
-            prior = SHRINK_DOF * squares.sum() / dof
-            variance = (squares[mine].sum() + prior) / (mine.mean() * dof + SHRINK_DOF)
-            weights[mine] = max(variance, 1e-300) ** -0.5
-        return weights
+        common, own_dof = squares.sum() / dof, np.bincount(self.index) * dof / len(squares)
+        own = np.bincount(self.index, squares)
+        variance = (own + SHRINK_DOF * common) / (own_dof + SHRINK_DOF)
+        return np.maximum(variance, 1e-300)[self.index] ** -0.5
 
 
 def _free(cause: str, rows: NDArray[np.intp], at: int = 0, tried: int = 1) -> Hypothesis:
@@ -324,42 +343,6 @@ def lens_terms(xy: Floats) -> Floats:
     return terms
 
 
-def linearise(model: Calibration) -> Linear:
-    """Residuals and derivatives of a calibration at its corners."""
-    corners, camera, values = model.corners, model.camera, model.values
-    R, t = model.poses[corners.view, :3, :3], model.poses[corners.view, :3, 3]
-    shape = bow_shape(model, corners.points)
-    on_board = corners.points + (shape @ values[BOW])[:, None] * NORMAL
-    still = np.einsum("nij,nj->ni", R, on_board) + t
-    # The row at which a corner was seen is measured: nothing has to be solved for it.
-    time = (corners.pixels[:, 1] + 0.5) / camera.height - 0.5
-    points = still + time[:, None] * values[SHUTTER][corners.view]
-    pixels, by_camera, by_point = project_with_derivatives(points, camera)
-    left_out = by_camera[:, :, 4:][:, :, ~model.estimated[4:].any(axis=1)]
-    terms = lens_terms(points[:, :2] / points[:, 2:]) * np.array([[camera.fx], [camera.fy]])
-    terms = np.concatenate([terms, left_out], axis=2)
-    principal = np.array([camera.cx, camera.cy])
-    from_axis = pixels - principal + terms @ values[LENS]
-    scale = 1.0 + values[FOCUS][corners.view][:, :, None]
-    by_point = by_point * scale
-    by_camera = by_camera * scale
-    by_camera[:, [0, 1], [2, 3]] = 1.0
-    columns = {
-        BOW: np.einsum("nij,nj->ni", by_point, R[:, :, 2])[..., None] * shape[:, None, :],
-        FOCUS: from_axis[..., None],
-        SHUTTER: by_point * time[:, None, None],
-        LENS: terms * scale,
-    }
-    shared = [by_camera @ model.estimated, *(columns[c] for c in model.causes if c not in OWN)]
-    own = [twist_columns(points, by_point), *(columns[c] for c in model.causes if c in OWN)]
-    return Linear(
-        corners.pixels - principal - from_axis * scale[:, 0],
-        np.concatenate(shared, axis=2),
-        np.concatenate(own, axis=2),
-        columns,
-    )
-
-
 def refit(model: Calibration) -> Calibration:
     """Levenberg-Marquardt over the camera, the poses and the causes of the model.
 
@@ -391,7 +374,7 @@ def _prior(model: Calibration) -> tuple[Floats, Floats]:
 
     Coefficients are held towards 0 as by one corner coordinate of noise PRIOR_PX each.
     """
-    own = [cause for cause in model.causes if cause in OWN]
+    own = [cause for cause in model.sizes if cause in OWN]
     weights = [np.full(OWN[cause], PRIOR_PX / model.sizes[cause]) for cause in own]
     values = [np.zeros((len(model.views), 0)), *(model.values[cause][model.views] for cause in own)]
     weight = np.concatenate([np.zeros(0), *weights])
@@ -426,7 +409,7 @@ def _moved(model: Calibration, shared: Floats, own: Floats) -> Calibration | Non
     poses, values = model.poses.copy(), dict(model.values)
     poses[model.views] = moved(poses[model.views], own[:, :6])
     at_shared, at_own = p, 6
-    for cause in model.causes:
+    for cause in model.sizes:
         value = values[cause] = values[cause].copy()
         if cause in OWN:
             value[model.views] += own[:, at_own : at_own + OWN[cause]]

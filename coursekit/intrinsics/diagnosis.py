@@ -82,7 +82,12 @@ def diagnose(
     >>> diagnose(Detections([]), Board("charuco", (9, 6), 0.025)).names
     ('few_views',)
     """
-    depths = None if depth_m is None else _checked_depths(detections, depth_m)
+    depths: list[Floats] = []
+    if depth_m is not None:
+        wanted = f"{len(detections)} views, each with its Z"
+        want(len(depth_m) == len(detections), "depth_m", len(depth_m), wanted)
+        counts = [len(detection.ids) for detection in detections]
+        depths = [array(f"depth_m[{i}]", z, (counts[i],)) for i, z in enumerate(depth_m)]
     found, used = _images(detections, board)
     unseen = [] if depths else [TEXTS.not_tested["squares"]]
     if all(detections[i].blur is None for i in used):
@@ -118,19 +123,6 @@ def stored_power() -> dict[str, dict[str, Any]]:
     return measured
 
 
-def _checked_depths(detections: Sequence[Detection], depth_m: Sequence[ArrayLike]) -> list[Floats]:
-    want(
-        len(depth_m) == len(detections),
-        "depth_m",
-        len(depth_m),
-        f"{len(detections)} views, each with its Z",
-    )
-    return [
-        array(f"depth_m[{number}]", z, (len(detection.ids),))
-        for number, (z, detection) in enumerate(zip(depth_m, detections, strict=True))
-    ]
-
-
 # --- before a fit ---
 
 
@@ -147,7 +139,11 @@ def _images(detections: Sequence[Detection], board: Board) -> tuple[list[Finding
         listed = _listed(others)
         found.append(TEXTS.finding("mixed_sizes", width=width, height=height, others=listed))
     used = [i for i, d in enumerate(detections) if d.size == common and len(d.ids) >= MIN_CORNERS]
-    layout = _layout([detections[i] for i in used], board) or _seen_otherwise(skipped, used, board)
+    layout = _layout([detections[i] for i in used], board)
+    refused = [s.reason for s in skipped if "squares" in s.reason]
+    if not layout and len(refused) > len(used):  # the detector saw other squares in most images
+        figures = {"images": len(refused), "reason": refused[0], "board": board.text}
+        layout = TEXTS.finding("other_squares_seen", **figures)
     if layout:
         return [*found, layout], used
     if len(used) < FEW_VIEWS:
@@ -177,15 +173,6 @@ def _layout(detections: list[Detection], board: Board) -> Finding | None:
     if best != columns and misfits[best] < LAYOUT_MISFIT:
         evidence += f"; with {best} inner corners in a row they fit"
     return TEXTS.finding("wrong_board_size", evidence=evidence, board=board.text)
-
-
-def _seen_otherwise(skipped: Sequence[Skipped], used: list[int], board: Board) -> Finding | None:
-    """Whether the detector refused most images because it saw other squares in them."""
-    reasons = [s.reason for s in skipped if "squares" in s.reason]
-    if len(reasons) <= len(used):
-        return None
-    seen, first = len(reasons), reasons[0]
-    return TEXTS.finding("other_squares_seen", images=seen, reason=first, board=board.text)
 
 
 def _lattice_misfit(detections: list[Detection], columns: int) -> float:
@@ -313,9 +300,8 @@ def _blur(detections: Sequence[Detection]) -> Finding | None:
     if len(blurred) < MANY_BLURRED:
         return None
     names = _listed([detections[i].name or f"view {i}" for i in blurred])
-    least, most = lengths[blurred].min(), lengths[blurred].max()
-    figures: Figures = {"blurred": len(blurred), "least": least, "most": most, "names": names}
-    return TEXTS.finding("motion_blur", views=len(lengths), **figures)
+    figures = {"least": lengths[blurred].min(), "most": lengths[blurred].max(), "names": names}
+    return TEXTS.finding("motion_blur", blurred=len(blurred), views=len(lengths), **figures)
 
 
 def blur_lengths_px(detections: Sequence[Detection]) -> Floats:
