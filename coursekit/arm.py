@@ -3,7 +3,12 @@
 Everything takes angles (..., 6) in rad and returns arrays with the same leading shape. The chain is
 read from data/wxai.json, which says where it comes from.
 
+>>> arm = widowx()
+>>> arm.forward([0.0, 1.2, 1.0, 0.2, 0.0, 0.0])[:3, 3].round(3).tolist()  # m, in the base
+[0.429, 0.0, 0.36]
+
 What makes forward kinematics wrong: encoder offsets, gear play, links unlike the drawing.
+`SimulatedArm` has all of them hidden in it, and `fk_covariance` is what a fit may know of them.
 
 The sizes in `ArmErrors` are **assumed, not measured**: nobody has published them for this arm. Each
 is plausible for an arm of this class, and together they put the flange 2.6 mm and the fingertip
@@ -24,16 +29,16 @@ from __future__ import annotations
 
 import json
 import zlib
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache
-from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from coursekit.arrays import ArrayLike, Floats, Mask
-from coursekit.checks import transforms
-from coursekit.geometry import cross_matrix, invert_transform, make_transform
+from coursekit.checks import array, choice, number, transforms, want, whole
+from coursekit.geometry import cross_matrix, invert_transform, make_transform, pose_difference
 from coursekit.specifications import DATA
 
 Tool = Literal["gripper", "flange"]
@@ -64,9 +69,8 @@ class Arm:
 
     joints: their names. origins (6, 4, 4): each joint's frame in its parent's at angle zero, m.
     axes (6, 3): unit vectors in the joint's own frame. limits (6, 2): lower and upper, rad.
-    velocity_rad_s (6,): the largest. T_flange_gripper, T_gripper_camera (4, 4): the gripper in
-    the flange (`link_6`), and the camera's colour optical frame in the gripper. The table is the
-    plane z = 0 of the base.
+    T_flange_gripper, T_gripper_camera (4, 4), m: the gripper in the flange (`link_6`), and the
+    camera's colour optical frame in the gripper. The table is the plane z = 0 of the base.
     """
 
     name: str
@@ -74,10 +78,8 @@ class Arm:
     origins: Floats
     axes: Floats
     limits: Floats
-    velocity_rad_s: Floats
     T_flange_gripper: Floats
     T_gripper_camera: Floats
-    source: str
 
     def forward(self, q: ArrayLike, tool: Tool = "gripper") -> Floats:
         """T_base_gripper (..., 4, 4), or T_base_flange, at joint angles q (..., 6), rad.
@@ -89,7 +91,7 @@ class Arm:
 
     def link_frames(self, q: ArrayLike) -> Floats:
         """The frames of the base and of link_1 to link_6, in the base, (..., 7, 4, 4)."""
-        q = self._angles(q)
+        q = _angles(q)
         skew = cross_matrix(self.axes)
         sin, versine = np.sin(q)[..., None, None], (1 - np.cos(q))[..., None, None]
         turns = np.eye(3) + sin * skew + versine * (skew @ skew)  # Rodrigues
@@ -111,19 +113,20 @@ class Arm:
         return self._jacobian(frames, self._tool(frames, tool))
 
     def _jacobian(self, frames: Floats, T: Floats) -> Floats:
+        """`jacobian` of a tool at T (..., 4, 4) from the links' frames (..., 7, 4, 4)."""
         axes = (frames[..., 1:, :3, :3] @ self.axes[:, :, None])[..., 0]
         arms = T[..., None, :3, 3] - frames[..., 1:, :3, 3]
         return np.swapaxes(np.concatenate([axes, np.cross(axes, arms)], axis=-1), -1, -2)
 
     def _tool(self, frames: Floats, tool: Tool) -> Floats:
-        if tool not in get_args(Tool):
-            raise ValueError(f"tool: got {tool!r}, want 'gripper' or 'flange'")
+        """Where the tool is, (..., 4, 4), from the links' frames (..., 7, 4, 4)."""
+        choice("tool", tool, get_args(Tool))
         flange = frames[..., 6, :, :]
         return flange @ self.T_flange_gripper if tool == "gripper" else flange
 
     def check(self, q: ArrayLike) -> Floats:
         """q (..., 6) as an array, or a ValueError that names the joint outside its limits."""
-        q = self._angles(q)
+        q = _angles(q)
         outside = np.argwhere(~self._inside(q))
         if outside.size:
             *index, j = outside[0].tolist()
@@ -138,7 +141,7 @@ class Arm:
 
     def within_limits(self, q: ArrayLike) -> Mask:
         """(...): whether all joints at q (..., 6), rad, are inside their limits."""
-        return np.asarray(self._inside(self._angles(q)).all(axis=-1))
+        return np.asarray(self._inside(_angles(q)).all(axis=-1))
 
     def _inside(self, q: Floats) -> Mask:
         low, high = self.limits.T
@@ -166,11 +169,10 @@ class Arm:
 
     def random(self, rng: np.random.Generator, n: int, clearance_m: float = 0.02) -> Floats:
         """n joint configurations (n, 6), rad: uniform inside the limits, `is_free` of the rest."""
-        if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1:
-            raise ValueError(f"n: got {n!r}, want at least 1")
+        n = whole("n", n)
         found = np.empty((0, 6))
         for _ in range(100):
-            q = rng.uniform(self.limits[:, 0], self.limits[:, 1], (4 * int(n) + 16, 6))
+            q = rng.uniform(self.limits[:, 0], self.limits[:, 1], (4 * n + 16, 6))
             found = np.concatenate([found, q[self.is_free(q, clearance_m)]])
             if len(found) >= n:
                 return found[:n]
@@ -191,9 +193,14 @@ class Arm:
         shape = targets.shape[:-2]
         targets = targets.reshape(-1, 4, 4)
         q, reached = np.zeros((len(targets), 6)), np.zeros(len(targets), bool)
-        starts = [*np.array(IK_STARTS), *self._more_starts()] if elsewhere or start is None else []
+        starts: list[Floats] = []
+        if elsewhere or start is None:
+            low, high = self.limits.T
+            more = np.random.default_rng(0).uniform(low, high, (IK_MORE_STARTS, 6))
+            more *= [0.5, 1.0, 1.0, 1.0, 1.0, 1.0]  # joint_0 roughly towards the target
+            starts += [*np.array(IK_STARTS), *more]
         if start is not None:
-            starts.insert(0, np.broadcast_to(self._angles(start), (*shape, 6)).reshape(-1, 6))
+            starts.insert(0, np.broadcast_to(_angles(start), (*shape, 6)).reshape(-1, 6))
         towards = np.arctan2(targets[:, 1, 3], targets[:, 0, 3])
         for begin in starts:
             open_ = np.flatnonzero(~reached)
@@ -205,12 +212,8 @@ class Arm:
             q[open_], reached[open_] = self._descend(targets[open_], q0)
         return q.reshape(*shape, 6), reached.reshape(shape)
 
-    def _more_starts(self) -> Floats:
-        low, high = self.limits.T
-        starts = np.random.default_rng(0).uniform(low, high, (IK_MORE_STARTS, 6))
-        return starts * [0.5, 1.0, 1.0, 1.0, 1.0, 1.0]  # joint_0 roughly towards the target
-
     def _descend(self, targets: Floats, q: Floats) -> tuple[Floats, Mask]:
+        """Gauss-Newton from angles q (n, 6) to poses (n, 4, 4): the angles, and which arrived."""
         q = self._into_limits(q)
         reached, open_ = np.zeros(len(q), bool), np.arange(len(q))
         for _ in range(IK_STEPS):
@@ -227,34 +230,15 @@ class Arm:
         return q, reached
 
     def _into_limits(self, q: Floats) -> Floats:
+        """Angles (n, 6), rad, brought back inside their limits."""
         low, high = self.limits.T
         wrapped = low + (q - low) % (2 * np.pi)  # a joint that can turn all the way goes round
         return np.clip(np.where(high - low > 2 * np.pi - 1e-9, wrapped, q), low, high)
 
-    def _angles(self, q: ArrayLike) -> Floats:
-        try:
-            angles = np.asarray(q, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise ValueError("q: want an array of joint angles in rad") from None
-        if angles.ndim == 0 or angles.shape[-1] != 6:
-            raise ValueError(f"q: got shape {angles.shape}, want (..., 6) angles in rad")
-        if not np.isfinite(angles).all():
-            index = np.argwhere(~np.isfinite(angles))[0].tolist()
-            raise ValueError(f"q: the angle at index {index} is not finite")
-        return angles
 
-
-def pose_difference(T: ArrayLike, to: ArrayLike) -> Floats:
-    """What brings T to another pose, (..., 6): (omega, v) as in `Arm.jacobian`.
-
-    T, to (..., 4, 4): R_to = exp(omega) R and t_to = t + v; rad and m, in the parent's axes.
-    """
-    from scipy.spatial.transform import Rotation
-
-    T, to = np.asarray(T, dtype=np.float64), np.asarray(to, dtype=np.float64)
-    turn = to[..., :3, :3] @ np.swapaxes(T[..., :3, :3], -1, -2)
-    omega = Rotation.from_matrix(turn.reshape(-1, 3, 3)).as_rotvec().reshape(*turn.shape[:-2], 3)
-    return np.concatenate([omega, to[..., :3, 3] - T[..., :3, 3]], axis=-1)
+def _angles(q: ArrayLike) -> Floats:
+    """q as angles (..., 6) in rad, or a ValueError."""
+    return array("q", q, (6,), leading=True, finite=True)
 
 
 def _damped_step(J: Floats, miss: Floats) -> Floats:
@@ -270,32 +254,24 @@ def _damped_step(J: Floats, miss: Floats) -> Floats:
 @cache
 def widowx() -> Arm:
     """The WidowX AI follower arm with its wrist camera, from data/wxai.json; arrays read-only."""
-    return _load(DATA / "wxai.json")
-
-
-def _load(path: Path) -> Arm:
-    try:
-        table = json.loads(path.read_text("utf-8"))
-        joints = table["joints"]
-        T_flange_gripper = _chain(table["gripper"])
-        arm = Arm(
-            table["name"],
-            tuple(joint["name"] for joint in joints),
-            np.stack([_origin(joint) for joint in joints]),
-            np.array([joint["axis"] for joint in joints], dtype=np.float64),
-            np.array([joint["limit_rad"] for joint in joints], dtype=np.float64),
-            np.array([joint["velocity_rad_s"] for joint in joints], dtype=np.float64),
-            T_flange_gripper,
-            invert_transform(T_flange_gripper) @ _chain(table["camera"]),
-            table["source"],
-        )
-    except FileNotFoundError:
+    path = DATA / "wxai.json"
+    if not path.is_file():
         raise ValueError(
             f"{path} is missing: coursekit reads it from the course's folder, "
             "so install the course with `python3 course.py lab`"
-        ) from None
-    except KeyError as error:
-        raise ValueError(f"{path}: {error} is missing") from error
+        )
+    table = json.loads(path.read_text("utf-8"))
+    joints = table["joints"]
+    T_flange_gripper = _chain(table["gripper"])
+    arm = Arm(
+        table["name"],
+        tuple(joint["name"] for joint in joints),
+        np.stack([_chain([joint]) for joint in joints]),
+        np.array([joint["axis"] for joint in joints], dtype=np.float64),
+        np.array([joint["limit_rad"] for joint in joints], dtype=np.float64),
+        T_flange_gripper,
+        invert_transform(T_flange_gripper) @ _chain(table["camera"]),
+    )
     for value in vars(arm).values():
         if isinstance(value, np.ndarray):
             value.flags.writeable = False
@@ -303,17 +279,11 @@ def _load(path: Path) -> Arm:
 
 
 def _chain(joints: list[dict[str, Any]]) -> Floats:
+    """Joints' origins, as URDF writes them, in a row: each turned about fixed axes x, y, z."""
     T = np.eye(4)
     for joint in joints:
-        T = T @ _origin(joint)
+        T = T @ make_transform(Rotation.from_euler("xyz", joint["rpy_rad"]), joint["xyz_m"])
     return T
-
-
-def _origin(joint: dict[str, Any]) -> Floats:
-    """A joint's origin, as URDF writes it: turned about fixed axes x, y, z in that order."""
-    from scipy.spatial.transform import Rotation
-
-    return make_transform(Rotation.from_euler("xyz", joint["rpy_rad"]), joint["xyz_m"])
 
 
 def _distance(points: Floats, a: Floats, b: Floats) -> Floats:
@@ -324,10 +294,9 @@ def _distance(points: Floats, a: Floats, b: Floats) -> Floats:
     return np.asarray(np.linalg.norm(from_a - share[..., None] * along, axis=-1))
 
 
-STOP_RAD = 5e-4  # std by which the controller misses the commanded angle; the encoder sees it
-STILL_RAD = 1e-6  # a joint that is sent no farther stays where it is
-LOAD_ARM_M = 0.03  # gravity decides on which flank a joint rests from this lever arm on
-HOME = (0.0, 1.2, 1.0, 0.2, 0.0, 0.0)  # rad; where the simulated arm starts
+# --- what a fit may know about the arm's errors ---
+
+GRAVITY_ARM_M = 0.03  # gravity decides on which flank a joint rests from this lever arm on
 
 
 @dataclass(frozen=True)
@@ -344,106 +313,8 @@ class ArmErrors:
     link_rad: float = 1e-3
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not (np.isfinite(value) and value >= 0):
-                raise ValueError(f"{field.name}: got {value!r}, want a finite number, 0 or more")
-
-
-@dataclass(frozen=True, eq=False)
-class ArmTruth:
-    """What a simulated arm really is, and does not report.
-
-    offset_rad (6,): true minus read angle of each joint, without play. play_rad (6,): half of each
-    joint's play, not negative. link (7, 6): of the six joint origins and the fingertip, rotation
-    (rad) and displacement (m) in the parent's axes. arm: the chain with those links.
-    """
-
-    offset_rad: Floats
-    play_rad: Floats
-    link: Floats
-    arm: Arm
-
-    def __repr__(self) -> str:
-        def listed(values: Floats, digits: int) -> str:
-            return ", ".join(f"{value:+.{digits}f}" for value in values)
-
-        length = 1e3 * np.linalg.norm(self.link[:, 3:], axis=1)
-        angle = np.degrees(np.linalg.norm(self.link[:, :3], axis=1))
-        return "\n".join(
-            [
-                f"joint offsets    {listed(np.degrees(self.offset_rad), 3)} deg",
-                f"half gear play   {', '.join(f'{p:.3f}' for p in np.degrees(self.play_rad))} deg",
-                f"link errors      {', '.join(f'{d:.2f}' for d in length)} mm",
-                f"and              {', '.join(f'{a:.2f}' for a in angle)} deg",
-            ]
-        )
-
-
-class SimulatedArm:
-    """An arm that is not quite what its drawing says: `move`, then ask where the gripper really is.
-
-    seed names the unit: its offsets, play and links, which stay, and the scatter of its moves.
-    nominal: the arm as drawn, whose `forward` at the reported angles is all that a user has.
-    """
-
-    def __init__(
-        self, seed: int, errors: ArmErrors | None = None, nominal: Arm | None = None
-    ) -> None:
-        self.nominal = nominal or widowx()
-        self.errors = errors or ArmErrors()
-        self._truth = _hidden(seed, self.errors, self.nominal)
-        self._rng = np.random.default_rng([seed, zlib.crc32(b"moves")])
-        self._at = np.array(HOME)
-        self._last = self._rng.choice([-1.0, 1.0], 6)  # direction of each joint's last move
-        self._joints = self._true_joints(self._at[None], self._last[None])[0]
-
-    def move(self, q: ArrayLike) -> Floats:
-        """Go to joint angles (6,), or through (n, 6) in turn; what the encoders then read, rad.
-
-        Raises ValueError for angles outside the limits.
-        """
-        commanded = self.nominal.check(q)
-        if commanded.ndim > 2:
-            raise ValueError(f"q: got shape {commanded.shape}, want (6,) or (n, 6)")
-        path = commanded.reshape(-1, 6)
-        directions = _directions(np.concatenate([self._at[None], path]), self._last)
-        missed = STOP_RAD * self._rng.standard_normal(path.shape)
-        read = np.clip(path + missed, self.nominal.limits[:, 0], self.nominal.limits[:, 1])
-        self._joints = self._true_joints(read, directions).reshape(commanded.shape)
-        if len(path):
-            self._at, self._last = path[-1], directions[-1]
-        return read.reshape(commanded.shape)
-
-    def true_pose(self, tool: Tool = "gripper") -> Floats:
-        """The tool's true pose in the base after the last `move`, (4, 4), or (n, 4, 4) after n."""
-        return self._truth.arm.forward(self._joints, tool)
-
-    def reveal(self) -> ArmTruth:
-        """The unit's hidden errors."""
-        return self._truth
-
-    def _true_joints(self, read: Floats, directions: Floats) -> Floats:
-        loaded = load_side(self.nominal, read)
-        side = np.where(loaded != 0, loaded, -directions)
-        return read + self._truth.offset_rad + side * self._truth.play_rad
-
-
-def load_side(arm: Arm, q: ArrayLike) -> Floats:
-    """Which way gravity turns each joint at q (..., 6): -1 or 1, and 0 where it hardly does.
-
-    Everything that hangs on a joint is taken as one weight half way between flange and fingertip;
-    0 where its lever arm about the joint's axis is under LOAD_ARM_M.
-    """
-    frames = arm.link_frames(q)
-    weight = frames[..., 6, :3, 3] + frames[..., 6, :3, :3] @ arm.T_flange_gripper[:3, 3] / 2
-    axes = (frames[..., 1:, :3, :3] @ arm.axes[:, :, None])[..., 0]
-    levers = weight[..., None, :] - frames[..., 1:, :3, 3]
-    arms = -np.cross(axes, levers)[..., 2]  # axis . (lever x down), positive where it turns along
-    return np.where(np.abs(arms) > LOAD_ARM_M, np.sign(arms), 0.0)
-
-
-# --- what a fit may know about these errors ---
+        for name, value in vars(self).items():
+            number(name, value, "a finite number, 0 or more", least=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -470,35 +341,27 @@ class FkErrors:
         scaled = self.shared * self.sigma
         return scaled @ np.swapaxes(scaled, -1, -2) + self.each
 
-    @property
-    def joint_covariance(self) -> Floats:
-        """Of the errors of all n poses together, (6 n, 6 n): the shared part does not average."""
-        scaled = (self.shared * self.sigma).reshape(-1, len(self.sigma))
-        joint = scaled @ scaled.T
-        for i, block in enumerate(self.each.reshape(-1, 6, 6)):
-            joint[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += block
-        return joint
-
 
 def fk_covariance(
-    q: ArrayLike, errors: ArmErrors | None = None, arm: Arm | None = None, tool: Tool = "gripper"
+    q: ArrayLike, errors: ArmErrors | None = None, arm: Arm | None = None
 ) -> FkErrors:
     """What forward kinematics at q (..., 6), rad, may be wrong by if the arm's errors have a size.
 
-    Play under load is shared, with the side that gravity gives at each pose; play without load
-    belongs to each pose, because its side depends on the moves. No play is negative, so all of
-    them together make the arm sag: that is the common play. Second moments are those of half
-    normal variables; that their mean is not zero is left to a spread of the same size.
+    errors: those sizes, the course's unless given. arm: the WidowX unless given. Play under load is
+    shared, with the side that gravity gives at each pose; play without load belongs to each pose,
+    because its side depends on the moves. No play is negative, so all of them together make the arm
+    sag: that is the common play. Second moments are those of half normal variables; that their mean
+    is not zero is left to a spread of the same size. Raises ValueError for angles that are none.
+
+    >>> known = fk_covariance([0.0, 1.2, 1.0, 0.2, 0.0, 0.0])
+    >>> known.covariance.shape, len(known.names)
+    ((6, 6), 55)
     """
     arm, errors = arm or widowx(), errors or ArmErrors()
-    frames = arm.link_frames(q)
-    T = arm.forward(q, tool)
-    by_joint = arm.jacobian(q, tool)
-    side = load_side(arm, q)
+    by_joint, side = arm.jacobian(q), load_side(arm, q)
     loose = by_joint * (errors.play_rad * (side == 0))[..., None, :]
-    by_play, by_link = by_joint * side[..., None, :], _by_link(frames, T)
-    if tool == "flange":
-        by_link[..., -6:] = 0.0  # the fingertip lies behind it
+    by_play = by_joint * side[..., None, :]
+    by_link = _by_link(arm.link_frames(q), arm.forward(q))
     shared = np.concatenate(
         [by_joint, by_play, by_play.sum(axis=-1, keepdims=True), by_link], axis=-1
     )
@@ -511,7 +374,14 @@ def fk_covariance(
             np.tile(np.repeat([errors.link_rad, errors.link_m], 3), 7),
         ]
     )
-    return FkErrors(shared, sigma, _names(arm), loose @ np.swapaxes(loose, -1, -2))
+    axes, origins = ("rx", "ry", "rz", "x", "y", "z"), (*arm.joints, "fingertip")
+    names = (
+        *(f"offset of {joint}" for joint in arm.joints),
+        *(f"play of {joint}" for joint in arm.joints),
+        "play of all joints",
+        *(f"{axis} of {origin}" for origin in origins for axis in axes),
+    )
+    return FkErrors(shared, sigma, names, loose @ np.swapaxes(loose, -1, -2))
 
 
 def _by_link(frames: Floats, T: Floats) -> Floats:
@@ -526,42 +396,110 @@ def _by_link(frames: Floats, T: Floats) -> Floats:
     return columns.reshape(*columns.shape[:-2], 42)
 
 
-def _names(arm: Arm) -> tuple[str, ...]:
-    axes = ("rx", "ry", "rz", "x", "y", "z")
-    origins = (*arm.joints, "fingertip")
-    return (
-        *(f"offset of {joint}" for joint in arm.joints),
-        *(f"play of {joint}" for joint in arm.joints),
-        "play of all joints",
-        *(f"{axis} of {origin}" for origin in origins for axis in axes),
-    )
+def load_side(arm: Arm, q: ArrayLike) -> Floats:
+    """Which way gravity turns each joint at q (..., 6): -1 or 1, and 0 where it hardly does.
+
+    Everything that hangs on a joint is taken as one weight half way between flange and fingertip;
+    0 where its lever arm about the joint's axis is under GRAVITY_ARM_M.
+    """
+    frames = arm.link_frames(q)
+    weight = frames[..., 6, :3, 3] + frames[..., 6, :3, :3] @ arm.T_flange_gripper[:3, 3] / 2
+    axes = (frames[..., 1:, :3, :3] @ arm.axes[:, :, None])[..., 0]
+    levers = weight[..., None, :] - frames[..., 1:, :3, 3]
+    arms = -np.cross(axes, levers)[..., 2]  # axis . (lever x down), positive where it turns along
+    return np.where(np.abs(arms) > GRAVITY_ARM_M, np.sign(arms), 0.0)
 
 
-def fk_error(true: ArrayLike, computed: ArrayLike) -> tuple[Floats, Floats]:
-    """How far true poses (..., 4, 4) are from the computed ones: (...) m and (...) rad."""
-    miss = pose_difference(computed, true)
-    return np.linalg.norm(miss[..., 3:], axis=-1), np.linalg.norm(miss[..., :3], axis=-1)
+# --- an arm that errs ---
+
+STOP_RAD = 5e-4  # std by which the controller misses the commanded angle; the encoder sees it
+STILL_RAD = 1e-6  # a joint that is sent no farther stays where it is
+HOME = (0.0, 1.2, 1.0, 0.2, 0.0, 0.0)  # rad; where the simulated arm starts
 
 
-# --- the unit that a seed names ---
+@dataclass(frozen=True, eq=False)
+class ArmTruth:
+    """What a simulated arm really is, and does not report.
+
+    offset_rad (6,): true minus read angle of each joint, without play. play_rad (6,): half of each
+    joint's play, not negative. link (7, 6): of the six joint origins and the fingertip, rotation
+    (rad) and displacement (m) in the parent's axes. arm: the chain with those links.
+    """
+
+    offset_rad: Floats
+    play_rad: Floats
+    link: Floats
+    arm: Arm
+
+    def __repr__(self) -> str:
+        length, angle = np.linalg.norm(self.link.reshape(7, 2, 3)[:, ::-1], axis=2).T
+        rows = (
+            ("joint offsets", "+.3f", np.degrees(self.offset_rad), "deg"),
+            ("half gear play", ".3f", np.degrees(self.play_rad), "deg"),
+            ("link errors", ".2f", 1e3 * length, "mm"),
+            ("and", ".2f", np.degrees(angle), "deg"),
+        )
+        return "\n".join(
+            f"{what:16} {', '.join(f'{value:{form}}' for value in values)} {unit}"
+            for what, form, values, unit in rows
+        )
 
 
-def _hidden(seed: int, errors: ArmErrors, nominal: Arm) -> ArmTruth:
-    rng = np.random.default_rng([seed, zlib.crc32(b"arm")])
-    offset = errors.offset_rad * rng.standard_normal(6)
-    play = errors.play_rad * np.abs(rng.standard_normal(6))
-    sizes = np.repeat([errors.link_rad, errors.link_m], 3)
-    link = sizes * rng.standard_normal((7, 6))
-    return ArmTruth(offset, play, link, with_link_errors(nominal, link))
+class SimulatedArm:
+    """An arm that is not quite what its drawing says: `move`, then ask where the gripper really is.
+
+    seed names the unit: its offsets, play and links, which stay, and the scatter of its moves.
+    nominal: the arm as drawn, whose `forward` at the reported angles is all that a user has.
+    """
+
+    def __init__(
+        self, seed: int, errors: ArmErrors | None = None, nominal: Arm | None = None
+    ) -> None:
+        self.nominal = nominal or widowx()
+        self.errors = errors or ArmErrors()
+        rng, size = np.random.default_rng([seed, zlib.crc32(b"arm")]), self.errors
+        offset = size.offset_rad * rng.standard_normal(6)
+        play = size.play_rad * np.abs(rng.standard_normal(6))
+        link = np.repeat([size.link_rad, size.link_m], 3) * rng.standard_normal((7, 6))
+        self._truth = ArmTruth(offset, play, link, with_link_errors(self.nominal, link))
+        self._rng = np.random.default_rng([seed, zlib.crc32(b"moves")])
+        self._at = np.array(HOME)
+        self._last = self._rng.choice([-1.0, 1.0], 6)  # direction of each joint's last move
+        self._joints = self._true_joints(self._at[None], self._last[None])[0]
+
+    def move(self, q: ArrayLike) -> Floats:
+        """Go to joint angles (6,), or through (n, 6) in turn; what the encoders then read, rad.
+
+        Raises ValueError for angles outside the limits.
+        """
+        commanded = self.nominal.check(q)
+        want(commanded.ndim <= 2, "q", f"shape {commanded.shape}", "(6,) or (n, 6)")
+        path = commanded.reshape(-1, 6)
+        directions = _directions(np.concatenate([self._at[None], path]), self._last)
+        missed = STOP_RAD * self._rng.standard_normal(path.shape)
+        read = np.clip(path + missed, self.nominal.limits[:, 0], self.nominal.limits[:, 1])
+        self._joints = self._true_joints(read, directions).reshape(commanded.shape)
+        if len(path):
+            self._at, self._last = path[-1], directions[-1]
+        return read.reshape(commanded.shape)
+
+    def true_pose(self, tool: Tool = "gripper") -> Floats:
+        """The tool's true pose in the base after the last `move`, (4, 4), or (n, 4, 4) after n."""
+        return self._truth.arm.forward(self._joints, tool)
+
+    def reveal(self) -> ArmTruth:
+        """The unit's hidden errors."""
+        return self._truth
+
+    def _true_joints(self, read: Floats, directions: Floats) -> Floats:
+        loaded = load_side(self.nominal, read)
+        side = np.where(loaded != 0, loaded, -directions)
+        return read + self._truth.offset_rad + side * self._truth.play_rad
 
 
 def with_link_errors(arm: Arm, link: ArrayLike) -> Arm:
     """The arm with its six joint origins and fingertip displaced by link (7, 6): rad, then m."""
-    from scipy.spatial.transform import Rotation
-
-    link = np.asarray(link, dtype=np.float64)
-    if link.shape != (7, 6) or not np.isfinite(link).all():
-        raise ValueError(f"link: got shape {link.shape}, want (7, 6) finite numbers")
+    link = array("link", link, (7, 6), finite=True)
     origins = np.concatenate([arm.origins, arm.T_flange_gripper[None]])
     turned = Rotation.from_rotvec(link[:, :3]).as_matrix()
     origins[:, :3, :3] = turned @ origins[:, :3, :3]

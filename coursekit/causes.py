@@ -81,7 +81,7 @@ from coursekit.arrays import Floats, Mask, NDArray
 from coursekit.words import Finding
 
 IMITATED = 1e-10  # share of a column's squares that is left of it but for rounding errors
-ROUNDS = 8  # of accepting or refusing one hypothesis
+SEARCH_ROUNDS = 8  # of accepting or refusing one hypothesis
 RIVAL_GAIN = 2 * math.log(20)  # a rival is at most 20 times less likely than what was accepted
 
 
@@ -205,7 +205,7 @@ def search(model: M, level: float) -> CauseSearch[M]:
     level: the p-value from which on a hypothesis is no chance.
     """
     found = CauseSearch(model, model)
-    for _ in range(ROUNDS):
+    for _ in range(SEARCH_ROUNDS):
         open_ones = [h for h in found.model.hypotheses() if (h.cause, h.at) not in found.refused]
         found.tested = found.model.tested(open_ones)
         significant = [t for t in found.tested if t.log_p < math.log(level) and t.gain > 0]

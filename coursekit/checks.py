@@ -120,6 +120,17 @@ def array(
     return result
 
 
+def covariance(name: str, value: ArrayLike, size: int) -> Floats:
+    """`value` as a covariance (size, size): finite, symmetric, no negative eigenvalue."""
+    matrix = array(name, value, (size, size), finite=True)
+    sigma = np.sqrt(np.clip(np.diag(matrix), 1e-300, None))
+    correlation = matrix / np.outer(sigma, sigma)  # units differ by powers of ten
+    want(np.allclose(correlation, correlation.T, atol=1e-9), name, matrix, "a symmetric matrix")
+    least = float(np.linalg.eigvalsh(correlation).min(initial=0.0))
+    want(least >= -1e-9, name, matrix, "a covariance; one of its eigenvalues is negative")
+    return matrix
+
+
 def transforms(name: str, value: ArrayLike, tolerance: float = ROTATION_TOLERANCE) -> Floats:
     """`value` as rigid transforms (..., 4, 4); the message names the first that is none."""
     T = array(name, value, (4, 4), leading=True)

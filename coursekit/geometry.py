@@ -16,17 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from coursekit import kernels
 from coursekit.arrays import ArrayLike, Floats, NDArray
-from coursekit.checks import (
-    array,
-    choice,
-    instance,
-    number,
-    positive,
-    transform,
-    transforms,
-    want,
-    whole,
-)
+from coursekit.checks import array, instance, number, positive, transform, transforms, want, whole
 
 DISTORTION_MODELS = ("none", "brown_conrady", "inverse_brown_conrady", "modified_brown_conrady")
 _NEWTON_STEPS = 50
@@ -55,7 +45,8 @@ class Intrinsics:
         lengths = {"width": whole, "height": whole, "fx": positive, "fy": positive}
         for name, check in (lengths | {"cx": number, "cy": number}).items():
             object.__setattr__(self, name, check(name, getattr(self, name)))
-        choice("model", self.model, DISTORTION_MODELS)
+        known = ", ".join(DISTORTION_MODELS)
+        want(self.model in DISTORTION_MODELS, "model", self.model, f"one of {known}")
         coeffs = array("coeffs", self.coeffs, (5,), finite=True)
         object.__setattr__(self, "coeffs", tuple(coeffs.tolist()))
 
@@ -300,25 +291,20 @@ def align_depth_to_color(
     shape = (depth_intrinsics.height, depth_intrinsics.width)
     want(depth.shape == shape, "depth_m", depth.shape, f"{shape} as the intrinsics say")
     T = transform("T_color_depth", T_color_depth)
-    source = _align_sources(depth, depth_intrinsics, color_intrinsics, T)
-    grid = pixel_grid(*depth_intrinsics.size)
-    points = deproject(grid, depth, depth_intrinsics.K, depth_intrinsics.dist)
-    z_color = (points @ T[2, :3] + T[2, 3]).ravel()
-    return np.where(source >= 0, z_color[source], 0.0).astype(np.float32)
-
-
-def _align_sources(depth: Floats, of: Intrinsics, to: Intrinsics, T: Floats) -> NDArray[np.int64]:
-    """For each colour pixel the flat index of the nearest depth pixel that covers it, else -1."""
-
+    of, to = depth_intrinsics, color_intrinsics
     corners = pixel_grid(of.width + 1, of.height + 1) - 0.5
     rays = deproject(corners, np.ones(corners.shape[:2]), of.K, of.dist)
 
     def landing(ray: Floats) -> Floats:
+        """The colour pixels (H, W, 2) in which corners of the depth pixels land."""
         points = ray * np.where(depth > 0, depth, np.nan)[..., None]
         return np.floor(project(transform_points(T, points), to.K, to.dist) + 0.5)
 
     first, last = landing(rays[:-1, :-1]), landing(rays[1:, 1:])
-    return kernels.nearest_footprint(depth, first, last, to.width, to.height)
+    source = kernels.nearest_footprint(depth, first, last, to.width, to.height)
+    points = deproject(pixel_grid(*of.size), depth, of.K, of.dist)
+    z_color = (points @ T[2, :3] + T[2, 3]).ravel()
+    return np.where(source >= 0, z_color[source], 0.0).astype(np.float32)
 
 
 # --- rigid transforms ---
@@ -370,6 +356,61 @@ def cross_matrix(vectors: Floats) -> Floats:
     matrix[..., [2, 0, 1], [1, 2, 0]] = vectors
     matrix[..., [1, 2, 0], [2, 0, 1]] = -vectors
     return matrix
+
+
+# --- small motions of a pose ---
+#
+# A twist is (omega, v), a rotation vector in rad and a displacement in m, along the axes of the
+# frame in which the pose is given. There are two ways to apply one, and they differ by omega x t:
+#
+#     turned   R <- exp(omega) R, t <- t + v               about the body's own origin
+#     moved    R <- exp(omega) R, t <- exp(omega) t + v    about the origin of that frame
+#
+# A covariance of the first can be read directly: v is what the body's position is off by. The
+# second is what happens to all points that are given in the frame: p <- exp(omega) p + v.
+
+
+def turned(T: Floats, twists: Floats) -> Floats:
+    """Poses T (..., 4, 4) turned and shifted about their own origins by twists (..., 6).
+
+    R <- exp(omega) R and t <- t + v, rad and m: `pose_difference(T, turned(T, xi))` is xi again.
+
+    >>> turned(np.eye(4), np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.2]))[:3, 3].tolist()
+    [0.1, 0.0, 0.2]
+    """
+    flat = np.broadcast_to(T, (*twists.shape[:-1], 4, 4)).reshape(-1, 4, 4).copy()
+    steps = twists.reshape(-1, 6)
+    flat[:, :3, :3] = Rotation.from_rotvec(steps[:, :3]).as_matrix() @ flat[:, :3, :3]
+    flat[:, :3, 3] += steps[:, 3:]
+    return flat.reshape(*twists.shape[:-1], 4, 4)
+
+
+def pose_difference(T: ArrayLike, to: ArrayLike) -> Floats:
+    """The twists (..., 6) that bring poses T (..., 4, 4) to other poses: the inverse of `turned`.
+
+    R_to = exp(omega) R and t_to = t + v; rad and m, along the axes of the frame of T.
+
+    >>> far = np.eye(4)
+    >>> far[:3, 3] = [0.1, 0.0, 0.2]
+    >>> pose_difference(np.eye(4), far).tolist()
+    [0.0, 0.0, 0.0, 0.1, 0.0, 0.2]
+    """
+    T, to = np.asarray(T, dtype=np.float64), np.asarray(to, dtype=np.float64)
+    turn = to[..., :3, :3] @ np.swapaxes(T[..., :3, :3], -1, -2)
+    omega = Rotation.from_matrix(turn.reshape(-1, 3, 3)).as_rotvec().reshape(*turn.shape[:-2], 3)
+    return np.concatenate([omega, to[..., :3, 3] - T[..., :3, 3]], axis=-1)
+
+
+def moved(T: Floats, twists: Floats) -> Floats:
+    """exp(xi) T: poses (n, 4, 4) carried along as twists (n, 6) move their whole frame.
+
+    exp(xi) has R = exp(omega), rad, and t = v, m; T turns about the frame's origin and not, as in
+    `turned`, about its own.
+    """
+    step = np.broadcast_to(np.eye(4), T.shape).copy()
+    step[:, :3, :3] = Rotation.from_rotvec(twists[:, :3]).as_matrix()
+    step[:, :3, 3] = twists[:, 3:]
+    return step @ T
 
 
 # --- what a camera's numbers must be ---

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
 import os
 import platform
 from collections.abc import Iterator, Mapping
@@ -18,13 +17,18 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal, Protocol, get_args
 
+import numpy as np
+
+from coursekit import checks
+from coursekit.checks import want
+
 ROOT = Path(__file__).resolve().parent.parent
 FORMAT = 1
 Source = Literal["live", "recorded", "simulated", "reference"]
-Kind = Literal["bias", "noise"]
+ErrorKind = Literal["bias", "noise"]
 
 
-class Measured(Protocol):
+class MeasuringCamera(Protocol):
     """What a result is measured with: a camera, or what stands in for one."""
 
     @property
@@ -42,27 +46,24 @@ class Quantity:
 
     sigma: one standard deviation in the same unit, None where nobody has measured it (then `note`
     says so). kind: "bias" for what repeats, "noise" for what averages down, None for neither.
+    Raises ValueError for numbers that are not finite, a negative sigma and a missing unit.
+
+    >>> Quantity(612.4, "px", 0.9, "bias", "from 28 views").sigma
+    0.9
     """
 
     value: float
     unit: str
     sigma: float | None = None
-    kind: Kind | None = None
+    kind: ErrorKind | None = None
     note: str = ""
 
     def __post_init__(self) -> None:
-        for name in ("value", "sigma"):
-            number = getattr(self, name)
-            if number is None and name == "sigma":
-                continue
-            if not isinstance(number, (int, float)) or not math.isfinite(number):
-                raise ValueError(f"{name}: got {number!r}, want a finite number")
-        if self.sigma is not None and self.sigma < 0:
-            raise ValueError(f"sigma: got {self.sigma}, want a standard deviation >= 0")
-        if self.kind not in (None, *get_args(Kind)):
-            raise ValueError(f"kind: got {self.kind!r}, want 'bias', 'noise' or None")
-        if not self.unit:
-            raise ValueError("unit: got nothing, want for example 'px', 'mm' or '1'")
+        checks.number("value", self.value)
+        if self.sigma is not None:
+            checks.number("sigma", self.sigma, "a standard deviation >= 0", least=0.0)
+        checks.choice("kind", self.kind, (None, *get_args(ErrorKind)))
+        want(self.unit, "unit", self.unit, "for example 'px', 'mm' or '1'")
 
 
 @dataclass(frozen=True)
@@ -70,26 +71,19 @@ class Covariance:
     """The covariance of several numbers that were estimated together.
 
     names (n): which numbers; matrix (n, n): in the product of their units, symmetric, none of its
-    eigenvalues negative. A NumPy array is taken and kept as tuples.
+    eigenvalues negative. A NumPy array is taken and kept as tuples. Raises ValueError for what is
+    no covariance of so many numbers.
+
+    >>> Covariance(("fx", "k1"), [[0.81, 4e-4], [4e-4, 1e-6]]).names
+    ('fx', 'k1')
     """
 
     names: tuple[str, ...]
     matrix: tuple[tuple[float, ...], ...]
 
     def __post_init__(self) -> None:
-        import numpy as np
-
-        names, matrix = tuple(self.names), np.array(self.matrix, dtype=float)
-        if matrix.shape != (len(names), len(names)):
-            raise ValueError(f"matrix: got shape {matrix.shape}, want {(len(names), len(names))}")
-        if not np.isfinite(matrix).all():
-            raise ValueError("matrix: got NaN or infinity, want finite numbers")
-        sigma = np.sqrt(np.clip(np.diag(matrix), 1e-300, None))
-        correlation = matrix / np.outer(sigma, sigma)  # units differ by powers of ten
-        if not np.allclose(correlation, correlation.T, atol=1e-9):
-            raise ValueError("matrix: is not symmetric")
-        if np.linalg.eigvalsh(correlation).min() < -1e-9:
-            raise ValueError("matrix: is no covariance, one of its eigenvalues is negative")
+        names = tuple(self.names)
+        matrix = checks.covariance("matrix", self.matrix, len(names))
         object.__setattr__(self, "names", names)
         object.__setattr__(self, "matrix", tuple(map(tuple, matrix.tolist())))
 
@@ -117,33 +111,25 @@ def folder() -> Path:
 
 def save(
     lesson: str,
-    camera: Measured,
+    camera: MeasuringCamera,
     quantities: Mapping[str, Quantity],
     covariances: Mapping[str, Covariance] | None = None,
 ) -> Path:
-    """Write `results/<lesson>.json` in one step (a reader sees the old file or the new one)."""
+    """Write `results/<lesson>.json` in one step (a reader sees the old file or the new one).
+
+    covariances: of those quantities that were estimated together, by a name for the group. Returns
+    the path. Raises ValueError for what is no quantity and no covariance, and for a covariance of
+    something that is not among the quantities.
+    """
     covariances = covariances or {}
-    for argument, given, want in (
-        ("quantities", quantities, Quantity),
-        ("covariances", covariances, Covariance),
-    ):
-        for name, value in given.items():
-            if not isinstance(value, want):
-                got = type(value).__name__
-                raise ValueError(f"{argument}: {name} is a {got}, want {want.__name__}")
+    for name, quantity in quantities.items():
+        checks.instance(f"quantities[{name!r}]", quantity, Quantity)
     for group, covariance in covariances.items():
-        unknown = [name for name in covariance.names if name not in quantities]
-        if unknown:
-            raise ValueError(f"covariances: {group} has {unknown[0]!r}, which is no quantity")
-    result = Result(
-        lesson,
-        camera.source,
-        camera.name,
-        now(),
-        versions(),
-        dict(quantities),
-        dict(covariances),
-    )
+        argument = f"covariances[{group!r}]"
+        for name in checks.instance(argument, covariance, Covariance).names:
+            want(name in quantities, argument, name, "the name of a quantity")
+    made = (lesson, camera.source, camera.name, now(), versions())
+    result = Result(*made, dict(quantities), dict(covariances))
     path = _path(lesson)
     write_json(path, {"format": FORMAT} | asdict(result))
     return path
@@ -158,25 +144,21 @@ def load(lesson: str) -> Result:
 
 
 def read(path: Path) -> Result:
-    """A result in another folder; errors as for `load`."""
+    """A result in another folder; ValueError that names the file where it is damaged."""
     content = read_json(path)
     try:
         if content.pop("format") != FORMAT:
             raise ValueError("written by another version of the course")
         quantities = {k: Quantity(**v) for k, v in content.pop("quantities").items()}
         covariances = {k: Covariance(**v) for k, v in content.pop("covariances", {}).items()}
-        result = Result(**content, quantities=quantities, covariances=covariances)
-        if result.source not in get_args(Source):
-            raise ValueError(f"source is {result.source!r}")
-        return result
+        checks.choice("source", content["source"], get_args(Source))
+        return Result(**content, quantities=quantities, covariances=covariances)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path.name}: {error}") from error
 
 
 def save_arrays(lesson: str, **arrays: Any) -> Path:
     """Write the raw measurements behind a result to `results/<lesson>.npz`, in one step."""
-    import numpy as np
-
     path = _path(lesson).with_suffix(".npz")
     with _whole(path) as part, part.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
@@ -225,12 +207,12 @@ def now() -> str:
 
 
 def _path(lesson: str) -> Path:
-    if not lesson or not lesson.replace("_", "").isalnum():
-        raise ValueError(f"lesson: got {lesson!r}, want a name like '01_pinhole'")
+    want(lesson.replace("_", "").isalnum(), "lesson", lesson, "a name like '01_pinhole'")
     return folder() / f"{lesson}.json"
 
 
 def versions() -> dict[str, str]:
+    """Of Python, of this package and of those whose version a result may depend on."""
     found = {"python": platform.python_version()}
     for name in ("coursekit", "numpy", "opencv-python-headless", "pyrealsense2"):
         try:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from coursekit.specifications import DATA
+from coursekit.specifications import DATA, device
 
 
 @dataclass(frozen=True)
@@ -44,3 +45,8 @@ def claim(name: str, verdict: str) -> Callable[[Callable[[], None]], Callable[[]
         return test
 
     return mark
+
+
+def nominal_fx_px(name: str, width: int) -> float:
+    """What the field of view in a camera's data sheet makes the focal length of such an image."""
+    return width / 2 / math.tan(math.radians(device(name).nominal.depth_hfov_deg / 2))

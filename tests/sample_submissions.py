@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
+from coursekit.submission.flags import data_flags, fingerprint
 from coursekit.submission.format import (
     CameraFacts,
     Claims,
@@ -27,7 +28,7 @@ from coursekit.submission.format import (
     TableRow,
 )
 from coursekit.submission.recompute import Recomputed, recompute
-from coursekit.submission.rubric import grade
+from coursekit.submission.rubric import Grade, judged
 
 DISTANCES = (0.30, 0.45, 0.60)
 MADE = "2026-03-02T10:00:00+00:00"
@@ -188,7 +189,19 @@ def _honest(seed: int, frames: int, of_camera: tuple[tuple[str, Any], ...]) -> S
     return finished(*raw(seed, frames, **dict(of_camera)), f"Student {seed}")
 
 
-graded = cache(grade)  # by the submission itself: whoever shares one shares its grade
+@cache
+def graded(submission: Submission) -> Grade:
+    """As `rubric.grade`, but what several submissions share is computed once."""
+    found = _recomputed(submission.stacks, submission.camera, submission.tape_sigma_m)
+    prints = fingerprint(submission)
+    flags = data_flags(submission, found, prints)
+    return Grade(submission.student, judged(submission, found), flags, found, prints)
+
+
+@cache
+def _recomputed(stacks: tuple[Stack, ...], facts: CameraFacts, tape_sigma_m: float) -> Recomputed:
+    whole = replace(_honest(0, 100, ()), stacks=stacks, camera=facts, tape_sigma_m=tape_sigma_m)
+    return recompute(whole)
 
 
 def finished(

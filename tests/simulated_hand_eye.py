@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -10,8 +10,16 @@ from scipy.spatial.transform import Rotation
 
 from coursekit.arm import ArmErrors, FkErrors, SimulatedArm, fk_covariance, widowx
 from coursekit.boards import Board, Detection, Detections
-from coursekit.geometry import Intrinsics, invert_transform, make_transform, project
-from coursekit.hand_eye.poses import camera_board, turned
+from coursekit.geometry import (
+    Intrinsics,
+    invert_transform,
+    make_transform,
+    pose_difference,
+    project,
+    turned,
+)
+from coursekit.hand_eye import HandEyeResult, HandEyeSession, solve
+from coursekit.hand_eye.poses import camera_board
 
 LENS = Intrinsics(
     640, 480, 440.0, 441.0, 322.0, 238.0, "brown_conrady", (-0.05, 0.06, 4e-4, -3e-4, -0.02)
@@ -33,25 +41,43 @@ def typical(mount: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 @dataclass(frozen=True, eq=False)
-class Session:
+class Simulated:
     """What a student would have, and the truth. fk: the honest model of the arm's errors."""
 
-    mount: str
-    q: np.ndarray
-    T_base_gripper: np.ndarray
-    detections: Detections
+    session: HandEyeSession
     X: np.ndarray
     Y: np.ndarray
     fk: FkErrors | None
 
-    def part(self, which: slice) -> Session:
+    @property
+    def T(self) -> np.ndarray:
+        """The reported arm poses."""
+        return self.session.T_base_gripper
+
+    @property
+    def exact(self) -> np.ndarray:
+        """Where the camera would see the board if the arm were where it says."""
+        return camera_board(self.T, self.X, self.Y, self.session.mount)
+
+    def with_poses(self, T_camera_board: np.ndarray | None = None) -> HandEyeSession:
+        """The session with poses of the board, exact ones unless given, in place of corners."""
+        return replace(self.session, seen=self.exact if T_camera_board is None else T_camera_board)
+
+    def part(self, which: slice) -> Simulated:
         fk = self.fk
         if fk is not None:
             fk = FkErrors(fk.shared[which], fk.sigma, fk.names, fk.each[which])
-        return Session(
-            self.mount, self.q[which], self.T_base_gripper[which], self.detections[which],
-            self.X, self.Y, fk,
-        )  # fmt: skip
+        rows = np.arange(len(self.session))[which]
+        return Simulated(self.session.pick(rows), self.X, self.Y, fk)
+
+    def solve(self, method: str = "refine", **options) -> HandEyeResult:
+        return solve(self.session, method, **options)
+
+
+def holds(result: HandEyeResult, X: np.ndarray, level: float = 0.95) -> np.ndarray:
+    """Whether the interval of each of rx, ry, rz, tx, ty, tz holds the truth, (6,)."""
+    sigma = np.sqrt(np.diag(result.covariance)[:6])
+    return np.abs(pose_difference(result.X, X)) < result.quantile(level) * sigma
 
 
 def in_view(T_camera_board: np.ndarray) -> np.ndarray:
@@ -86,13 +112,10 @@ def reachable(mount: str, count: int = 3000) -> np.ndarray:
     return found[:count]
 
 
+@cache
 def arm_session(
-    seed: int,
-    mount: str = "eye_in_hand",
-    n: int = 25,
-    noise_px: float = NOISE_PX,
-    errors: ArmErrors | None = None,
-) -> Session:
+    seed: int, mount: str = "eye_in_hand", n: int = 25, errors: ArmErrors | None = None
+) -> Simulated:
     """A session on the WidowX; errors: of the arm, None for one whose kinematics are exact."""
     rng = np.random.default_rng([seed, 5])
     arm = widowx()
@@ -100,11 +123,9 @@ def arm_session(
     pool = reachable(mount)
     pool = pool[rng.permutation(len(pool))]
     pool = pool[in_view(camera_board(arm.forward(pool), X, Y, mount))]
-    q = true = None
-    if errors is None:
-        q = pool[:n]
-        true = arm.forward(q)
-    else:
+    q = pool[:n]
+    true = arm.forward(q)
+    if errors is not None:
         unit = SimulatedArm(seed, errors)
         read = unit.move(pool[: 3 * n])
         true = unit.true_pose()
@@ -113,22 +134,25 @@ def arm_session(
     assert len(q) == n
     seen = camera_board(true, X, Y, mount)
     fk = None if errors is None else fk_covariance(q, errors)
-    detections = corners_at(seen, rng, noise_px)
-    return Session(mount, q, arm.forward(q), detections, X, Y, fk)
+    session = HandEyeSession(mount, arm.forward(q), corners_at(seen, rng), BOARD, LENS, q)
+    return Simulated(session, X, Y, fk)
 
 
-def corners_at(T_camera_board: np.ndarray, rng: np.random.Generator, noise_px: float) -> Detections:
+def corners_at(
+    T_camera_board: np.ndarray, rng: np.random.Generator, board: Board = BOARD, px: float = NOISE_PX
+) -> Detections:
     """What a camera detects of a board at poses (n, 4, 4)."""
-    at = BOARD.points @ np.swapaxes(T_camera_board[:, :3, :3], 1, 2)
+    at = board.points @ np.swapaxes(T_camera_board[:, :3, :3], 1, 2)
     pixels = project(at + T_camera_board[:, None, :3, 3], LENS.K, LENS.dist)
-    pixels += noise_px * rng.normal(size=pixels.shape)
-    ids = np.arange(len(BOARD.points))
+    pixels += px * rng.normal(size=pixels.shape)
+    ids = np.arange(len(board.points))
     return Detections([Detection(ids, uv, LENS.size, f"{i:02d}") for i, uv in enumerate(pixels)])
 
 
+@cache
 def free_session(
     seed: int, mount: str = "eye_in_hand", n: int = 25, tilt_deg: float = 40.0
-) -> Session:
+) -> Simulated:
     """A session of an arm that reaches every pose: tilts all around up to tilt_deg."""
     rng = np.random.default_rng([seed, 6])
     X, Y = (turned(T, rng.normal(size=6) * ([0.05] * 3 + [0.01] * 3)) for T in typical(mount))
@@ -144,5 +168,5 @@ def free_session(
     seen = np.stack(seen)
     M = X @ seen @ invert_transform(Y)
     T_base_gripper = M if mount == "eye_to_hand" else invert_transform(M)
-    detections = corners_at(seen, rng, NOISE_PX)
-    return Session(mount, np.zeros((n, 6)), T_base_gripper, detections, X, Y, None)
+    session = HandEyeSession(mount, T_base_gripper, corners_at(seen, rng), BOARD, LENS)
+    return Simulated(session, X, Y, None)

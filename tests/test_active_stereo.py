@@ -334,7 +334,7 @@ def test_pixel_locking_beside_opencvs_matchers():
     matchers = {"match": match, "cv2.StereoBM": block, "cv2.StereoSGBM": semi_global}
     total = {name: np.zeros(16) for name in matchers}
     count = {name: np.zeros(16) for name in matchers}
-    for seed, distance in enumerate((0.5, 0.7, 0.85, 1.0, 1.2, 1.4)):
+    for seed, distance in enumerate((0.5, 0.85, 1.0, 1.4)):
         view = on_wall(replace(D435, seed=seed), distance)
         rows = slice(160, 320)
         pair = [eye[rows] for eye in view.images(np.random.default_rng(seed))]
@@ -388,10 +388,10 @@ def sweep(rig: Rig) -> tuple[float, float, np.ndarray]:
 
 
 NEAR_TO_FAR = (0.3, 0.45, 0.6, 1.0, 1.5, 2.0) if NIGHTLY else (0.3, 0.6, 1.0, 2.0)
-FRAMES = 30 if NIGHTLY else 10
+FRAMES = 30 if NIGHTLY else 8
 
 
-@pytest.mark.parametrize("seed", range(10) if NIGHTLY else (0, 1))
+@pytest.mark.parametrize("seed", range(10) if NIGHTLY else (0,))
 def test_depth_noise_grows_as_the_square_of_the_distance(seed):
     power, coarse, sigma_d = sweep(replace(D435, seed=seed))
     print(f"\nseed {seed}: exponent {power:.3f}, sigma_d {np.round(sigma_d, 4)} px")
@@ -412,7 +412,7 @@ def test_room_light_steepens_the_curve(ambient, seed):
 def test_noise_on_the_studio_block_is_that_of_the_wall():
     for distance in (0.30, 0.45, 0.60):
         view, rows = D435.look_at(tabletop(distance)), slice(210, 274)
-        d = disparities(view, 30, 0, rows)[:, 16:48, 420:452]
+        d = disparities(view, 12, 0, rows)[:, 16:48, 420:452]
         assert (d > 0).mean() > 0.99
         steady = (d > 0).all(axis=0)
         sigma = np.sqrt(d[:, steady].var(axis=0, ddof=1).mean())

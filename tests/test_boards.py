@@ -245,13 +245,7 @@ def test_noise_levels_measures_noise_and_not_edges():
 @pytest.mark.parametrize("board", [CHECKERBOARD, CHARUCO], ids=["checker", "charuco"])
 @pytest.mark.parametrize(
     ("blur_px", "motion_px"),
-    [
-        (0.5, (0, 0)),
-        (1.2, (0, 0)),
-        (0.6, (3, 0)),
-        (0.6, (0, 3)),
-        (0.6, (2.1, -2.1)),
-    ],
+    [(0.5, (0, 0)), (1.2, (0, 0)), (0.6, (3, 0)), (0.6, (0, 3)), (0.6, (2.1, -2.1))],
 )
 def test_the_blur_has_its_size_and_direction(board, blur_px, motion_px):
     """A uniform motion of length L has the variance L^2 / 12, a pixel that of its width.
@@ -326,7 +320,7 @@ def test_a_checkerboard_is_whole_and_its_own_or_not_found():
     assert missed == 0
     image = photograph(view(CHECKERBOARD)[0])
     for squares in ((6, 5), (5, 4), (8, 6), (9, 6), (10, 6), (9, 7), (11, 7)):
-        assert find(image, Board("checkerboard", squares, 0.025)) is None
+        assert find_corners(image, Board("checkerboard", squares, 0.025)) is None
 
 
 def test_corners_at_the_rim_of_the_image_are_as_good():

@@ -14,12 +14,12 @@ from coursekit import results
 from coursekit.budget import (
     HandOver,
     beside,
-    effective_frames,
     hand_over,
+    independent_frames,
     lesson_budget,
     wrist_budget,
 )
-from coursekit.budget.handover import LESSONS
+from coursekit.budget.handover import NEEDED
 from coursekit.results import Covariance, Quantity
 
 YOURS = SimpleNamespace(source="live", name="D435 on the bench")
@@ -93,7 +93,7 @@ def test_intrinsics_use_the_correlations(folders: tuple[Path, Path]) -> None:
     write(YOURS)
     handed = hand_over(folders[1])
     view = handed.view().moved(u=824.0, v=640.0)  # 400 px off both ways: fx and fy move together
-    M = handed.budget(view)["intrinsics"].matrix(view)
+    M = handed.budget()["intrinsics"].matrix(view)
     covariance = M @ M.T
     x = np.array([400 / 430, 400 / 430])
     r2 = x @ x
@@ -106,7 +106,7 @@ def test_intrinsics_use_the_correlations(folders: tuple[Path, Path]) -> None:
 def test_what_propagate_takes(folders: tuple[Path, Path]) -> None:
     write(YOURS)
     handed = hand_over(folders[1])
-    given = handed.covariances(handed.view(0.6))
+    given = handed.covariances(handed.view().moved(distance_m=0.6))
     assert given.names == K
     assert np.diag(given.intrinsics)[4] == pytest.approx(0.004**2)
     twist = np.sqrt(np.diag(given.hand_eye))  # rad and m, from the sigmas: no covariance was kept
@@ -124,7 +124,7 @@ def test_what_propagate_takes(folders: tuple[Path, Path]) -> None:
 
 def test_nothing_yet(folders: tuple[Path, Path]) -> None:
     handed = hand_over(folders[1])
-    for lesson, found in zip(LESSONS, handed, strict=True):
+    for lesson, found in zip(NEEDED, handed, strict=True):
         assert found.says == (
             f"{lesson}: results/{lesson}.json is not there yet, notebook {lesson} has not "
             "saved it; the reference is used."
@@ -141,7 +141,10 @@ def test_nothing_yet(folders: tuple[Path, Path]) -> None:
         (lambda text: "", "not a JSON file"),
         (lambda text: text.replace('"format": 1', '"format": 0'), "another version"),
         (lambda text: text.replace('"value": 0.0', '"value": null'), "value"),
-        (lambda text: text.replace('"04_hand_eye"', '"03_intrinsics"'), "notebook 03_intrinsics"),
+        (
+            lambda text: text.replace('"04_hand_eye"', '"03_intrinsics"'),
+            "lesson: got '03_intrinsics', want 04_hand_eye",
+        ),
         (lambda text: text.replace('"rz"', '"turn"'), "holds no rz with a sigma"),
         (lambda text: text.replace('"sigma": 0.05', '"sigma": null'), "holds no rx with a sigma"),
     ],
@@ -238,7 +241,7 @@ def test_what_notebook_1_and_2_may_have_kept_is_used(folders: tuple[Path, Path])
     per_px = 0.45**2 / (430.0 * 0.055)
     noise = {row.term.name: row.high_m for row in budget.rows}["depth noise"]
     assert noise == pytest.approx(per_px * math.hypot(0.07, 0.05))
-    many = 0.07**2 / effective_frames(400, 0.3) + 0.05**2
+    many = 0.07**2 / independent_frames(400, 0.3) + 0.05**2
     assert budget.at(frames=400).averaged_m["depth noise"] == pytest.approx(
         per_px * math.sqrt(many)
     )

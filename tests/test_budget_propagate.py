@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -15,21 +16,22 @@ from coursekit.budget import (
     Covariances,
     View,
     check_first_order,
-    ellipsoid,
-    jacobian,
     lesson_view,
     looking_down,
     monte_carlo,
     propagate,
 )
 from coursekit.budget.handover import LESSON_CAMERA
-from coursekit.budget.propagation import PARAMETERS
+from coursekit.budget.propagation import displacements, jacobian
 from coursekit.geometry import Intrinsics, deproject, invert_transform, transform_points, undistort
+from coursekit.intrinsics.derivatives import PARAMETERS, scaled_root
 
 LENS = Intrinsics(
     848, 480, 430.0, 432.0, 421.0, 243.0, "brown_conrady", (-0.05, 0.06, -8e-4, 1.4e-3, -0.02)
 )
 ARM_AT = (0.2, 1.3, 1.2, -0.3, 0.1, 0.4)
+NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
+SAMPLES = 150_000 if NIGHTLY else 50_000  # a variance to 0.4 or 0.6 % (one standard error)
 CORNERS = [(424.0, 240.0), (0.0, 0.0), (847.0, 240.0), (847.0, 479.0), (424.0, 0.0)]
 
 
@@ -98,22 +100,25 @@ def test_jacobian_is_the_derivative(mount: str, camera: Intrinsics, p: int) -> N
 
 
 @pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
-def test_samples_go_through_the_exact_chain(mount: str) -> None:
-    """One error at a time, and large: each sample is what the composed transforms say."""
+def test_displacements_are_those_of_the_composed_transforms(mount: str) -> None:
+    """Errors of every part at once, and large: 10 degrees of turn, 10 mm of depth, a wrong lens."""
     where = chain(mount, LENS, 0.5, 701.0, 92.0)
-    start = exact(where, PARAMETERS, np.zeros(24))
     given = errors(0.5, 10.0, lens=True)
-    one = {"hand_eye": given.hand_eye, "arm": 100 * given.arm, "intrinsics": given.intrinsics}
-    for name, covariance in one.items():
-        alone = Covariances(names=PARAMETERS, **{name: covariance})
-        samples = monte_carlo(where, alone, 20, seed=5)
-        from coursekit.budget.propagation import _root
+    all_of_it = replace(given, depth_sigma_m=0.01, arm=100 * np.asarray(given.arm))
+    drawn = scaled_root(all_of_it.joint) @ np.random.default_rng(5).standard_normal((24, 30))
+    start = exact(where, PARAMETERS, np.zeros(24))
+    expected = [exact(where, PARAMETERS, e) - start for e in drawn.T]
+    found = displacements(where, PARAMETERS, drawn)
+    np.testing.assert_allclose(found.T, expected, atol=1e-9)
 
-        used = _root(alone.joint) @ np.random.default_rng(5).standard_normal(
-            (np.linalg.matrix_rank(alone.joint, tol=1e-16), 20)
-        )
-        expected = [exact(where, PARAMETERS, e) - start for e in used.T]
-        assert samples == pytest.approx(np.array(expected), abs=1e-9)
+
+def test_what_is_drawn_goes_through_the_exact_chain() -> None:
+    where = chain("eye_in_hand", LENS, 0.5, 701.0, 92.0)
+    given = errors(0.5, 10.0, lens=True)
+    root = scaled_root(given.joint)
+    drawn = root @ np.random.default_rng(5).standard_normal((root.shape[1], 20))
+    expected = displacements(where, PARAMETERS, drawn).T
+    assert monte_carlo(where, given, 20, seed=5) == pytest.approx(expected, abs=1e-12)
 
 
 @pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
@@ -121,15 +126,17 @@ def test_samples_go_through_the_exact_chain(mount: str) -> None:
 def test_first_order_over_the_working_volume(mount: str, Z: float) -> None:
     """Every variance within 3 % for turns of 1 degree about each axis, over the whole image."""
     for u, v in CORNERS:
-        check = check_first_order(chain(mount, LESSON_CAMERA, Z, u, v), errors(Z, 1.0), 150_000)
+        check = check_first_order(chain(mount, LESSON_CAMERA, Z, u, v), errors(Z, 1.0), SAMPLES)
         assert check.worst < 0.03, (u, v, check)
 
 
-def test_first_order_with_a_lens_a_million() -> None:
+def test_first_order_with_a_lens() -> None:
+    """Within 1 % of a million; of fewer, within four standard errors of a variance more."""
+    n = 1_000_000 if NIGHTLY else 200_000
     check = check_first_order(
-        chain("eye_in_hand", LENS, 0.45, 40.0, 30.0), errors(0.45, 1.0, lens=True)
+        chain("eye_in_hand", LENS, 0.45, 40.0, 30.0), errors(0.45, 1.0, lens=True), n
     )
-    assert check.n == 1_000_000
+    assert check.n == n
     assert check.worst < 0.01
     assert np.abs(check.first_order - check.monte_carlo).max() < 0.01 * check.first_order.max()
 
@@ -168,7 +175,7 @@ def test_where_first_order_fails() -> None:
 
 
 def test_depth_from_disparity_is_skewed_far_away() -> None:
-    view = Chain(lesson_view(0.45))
+    view = Chain(lesson_view())
     small = Covariances(depth_sigma_m=0.45 * 0.01)
     assert check_first_order(view, small, 200_000, through_disparity=True).worst < 0.02
     large = Covariances(depth_sigma_m=0.45 * 0.2)
@@ -194,15 +201,6 @@ def test_same_seed_same_bytes() -> None:
     where = chain("eye_to_hand", LESSON_CAMERA, 0.45, 0.0, 0.0)
     first, again = (monte_carlo(where, errors(0.45, 0.5), 1000, seed) for seed in (3, 3))
     assert first.tobytes() == again.tobytes()
-
-
-def test_ellipsoid_holds_its_share() -> None:
-    covariance = propagate(chain("eye_in_hand", LENS, 0.5, 701.0, 92.0), errors(0.5, 0.5))
-    half, axes = ellipsoid(covariance, 0.9)
-    samples = np.random.default_rng(0).multivariate_normal(np.zeros(3), covariance, 100_000)
-    inside = np.sum((samples @ axes / half) ** 2, axis=1) <= 1
-    assert inside.mean() == pytest.approx(0.9, abs=0.005)
-    assert (np.diff(half) <= 0).all()
 
 
 @pytest.mark.parametrize(
@@ -231,5 +229,3 @@ def test_bad_chains() -> None:
         Chain(lesson_view(), "eye_on_stalk")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"^n: "):
         monte_carlo(Chain(lesson_view()), Covariances(), 0)
-    with pytest.raises(ValueError, match=r"^level: "):
-        ellipsoid(np.eye(3), 1.0)

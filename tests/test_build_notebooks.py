@@ -49,10 +49,26 @@ def built_text(tmp_path_factory):
 
 
 @pytest.fixture
-def built(built_text, tmp_path):
+def built(built_text, tmp_path, monkeypatch):
+    """A built notebook, the only one of a folder that the tool takes for the course's."""
     path = tmp_path / "01_toy.ipynb"
     path.write_text(built_text, encoding="utf-8")
+    monkeypatch.setattr(build_notebooks, "NOTEBOOKS", tmp_path)
     return path
+
+
+@pytest.fixture
+def light(built):
+    """The same without coursekit, which takes a kernel long to import."""
+    edit(built, lighten)
+    return built
+
+
+def lighten(notebook):
+    cell_of(notebook, "setup").update(source=["import os"])
+    notebook["cells"].remove(cell_of(notebook, "question"))
+    for number, cell in enumerate(code_cells(notebook), 1):
+        cell["execution_count"] = number
 
 
 def cell_of(notebook, name):
@@ -106,7 +122,6 @@ def test_a_failing_cell_leaves_the_file_and_is_named(tmp_path, monkeypatch, caps
 
 
 def test_a_copy_keeps_its_widgets_and_the_users_environment(built, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(build_notebooks, "NOTEBOOKS", tmp_path)
     monkeypatch.setenv("COURSEKIT_CAMERA", "728612070259")
     before = built.read_bytes()
     assert build_notebooks.main(["--into", str(tmp_path / "build"), "01_toy"]) == 0
@@ -118,11 +133,18 @@ def test_a_copy_keeps_its_widgets_and_the_users_environment(built, tmp_path, mon
     assert cell_of(copy, "sum")["outputs"][0]["text"] == ["0.476 m, camera 728612070259\n"]
 
 
-def test_an_unknown_name_is_refused_with_the_known_ones(built, monkeypatch, capsys):
-    monkeypatch.setattr(build_notebooks, "NOTEBOOKS", built.parent)
+@pytest.mark.usefixtures("built")
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["07_arm"], "there is no notebook '07_arm'; there are 01_toy"),
+        (["--run"], "--run belongs to --check"),
+    ],
+)
+def test_what_cannot_be_done_is_refused(arguments, says, capsys):
     with pytest.raises(SystemExit):
-        build_notebooks.main(["07_arm"])
-    assert "there is no notebook '07_arm'; there are 01_toy" in capsys.readouterr().err
+        build_notebooks.main(arguments)
+    assert says in capsys.readouterr().err
 
 
 # ---- checking -----------------------------------------------------------------------------------
@@ -205,9 +227,8 @@ def test_check_notices_a_file_that_another_program_wrote(built):
     assert [text for text in problems(built) if "was not written by" in text]
 
 
-def test_check_fails_on_a_file_that_is_no_notebook(tmp_path, monkeypatch, capsys):
-    (tmp_path / "01_toy.ipynb").write_text("[]", encoding="utf-8")
-    monkeypatch.setattr(build_notebooks, "NOTEBOOKS", tmp_path)
+def test_check_fails_on_a_file_that_is_no_notebook(built, capsys):
+    built.write_text("[]", encoding="utf-8")
     assert build_notebooks.main(["--check"]) == 1
     assert "01_toy.ipynb: not a notebook" in capsys.readouterr().out
 
@@ -224,14 +245,14 @@ def test_the_stored_notebooks_are_in_order():
 # ---- repeating ----------------------------------------------------------------------------------
 
 
-def test_what_repeats_passes_and_nothing_is_written(built, built_text, monkeypatch, capsys):
-    monkeypatch.setattr(build_notebooks, "NOTEBOOKS", built.parent)
+def test_what_repeats_passes_and_nothing_is_written(light, capsys):
+    before = light.read_bytes()
     assert build_notebooks.main(["--check", "--run"]) == 0
     first, second = capsys.readouterr().out.splitlines()
     assert first == "01_toy twice ... the same"
     assert re.fullmatch(r"2 executions, \d+ s", second)
-    assert built.read_text(encoding="utf-8") == built_text
-    assert list(built.parent.iterdir()) == [built]
+    assert light.read_bytes() == before
+    assert list(light.parent.iterdir()) == [light]
 
 
 def test_cells_that_do_not_repeat_or_are_out_of_date_are_named(tmp_path, monkeypatch, capsys):
@@ -269,44 +290,30 @@ def picture(notebook):
     return cell_of(notebook, "figure")["outputs"][0]["data"]
 
 
-def test_a_cell_that_fails_is_named_when_run_for_a_check(tmp_path, monkeypatch, capsys):
-    path = toy({"once": "print('1')"}, tmp_path / "01_toy.ipynb")
-    build_notebooks.build(path)
-    edit(path, change("once", source=["1 / 0"]))
-    monkeypatch.setattr(build_notebooks, "NOTEBOOKS", tmp_path)
+def test_a_cell_that_fails_is_named_when_run_for_a_check(light, capsys):
+    edit(light, change("sum", source=["1 / 0"]))
     assert build_notebooks.main(["--check", "--run"]) == 1
-    assert "01_toy, cell once: ZeroDivisionError: division by zero" in capsys.readouterr().out
-
-
-def test_run_without_check_is_refused(capsys):
-    with pytest.raises(SystemExit):
-        build_notebooks.main(["--run"])
-    assert "--run belongs to --check" in capsys.readouterr().err
+    assert "01_toy, cell sum: ZeroDivisionError: division by zero" in capsys.readouterr().out
 
 
 # ---- what nbval makes of it ---------------------------------------------------------------------
 
 
-def nbval(path, scratch):
+def test_nbval_fails_on_one_changed_digit_and_passes_what_is_stripped_as_well(built, tmp_path):
+    """Which is why --check exists."""
+    changed, stripped = tmp_path / "02_toy.ipynb", tmp_path / "03_toy.ipynb"
+    for path in (changed, stripped):
+        path.write_bytes(built.read_bytes())
+        edit(path, lighten)
+    edit(changed, change("sum", outputs=output("0.477 m, camera simulated\n")))
+    edit(stripped, strip)
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-c", os.devnull]
-    command += ["--rootdir", str(path.parent), "--nbval", "--nbval-current-env", str(path)]
-    environment = build_notebooks.kernel_environment(scratch)
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-
-
-def test_nbval_passes_a_built_notebook_with_a_checkpoint(built, tmp_path):
-    run = nbval(built, tmp_path)
-    assert "6 passed" in run.stdout, run.stdout
-
-
-def test_nbval_fails_on_one_changed_digit(built, tmp_path):
-    edit(built, change("sum", outputs=output("0.477 m, camera simulated\n")))
-    run = nbval(built, tmp_path)
-    assert "1 failed, 5 passed" in run.stdout, run.stdout
+    command += ["--rootdir", str(tmp_path), "--nbval", "--nbval-current-env", str(tmp_path)]
+    environment = build_notebooks.kernel_environment(tmp_path)
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert "1 failed, 15 passed" in run.stdout, run.stdout
+    assert re.findall(r"^FAILED .*(0\d_toy.ipynb::Cell \d+)", run.stdout, re.MULTILINE) == [
+        "02_toy.ipynb::Cell 4"
+    ]
     assert "0.477 m" in run.stdout
-
-
-def test_nbval_passes_a_stripped_notebook_which_is_why_check_exists(built, tmp_path):
-    edit(built, strip)
-    assert "6 passed" in nbval(built, tmp_path).stdout
-    assert len(problems(built)) == len(SOURCES)
+    assert len(problems(stripped)) == len(SOURCES) - 1

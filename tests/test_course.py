@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -285,97 +286,12 @@ def test_failed_set_up_says_why_and_names_the_log(project: Path) -> None:
     assert (code, calls(project), "Replacing" in output) == (0, ALL, False)
 
 
-# What the programs said here when each cause was provoked (addresses and folders shortened).
-SAID = {
-    "pip, hash": (
-        "the course was tested with",
-        "ERROR: THESE PACKAGES DO NOT MATCH THE HASHES FROM THE REQUIREMENTS FILE. If you have "
-        "updated the package versions, please update the hashes.\n"
-        "        Expected sha256 0000\n             Got        c66a",
-    ),
-    "uv, hash": (
-        "the course was tested with",
-        "error: Failed to download `anyio==4.16.0`\n  cause: Hash mismatch for `anyio==4.16.0`",
-    ),
-    "pip, proxy": (
-        "the network",
-        "WARNING: Retrying (Retry(total=0, connect=None)) after connection broken by "
-        "'ProxyError('Cannot connect to proxy.', NewConnectionError('Failed to establish a new "
-        "connection: [Errno 111] Connection refused'))': /anyio/\n"
-        "ERROR: Could not find a version that satisfies the requirement anyio==4.16.0\n"
-        "ERROR: No matching distribution found for anyio==4.16.0",
-    ),
-    "pip, no name server": (
-        "the network",
-        "WARNING: Retrying (Retry(total=0)) after connection broken by 'NewConnectionError('Failed "
-        "to establish a new connection: [Errno -2] Name or service not known')': /anyio/\n"
-        "ERROR: No matching distribution found for anyio==4.16.0",
-    ),
-    "uv, proxy": (
-        "the network",
-        "error: Request failed after 3 retries in 10.3s\n  cause: Failed to fetch: anyio\n"
-        "  cause: client error (Connect)\n  cause: tcp connect error\n"
-        "  cause: Connection refused (os error 111)",
-    ),
-    "uv, no name server": (
-        "the network",
-        "error: Request failed after 3 retries in 8.9s\n  cause: client error (Connect)\n"
-        "  cause: dns error\n  cause: failed to lookup address information",
-    ),
-    "uv, offline": (
-        "the network",
-        "error: No solution found when resolving dependencies\n\nhint: Packages were unavailable "
-        "because the network was disabled.",
-    ),
-    "pip, certificate": (
-        "certificate is not trusted",
-        "There was a problem confirming the ssl certificate: Max retries exceeded (Caused by "
-        "SSLError('[SSL: CERTIFICATE_VERIFY_FAILED] certificate verify failed'))\n"
-        "ERROR: No matching distribution found for anyio==4.16.0",
-    ),
-    "uv, certificate": (
-        "certificate is not trusted",
-        "  cause: error sending request for url\n  cause: client error (Connect)\n"
-        "  cause: invalid peer certificate: UnknownIssuer",
-    ),
-    "pip, disk": (
-        "the disk is full",
-        "Installing collected packages: numpy\nERROR: Could not install packages due to an "
-        "OSError: [Errno 28] No space left on device",
-    ),
-    "uv, disk": (
-        "the disk is full",
-        "error: Failed to install: numpy.whl\n  cause: failed to copy file: No space left on "
-        "device (os error 28)",
-    ),
-    "pip, a retry that went well, then the disk": (
-        "the disk is full",
-        "WARNING: Retrying (Retry(total=4)) after connection broken by 'NewConnectionError('Failed "
-        "to establish a new connection')'\nERROR: OSError: [Errno 28] No space left on device",
-    ),
-    "uv, platform": (
-        "does not exist for this computer",
-        "error: No solution found when resolving dependencies\n  cause: Because "
-        "llvmlite==0.50.0 has no usable wheels, your requirements are unsatisfiable.",
-    ),
-    "system, read-only": (
-        "cannot be written",
-        "[Errno 30] Read-only file system: '.venv'",
-    ),
-    "Windows, in use": (
-        "cannot be written, or is in use",
-        "[WinError 5] Zugriff verweigert: 'python.exe'",
-    ),
-    "something else": (
-        "saying last: boom",
-        "first\nboom\n",
-    ),
-}
+SAID = tomllib.loads((ROOT / "tests/failed_set_ups.toml").read_text(encoding="utf-8"))
 
 
-@pytest.mark.parametrize(("wanted", "said"), SAID.values(), ids=SAID.keys())
-def test_cause_is_recognised(course: ModuleType, wanted: str, said: str) -> None:
-    assert wanted in course.explain(said)
+@pytest.mark.parametrize("name", SAID)
+def test_cause_is_recognised(course: ModuleType, name: str) -> None:
+    assert SAID[name]["wanted"] in course.explain(SAID[name]["said"])
 
 
 def stand_in(folder: Path, name: str, status: int) -> None:

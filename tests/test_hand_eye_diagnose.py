@@ -126,7 +126,7 @@ def search_of(given: HandEyeSession) -> CauseSearch[MendedPairs]:
     velocity = None
     if given.dq is not None:
         velocity = (widowx().jacobian(given.q) @ given.dq[..., None])[..., 0]
-    return causes.search(PosePairs.of(given), Arms(widowx(), None, given.q, velocity))
+    return causes.search_pairs(PosePairs.of(given), Arms(widowx(), None, given.q, velocity))
 
 
 def test_two_mistakes_are_both_named() -> None:

@@ -10,10 +10,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from simulated_hand_eye import holds
 
-from coursekit.arm import ArmErrors, fk_error, pose_difference, widowx
-from coursekit.boards import detect
-from coursekit.geometry import invert_transform
+from coursekit.arm import ArmErrors, widowx
+from coursekit.geometry import invert_transform, pose_difference
 from coursekit.hand_eye import observability
 from coursekit.hand_eye.poses import camera_board
 from coursekit.hand_eye.session import HandEyeSession
@@ -59,20 +59,13 @@ def test_truth_closes_the_loop_and_the_report_is_off_by_what_the_arm_errs(mount)
     expected = camera_board(truth.T_base_gripper, truth.X, truth.setup.Y, mount)
     np.testing.assert_allclose(truth.T_camera_board, expected, atol=1e-12)
     np.testing.assert_allclose(session.T_base_gripper, widowx().forward(session.q), atol=1e-12)
-    shift, _ = fk_error(truth.T_base_gripper, session.T_base_gripper)
-    assert 5e-4 < np.median(shift) < 8e-3
+    off = pose_difference(session.T_base_gripper, truth.T_base_gripper)
+    assert 5e-4 < np.median(np.linalg.norm(off[:, 3:], axis=1)) < 8e-3
     exact, truth = hand_eye_session(mount, 5)
     np.testing.assert_allclose(exact.T_base_gripper, truth.T_base_gripper, atol=1e-12)
-
-
-@pytest.mark.parametrize("mount", MOUNTS)
-def test_solve_finds_X(mount) -> None:
-    session, truth = hand_eye_session(mount, 6)
-    off = pose_difference(truth.X, session.solve().X)
+    off = pose_difference(truth.X, exact.solve().X)
     assert np.abs(off[3:]).max() < 3e-4
     assert np.abs(off[:3]).max() < np.radians(0.05)
-    closed = pose_difference(truth.X, session.solve("park").X)
-    assert np.abs(closed[3:]).max() < 3e-3
 
 
 def test_the_same_seed_gives_the_same_session_and_another_one_another() -> None:
@@ -103,16 +96,12 @@ def test_each_mistake_does_what_it_says() -> None:
     healthy, truth = made()
     T = healthy.T_base_gripper
     np.testing.assert_allclose(made(inverted_poses=True)[0].T_base_gripper, invert_transform(T))
-    np.testing.assert_allclose(
-        made(inverted_detections=True)[0].seen, invert_transform(healthy.T_camera_board)
-    )
+    C, inverted = healthy.T_camera_board, made(inverted_detections=True)[0]
+    np.testing.assert_allclose(inverted.seen, invert_transform(C))
     assert made(wrong_mount=True)[0].mount == "eye_to_hand"
-    np.testing.assert_allclose(
-        made(millimetres="arm")[0].T_base_gripper[:, :3, 3], 1e3 * T[:, :3, 3]
-    )
-    np.testing.assert_allclose(
-        made(millimetres="board")[0].seen[:, :3, 3], 1e3 * healthy.T_camera_board[:, :3, 3]
-    )
+    for far, near in ((made(millimetres="arm")[0].T_base_gripper, T),
+                      (made(millimetres="board")[0].seen, C)):  # fmt: skip
+        np.testing.assert_allclose(far[:, :3, 3], 1e3 * near[:, :3, 3])
     degrees = made(degrees="joints")[0]
     np.testing.assert_allclose(degrees.q, np.degrees(healthy.q))
     np.testing.assert_allclose(degrees.T_base_gripper, widowx().forward(degrees.q))
@@ -125,57 +114,48 @@ def test_each_mistake_does_what_it_says() -> None:
     assert abs(np.linalg.norm(np.cross(given.ravel(), wrong.ravel()))) < 1e-9
 
     late, truth = made(late_s=0.05)
-    np.testing.assert_allclose(
-        late.q, widowx_angles(late, truth) + 0.05 * late.dq, atol=1e-9)  # fmt: skip
+    true, reached = widowx().inverse(truth.T_base_gripper, late.q, elsewhere=False)
+    assert reached.all()
+    np.testing.assert_allclose(late.q, true + 0.05 * late.dq, atol=1e-9)
     zero, truth = made(joint_offset_deg=2.0)
     assert truth.joint in {1, 2, 3, 4}
     off = np.linalg.norm(pose_difference(zero.T_base_gripper, truth.T_base_gripper)[:, :3], axis=1)
     np.testing.assert_allclose(np.degrees(off), 2.0, atol=1e-6)
     larger, truth = made(square_scale=1.05)
-    np.testing.assert_allclose(
-        larger.solve(free_scale=True).scale, 1.05, atol=0.001)  # fmt: skip
+    assert larger.solve(free_scale=True).scale == pytest.approx(1.05, abs=0.001)
     np.testing.assert_allclose(healthy.times, SECONDS * np.arange(25))
-
-
-def widowx_angles(session, truth) -> np.ndarray:
-    """The joint angles (n, 6) at the images, by inverse kinematics near the reported ones."""
-    q, reached = widowx().inverse(truth.T_base_gripper, session.q, elsewhere=False)
-    assert reached.all()
-    return q
 
 
 @pytest.mark.parametrize("by", [1, -1, 2])
 def test_shifted_by(by: int) -> None:
     healthy, _ = hand_eye_session("eye_in_hand", 12, n=15)
-    shifted, _ = hand_eye_session(
-        "eye_in_hand", 12, n=15, mistakes=HandEyeMistakes(shifted_by=by)
-    )  # fmt: skip
+    mistakes = HandEyeMistakes(shifted_by=by)
+    shifted, _ = hand_eye_session("eye_in_hand", 12, n=15, mistakes=mistakes)
     assert len(shifted) == 15 - abs(by)
-    for i in range(len(shifted)):
-        image = healthy.names.index(shifted.names[i])
-        np.testing.assert_allclose(
-            shifted.T_base_gripper[i], healthy.T_base_gripper[image - by], atol=1e-12)  # fmt: skip
+    own = [healthy.names.index(name) - by for name in shifted.names]
+    np.testing.assert_allclose(shifted.T_base_gripper, healthy.T_base_gripper[own], atol=1e-12)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_degenerate_designs_leave_free_what_they_should(mount) -> None:
-    def free(design: str) -> tuple[str, ...]:
+    for design, words in (
+        ("careful", ()),
+        ("grid", ("translation along all axes is free",)),
+        ("single_axis", "translation along the common axis"),
+    ):
         session, _ = hand_eye_session(mount, 1, mistakes=HandEyeMistakes(design=design))
-        return observability(session.T_base_gripper, mount).free
-
-    assert free("careful") == ()
-    assert free("grid") == ("translation along all axes is free",)
-    axis = free("single_axis")
-    assert any("translation along the common axis" in words for words in axis)
+        free = observability(session.T_base_gripper, mount).free
+        assert free == words or (design == "single_axis" and any(words in one for one in free))
 
 
 def test_arguments_are_checked() -> None:
-    with pytest.raises(ValueError, match="design: got 'circle'"):
-        HandEyeMistakes(design="circle")
-    with pytest.raises(ValueError, match="square_scale: got 0"):
-        HandEyeMistakes(square_scale=0.0)
-    with pytest.raises(ValueError, match="late_s: got nan"):
-        HandEyeMistakes(late_s=float("nan"))
+    for options, message in (
+        ({"design": "circle"}, "design: got 'circle'"),
+        ({"square_scale": 0.0}, "square_scale: got 0"),
+        ({"late_s": float("nan")}, "late_s: got nan"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            HandEyeMistakes(**options)
     with pytest.raises(ValueError, match="corner_noise_px"):
         hand_eye_session("eye_in_hand", 0, corner_noise_px=-1)
     with pytest.raises(ValueError, match="mount: got 'on_the_ceiling'"):
@@ -183,8 +163,8 @@ def test_arguments_are_checked() -> None:
 
 
 def test_rendered_images_agree_with_the_corners() -> None:
-    session, truth, images = rendered_session("eye_in_hand", 2, n=8)
-    assert len(images) == len(session) == 8
+    session, truth, images = rendered_session("eye_in_hand", 2, n=4)
+    assert len(images) == len(session) == 4
     for i, d in enumerate(session.seen):
         off = d.pixels - seen_by_opencv(truth, i)[d.ids]
         assert np.sqrt(np.mean(off**2)) < 0.15
@@ -195,24 +175,21 @@ def test_rendered_images_agree_with_the_corners() -> None:
 
 def test_a_session_checks_what_belongs_together() -> None:
     session, _ = hand_eye_session("eye_in_hand", 0, n=10)
-    with pytest.raises(ValueError, match="seen: got 9, T_base_gripper has 10"):
-        replace(session, seen=session.seen.pick(range(9)), names=())
-    with pytest.raises(ValueError, match="q: got shape"):
-        replace(session, q=session.q[:5])
-    q = session.q.copy()
+    q, T = session.q.copy(), session.T_base_gripper.copy()
     q[3, 2] = np.nan
-    with pytest.raises(ValueError, match=r"q\[3\]: has NaN"):
-        replace(session, q=q)
-    with pytest.raises(ValueError, match="dq: velocities need"):
-        replace(session, q=None, dq=session.q)
-    with pytest.raises(ValueError, match="board: got None"):
-        replace(session, board=None)
-    T = session.T_base_gripper.copy()
     T[4, :3, 0] *= -1
-    with pytest.raises(ValueError, match=r"T_base_gripper\[4\].*reflection"):
-        replace(session, T_base_gripper=T)
-    with pytest.raises(ValueError, match="mount"):
-        replace(session, mount="eye_on_hand")
+    for changes, message in (
+        ({"seen": session.seen.pick(range(9)), "names": ()}, "seen: got 9, want 10"),
+        ({"names": ("a", "b")}, "names: got 2, want 10"),
+        ({"q": session.q[:5]}, r"q: got shape \(5, 6\), want \(10, 6\)"),
+        ({"q": q}, r"q\[3\]: got .*nan"),
+        ({"q": None, "dq": session.q}, "q: got None, want the joint angles"),
+        ({"board": None}, "board: got None"),
+        ({"T_base_gripper": T}, r"T_base_gripper\[4\].*reflection"),
+        ({"mount": "eye_on_hand"}, "mount"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            replace(session, **changes)
 
 
 def test_pick_and_repr() -> None:
@@ -273,7 +250,7 @@ def test_shipped_sessions_show_the_error_of_the_arm(shipped) -> None:
         truth, result = truth_of(folder), session.solve()
         off = pose_difference(truth.X, result.X)
         assert 3e-4 < np.linalg.norm(off[3:]) < 6e-3
-        outside += int(np.sum(~result.holds(truth.X)))
+        outside += int(np.sum(~holds(result, truth.X)))
         text = (folder / "session.json").read_text("utf-8")
         assert f"{truth.X[0, 3]:.4f}" not in text
     assert outside >= 6  # of 12 numbers, where honest intervals would miss 0.6
@@ -300,7 +277,7 @@ def test_save_and_read_again(small, tmp_path) -> None:
     assert again.board == session.board
     assert again.intrinsics == session.intrinsics
     assert json.loads((folder / "session.json").read_text(encoding="utf-8"))["origin"] == "a test"
-    with pytest.raises(ValueError, match=r"images: no 'view_00.jpg'"):
+    with pytest.raises(ValueError, match=r"images: got \[\], want .* 'view_00.jpg'"):
         session.save(folder, {})
 
 
@@ -361,10 +338,3 @@ def test_folders_that_are_no_session(small, tmp_path) -> None:
     (small / "poses.csv").write_text("\n".join(text.splitlines()[:3]), encoding="utf-8")
     with pytest.raises(ValueError, match="2 usable pairs"):
         read(small, **known)
-
-
-def test_detection_of_a_shipped_image_is_what_the_session_holds(shipped) -> None:
-    session = shipped[1]
-    image = cv2.imread(str(SHIPPED[1] / "view_03.jpg"), cv2.IMREAD_GRAYSCALE)
-    alone = detect(image, session.board)
-    np.testing.assert_array_equal(alone.pixels, session.seen[3].pixels)

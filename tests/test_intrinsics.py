@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from simulated_corners import CHARUCO, CHECKERBOARD, LENS, fit
 
 from coursekit import intrinsics
-from coursekit.boards import Board, Detection, Detections
-from coursekit.geometry import Intrinsics, project
+from coursekit.boards import Detection, Detections
+from coursekit.geometry import Intrinsics, moved, project
 from coursekit.intrinsics.derivatives import (
     PARAMETERS,
-    moved,
     parameter_vector,
     project_with_derivatives,
     scaled_inverse,
@@ -22,12 +22,6 @@ from coursekit.intrinsics.derivatives import (
     with_parameters,
 )
 from coursekit.simulation.corner_sessions import Effects, bowed, corner_session
-
-LENS = Intrinsics(
-    640, 480, 612.0, 610.0, 322.0, 238.0, "brown_conrady", (0.08, -0.18, 0.0007, -0.0004, 0.05)
-)
-CHARUCO = Board("charuco", (9, 6), 0.025)
-CHECKERBOARD = Board("checkerboard", (10, 7), 0.025)
 
 
 @pytest.fixture(scope="module")
@@ -37,8 +31,8 @@ def session() -> tuple[Detections, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def result(session):
-    return intrinsics.calibrate(session[0], CHARUCO)
+def result():
+    return fit(CHARUCO, 1)
 
 
 def corners_for_opencv(detections, board=CHARUCO):

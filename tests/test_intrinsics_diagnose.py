@@ -19,7 +19,7 @@ from scipy.stats import binom, kstest
 from coursekit.boards import Board, Detection, Detections, Skipped
 from coursekit.geometry import Intrinsics
 from coursekit.intrinsics import causes
-from coursekit.intrinsics.causes import Calibration, Corners, Linear
+from coursekit.intrinsics.causes import Calibration, CornerTable, Linear
 from coursekit.intrinsics.diagnosis import blur_lengths_px, depth_scale, diagnose, stored_power
 from coursekit.intrinsics.fit import calibrate
 from coursekit.simulation.corner_sessions import Effects, Truth, corner_session
@@ -116,7 +116,7 @@ def test_two_causes_are_both_named_and_measured() -> None:
     assert set(findings.names) == {"bowed_board", "spoiled_view"}
     spoiled, bowed = findings
     assert f"view {truth.spoiled_view:02d}:" in spoiled.evidence
-    found = causes.search(calibrate(detections, CHECKERBOARD))
+    found = causes.search_residuals(calibrate(detections, CHECKERBOARD))
     assert {step.test.cause for step in found.accepted} == {"bowed_board", "spoiled_view"}
     sag, sigma = causes.sag(found.model)
     assert abs(sag - 1e-3) < 4 * sigma < 2e-4
@@ -128,13 +128,13 @@ def test_the_sizes_of_focus_drift_and_shutter_motion_come_out() -> None:
     drifting, truth = corner_session(
         CHECKERBOARD, LENS, FIRST_SEED + 1, effects=Effects(focus_drift=0.02)
     )
-    model = causes.search(calibrate(drifting, CHECKERBOARD)).model
+    model = causes.search_residuals(calibrate(drifting, CHECKERBOARD)).model
     assert tuple(model.sizes) == (causes.FOCUS,)
     assert model.sizes[causes.FOCUS] == pytest.approx(truth.focal_scale.std(), rel=0.25)
     moving, truth = corner_session(
         CHECKERBOARD, LENS, FIRST_SEED + 1, effects=Effects(readout_s=0.02, speed_m_s=0.1)
     )
-    model = causes.search(calibrate(moving, CHECKERBOARD)).model
+    model = causes.search_residuals(calibrate(moving, CHECKERBOARD)).model
     assert tuple(model.sizes) == (causes.SHUTTER,)
     assert np.sqrt(3) * model.sizes[causes.SHUTTER] == pytest.approx(0.002, rel=0.25)
     estimated, true = model.values[causes.SHUTTER][:, :2], 0.02 * truth.velocity_m_s[:, :2]
@@ -149,7 +149,7 @@ def small(seed: int, effects: Effects | None = None) -> Calibration:
     return causes.refit(Calibration.of(calibrate(detections, CHARUCO)))
 
 
-def dense_jacobian(linear: Linear, corners: Corners) -> np.ndarray:
+def dense_jacobian(linear: Linear, corners: CornerTable) -> np.ndarray:
     n = len(corners.view)
     poses = np.zeros((n, 2, 6, 6))
     poses[np.arange(n), :, corners.view] = linear.own

@@ -7,35 +7,21 @@ start at the true lens: where a fit starts does not change where it ends (test_i
 from __future__ import annotations
 
 import math
-import os
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from simulated_corners import CHARUCO, CHECKERBOARD, LENS, NIGHTLY, fit
 
 from coursekit import intrinsics
 from coursekit.boards import Board, Detection, Detections
-from coursekit.geometry import (
-    Intrinsics,
-    deproject,
-    invert_transform,
-    make_transform,
-    project,
-    transform_points,
-)
-from coursekit.intrinsics.derivatives import moved, parameter_vector, with_parameters
+from coursekit.geometry import deproject, invert_transform, moved, project, transform_points
+from coursekit.intrinsics.derivatives import parameter_vector, with_parameters
 from coursekit.intrinsics.fit import evaluate, image_grid
-from coursekit.simulation.corner_sessions import Effects, corner_session
+from coursekit.simulation.corner_sessions import corner_session
 
-NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 SESSIONS = 1000 if NIGHTLY else 60
 WITHIN = (0.93, 0.97) if NIGHTLY else (0.87, 1.0)
-LENS = Intrinsics(
-    640, 480, 612.0, 610.0, 322.0, 238.0, "brown_conrady", (0.08, -0.18, 0.0007, -0.0004, 0.05)
-)
 TRUTH = {"fx": 612.0, "fy": 610.0, "cx": 322.0, "cy": 238.0, "k1": 0.08}
-CHARUCO = Board("charuco", (9, 6), 0.025)
-CHECKERBOARD = Board("checkerboard", (10, 7), 0.025)
 PIXELS = np.array([[320.0, 240.0], [20, 20], [620, 460], [600, 100], [150, 400]])
 RANGES_M = (0.45, 2.0)
 
@@ -117,72 +103,12 @@ def test_uncertainty_is_the_spread_over_repeated_sessions() -> None:
         np.testing.assert_allclose(np.std(spread, axis=0) / sigma, 1.0, atol=1.3 * tolerance)
 
 
-# --- what tilt buys: claim I2 ---
-
-CLAIM_LENS = Intrinsics(1280, 720, 900.0, 900.0, 640.0, 360.0)
-CLAIM_PERCENT = {1: 41.0, 2: 10.0, 5: 1.8, 10: 0.52, 20: 0.20, 45: 0.10}
-
-
-def tilted_all_around(tilt_deg: float, views: int = 12) -> np.ndarray:
-    """Poses of a 9x6-corner board centred at 0.5 m, tilted to 12 sides by the same angle."""
-    centre = CHECKERBOARD.points.mean(axis=0)
-    poses = []
-    for angle in 2 * np.pi * np.arange(views) / views:
-        axis = np.array([np.cos(angle), np.sin(angle), 0.0])
-        R = Rotation.from_rotvec(np.radians(tilt_deg) * axis)
-        poses.append(make_transform(R, np.array([0, 0, 0.5]) - R.apply(centre)))
-    return np.stack(poses)
-
-
-@pytest.mark.parametrize("tilt_deg", CLAIM_PERCENT if NIGHTLY else (1, 5, 20))
-def test_sigma_of_the_focal_length_against_tilt(tilt_deg: int) -> None:
-    """Claim I2 reads: nine by six inner corners, every view tilted by the angle, to all sides.
-
-    Fits of noisy corners scatter, and say that they do, as the exact sigma of that claim's test.
-    """
-    poses = tilted_all_around(tilt_deg)
-    clean = [
-        Detection(
-            np.arange(54), project(transform_points(T, CHECKERBOARD.points), CLAIM_LENS.K),
-            CLAIM_LENS.size,
-        )
-        for T in poses
-    ]  # fmt: skip
-    rng = np.random.default_rng(tilt_deg)
-    focal, sigmas = [], []
-    for _ in range(300 if NIGHTLY else 50):
-        try:
-            fit = intrinsics.calibrate(noisy(clean, rng, 0.2), CHECKERBOARD, model="none")
-        except intrinsics.CalibrationFailed:
-            assert tilt_deg == 1  # one in a hundred has no camera at all
-            continue
-        focal.append(fit.value("fx"))
-        sigmas.append(100 * fit.sigma("fx") / fit.value("fx"))
-    low, high = np.quantile(focal, [0.1587, 0.8413])  # robust: at 1 deg a few run away
-    spread = 100 * (high - low) / 2 / CLAIM_LENS.fx
-    factor = 1.3 if tilt_deg >= 5 else 1.6  # far from linear below
-    assert 1 / factor < spread / CLAIM_PERCENT[tilt_deg] < factor
-    assert 1 / factor < np.median(sigmas) / CLAIM_PERCENT[tilt_deg] < factor
-
-
-def test_rms_does_not_show_that_the_focal_length_is_unknown() -> None:
-    flat, _ = corner_session(CHECKERBOARD, LENS, 0, effects=Effects(max_tilt_deg=3.0))
-    tilted, _ = corner_session(CHECKERBOARD, LENS, 0)
-    useless = intrinsics.calibrate(flat, CHECKERBOARD)
-    useful = intrinsics.calibrate(tilted, CHECKERBOARD)
-    assert useless.rms_px == pytest.approx(useful.rms_px, rel=0.05)
-    assert useless.sigma("fx") > 30 * useful.sigma("fx")
-    # at the boards' own distance the wrong focal length hardly shows either; far away it does
-    assert np.median(useless.uncertainty_map(useless.board_range_m)) < 0.5
-    assert np.median(useless.uncertainty_map(math.inf)) > 4
-
-
 # --- the functions ---
 
 
 @pytest.fixture(scope="module")
 def result() -> intrinsics.IntrinsicsResult:
-    return intrinsics.calibrate(corner_session(CHARUCO, LENS, 1)[0], CHARUCO)
+    return fit(CHARUCO, 1)
 
 
 def test_map_is_projection_sigma_on_a_grid_and_that_the_worst_direction(result) -> None:

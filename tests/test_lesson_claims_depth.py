@@ -11,7 +11,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from lesson_claims import ROWS, claim
+from lesson_claims import ROWS, claim, nominal_fx_px
 
 from coursekit import plots, stereo
 from coursekit.geometry import deproject
@@ -170,7 +170,7 @@ def test_d8_what_a_hundred_frames_buy() -> None:
 def test_d9_minimum_range() -> None:
     theory = FB / 126
     ROWS["D9"].says(f"{theory:.3f} m", "0.2-0.3 m")
-    at_1280 = D435.nominal.depth_fx_px(1280) * BASELINE / 126
+    at_1280 = nominal_fx_px("D435", 1280) * BASELINE / 126
     sheets = {"195 mm at 848x480": theory, "280 mm at 1280x720": at_1280}
     ROWS["D9"].says(*sheets)
     for text, least in sheets.items():  # a little above what the search allows

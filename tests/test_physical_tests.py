@@ -53,7 +53,7 @@ def test_two_good_cameras_on_a_good_arm_agree() -> None:
 
 def test_the_mount_is_checked() -> None:
     _, above = hand_eye_session("eye_to_hand", 5, n=6)
-    with pytest.raises(ValueError, match=r"^truth: got eye_to_hand"):
+    with pytest.raises(ValueError, match=r"^truth: got 'eye_to_hand'"):
         touch_corners(above)
     with pytest.raises(ValueError, match=r"^on_wrist, over_shoulder: "):
         shared_target(above, above)

@@ -133,10 +133,7 @@ def test_both_cameras_see_the_whole_of_both_objects():
         for box in scene[BLOCK:]:
             signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
             corners = signs * box.size_m / 2 @ box.T_scene_box[:3, :3].T + box.T_scene_box[:3, 3]
-            for intrinsics, T in (
-                (UNIT.depth, np.eye(4)),
-                (UNIT.color, UNIT.T_color_depth),
-            ):
+            for intrinsics, T in ((UNIT.depth, np.eye(4)), (UNIT.color, UNIT.T_color_depth)):
                 pixels = project(corners @ T[:3, :3].T + T[:3, 3], intrinsics.K)
                 assert (pixels > 20).all()
                 assert (pixels < np.array(intrinsics.size) - 20).all()

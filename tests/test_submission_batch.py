@@ -480,7 +480,7 @@ def test_a_folder_with_anything_else_in_it_is_not_touched(what, tmp_path):
         ({"folder": "nowhere"}, "there is no such folder"),
         ({"folder": "empty"}, r"there is no bundle \(.zip\) in it or below it; want"),
         ({"folder": "papers"}, "in it, only 1 other file; want"),
-        ({"workers": 0}, "workers: got 0"),
+        ({"workers": 0}, "workers: got 0, want a positive"),
         ({"timeout_s": 0.0}, "timeout_s: got 0.0"),
         ({"timeout_s": float("nan")}, "timeout_s: got nan"),
     ],

@@ -165,7 +165,7 @@ def test_a_number_is_right_up_to_its_tolerance_and_noticed_beyond(
         assert result.points < result.of
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(where=st.sampled_from(NUMBERS[:-2]), by=st.floats(-6, 6))
 def test_a_claim_is_right_exactly_within_its_tolerance(where: tuple[str, int], by: float) -> None:
     submission, found = _exact_once()

@@ -40,8 +40,8 @@ from coursekit.submission import format as bundle_format
 from coursekit.submission.format import Refused, Submission, bundle_bytes, read_bundle, zip_bytes
 
 NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
-STRUCTURED = 5_000 if NIGHTLY else 300
-MUTATED = 200_000 if NIGHTLY else 2_000
+STRUCTURED = 5_000 if NIGHTLY else 200
+MUTATED = 200_000 if NIGHTLY else 1_000
 KINDS = list(hostile())
 
 

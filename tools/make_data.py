@@ -103,17 +103,29 @@ def _jpeg(image: np.ndarray, quality: int = 95) -> bytes:
 
 
 POWER_SEEDS = range(5000, 5100)  # neither those of development nor those of the tests
-POWER_SIZES = {  # the effect, its unit, how many of that make one of the effect's, sizes in it
-    "bowed_board": ("bow_m", "mm", 1e3, (0.05, 0.08, 0.1, 0.12, 0.15, 0.2, 0.3)),
-    "focus_drift": ("focus_drift", "%", 1e2, (0.3, 0.5, 0.8, 1.0, 1.3, 1.6, 2.0)),
-    "rolling_shutter": ("speed_m_s", "m/s at 20 ms", 1.0, (0.01, 0.02, 0.03, 0.04, 0.06, 0.1)),
+POWER_SIZES = {  # the unit, the effect of so many of it, how many
+    "bowed_board": (
+        "mm",
+        lambda size: Effects(bow_m=size / 1e3),
+        (0.05, 0.08, 0.1, 0.12, 0.15, 0.2, 0.3),
+    ),
+    "focus_drift": (
+        "%",
+        lambda size: Effects(focus_drift=size / 1e2),
+        (0.3, 0.5, 0.8, 1.0, 1.3, 1.6, 2.0),
+    ),
+    "rolling_shutter": (
+        "m/s at 20 ms",
+        lambda size: Effects(readout_s=0.02, speed_m_s=size),
+        (0.01, 0.02, 0.03, 0.04, 0.06, 0.1),
+    ),
 }
 
 
 def diagnosis_power() -> None:
     """data/diagnosis_power.json: in how many simulated sessions a cause of some size is named."""
     causes = {}
-    for cause, (_, unit, _, sizes) in POWER_SIZES.items():
+    for cause, (unit, _, sizes) in POWER_SIZES.items():
         named = [times_named(cause, size) for size in sizes]
         causes[cause] = {"unit": unit, "sizes": sizes, "named": named, "sessions": len(POWER_SEEDS)}
     origin = (
@@ -129,8 +141,7 @@ def times_named(cause: str, size: float, seeds: Sequence[int] = POWER_SEEDS) -> 
     Each size gets the same seeds, and so the same poses and noise; about 0.2 s a session.
     """
     lens = ck.specifications.device("D435").unit.color
-    field, _, factor, _ = POWER_SIZES[cause]
-    effects = Effects(**{field: size / factor}, readout_s=0.02)
+    effects = POWER_SIZES[cause][1](size)
     sessions = (corner_session(BOARD, lens, seed, effects=effects)[0] for seed in seeds)
     return sum(cause in diagnose(session, BOARD).names for session in sessions)
 

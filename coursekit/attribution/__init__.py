@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from coursekit.attribution.ledger import Entry, Ledger
 from coursekit.attribution.simulate import SimulatedMisses, four_sets, simulate_misses
-from coursekit.attribution.verdict import Attribution, Verdict, attribute
+from coursekit.attribution.verdict import Attribution, Blame, attribute
 
 __all__ = [
     "Attribution",
+    "Blame",
     "Entry",
     "Ledger",
     "SimulatedMisses",
-    "Verdict",
     "attribute",
     "four_sets",
     "simulate_misses",

@@ -10,17 +10,28 @@ from __future__ import annotations
 import contextlib
 import csv
 import io
-import math
 import sys
 from collections.abc import Iterator
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
+from coursekit import checks
 from coursekit.attribution.verdict import Attribution
+from coursekit.checks import want
 from coursekit.results import folder, now, write_bytes
+from coursekit.words import counted
 
-FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")  # what a spreadsheet takes as a formula
+FORMULA_SIGNS = (
+    "=",
+    "+",
+    "-",
+    "@",
+    "＝",
+    "＋",
+    "－",
+    "＠",
+)  # what a spreadsheet takes as a formula
 LONGEST = 500
 
 
@@ -54,28 +65,28 @@ class Entry:
     note: str = ""
 
     def __post_init__(self) -> None:
-        for name, value in zip(HEADER, astuple(self), strict=True):
-            _check(name, value)
+        for name, value in zip(LEDGER_HEADER, astuple(self), strict=True):
+            if name in TEXTS:
+                plain = isinstance(value, str) and len(value) <= LONGEST and value.isprintable()
+                want(plain, name, value, f"one line of {LONGEST} letters at most")
+                want(value or name not in ("date", "task"), name, value, "some text")
+            elif value is not None and name == "trials":
+                checks.whole(name, value, least=0)
+            elif value is not None:
+                checks.number(name, value)
 
     @classmethod
     def of(cls, found: Attribution, task: str, camera: str = "", **rest: Any) -> Entry:
         """The row of an attribution, dated now. rest: other fields, such as tolerance_mm."""
-        given: dict[str, Any] = {
-            "date": now(),
-            "task": task,
-            "camera": camera,
-            "trials": found.n,
-            "p_mean": found.p_mean,
-            "p_pose": found.p_pose,
-            "verdict": found.verdict,
-        }
+        seen = found.evidence
+        given = {"trials": seen.n, "p_mean": seen.mean.p_value, "p_pose": seen.p_pose} | rest
         for axis, mean, scatter in zip("xyz", found.mean_m, found.scatter_m, strict=True):
             given[f"mean_{axis}_mm"] = 1e3 * float(mean)
             given[f"scatter_{axis}_mm"] = 1e3 * float(scatter)
-        return cls(**given | rest)
+        return cls(now(), task, camera, verdict=found.verdict, **given)
 
 
-HEADER = tuple(field.name for field in fields(Entry))
+LEDGER_HEADER = tuple(field.name for field in fields(Entry))
 TEXTS = ("date", "task", "camera", "verdict", "note")
 
 
@@ -83,6 +94,9 @@ class Ledger:
     """A CSV file of `Entry` rows, made when the first is appended.
 
     path: None takes `ledger.csv` beside the results of the notebooks.
+
+    >>> Ledger("no such folder/ledger.csv").read()
+    ()
     """
 
     def __init__(self, path: Path | str | None = None) -> None:
@@ -94,15 +108,13 @@ class Ledger:
         Raises ValueError, and leaves the file as it is, where it has another header or a damaged
         row; OSError where it cannot be written.
         """
-        if not isinstance(entry, Entry):
-            raise ValueError(f"entry: got a {type(entry).__name__}, want an Entry")
+        checks.instance("entry", entry, Entry)
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with _locked(self.path.with_name(f".{self.path.name}.lock")):
             rows = [*self.read(), entry]
             text = io.StringIO(newline="")
             writer = csv.writer(text, lineterminator="\n")
-            writer.writerow(HEADER)
-            writer.writerows([_cell(value) for value in astuple(row)] for row in rows)
+            writer.writerows([LEDGER_HEADER, *(map(_cell, astuple(row)) for row in rows)])
             write_bytes(self.path, text.getvalue().encode("utf-8"))
 
     def read(self) -> tuple[Entry, ...]:
@@ -117,20 +129,14 @@ class Ledger:
         except UnicodeDecodeError as error:
             raise ValueError(f"{self.path.name}: is not UTF-8 text ({error.reason})") from error
         reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-        entries = []
         try:
-            for index, row in enumerate(reader):
-                if index:
-                    entries.append(_entry(row))
-                elif tuple(row) != HEADER:
-                    raise ValueError(f"the header is {','.join(row)[:80]!r}, not a ledger's")
+            header = tuple(next(reader, ("nothing",)))
+            if header != LEDGER_HEADER:
+                raise ValueError(f"the header is {','.join(header)[:80]!r}, not a ledger's")
+            return tuple(map(_entry, reader))
         except (ValueError, csv.Error) as error:
-            raise ValueError(
-                f"{self.path.name}, line {reader.line_num}: {error}. Mend it or move it away."
-            ) from error
-        if reader.line_num == 0:
-            raise ValueError(f"{self.path.name}: is empty. Move it away.")
-        return tuple(entries)
+            where = f"{self.path.name}, line {max(reader.line_num, 1)}"
+            raise ValueError(f"{where}: {error}. Mend it or move it away.") from error
 
     def __repr__(self) -> str:
         rows = self.read()
@@ -139,7 +145,7 @@ class Ledger:
             f"{row.verdict or 'budget'}"
             for row in rows
         ]
-        return "\n".join([f"{self.path.name}: {len(rows)} row{'s' * (len(rows) != 1)}", *lines])
+        return "\n".join([f"{self.path.name}: {counted(len(rows), 'row')}", *lines])
 
 
 def _cell(value: str | float | None) -> str:
@@ -148,54 +154,38 @@ def _cell(value: str | float | None) -> str:
         return ""
     if not isinstance(value, str):
         return f"{value:.6g}"
-    risky = value.lstrip().startswith(FORMULA) or value.startswith("'")
+    risky = value.lstrip().startswith(FORMULA_SIGNS) or value.startswith("'")
     return "'" + value if risky else value
 
 
 def _entry(row: list[str]) -> Entry:
-    if len(row) != len(HEADER):
-        raise ValueError(f"has {len(row)} fields, want {len(HEADER)}")
-    return Entry(**{name: _value(name, cell) for name, cell in zip(HEADER, row, strict=True)})
+    """The entry that is written in a row of cells; ValueError for what is none."""
+    if len(row) != len(LEDGER_HEADER):
+        raise ValueError(f"has {len(row)} fields, want {len(LEDGER_HEADER)}")
+    return Entry(
+        **{name: _value(name, cell) for name, cell in zip(LEDGER_HEADER, row, strict=True)}
+    )
 
 
 def _value(name: str, cell: str) -> Any:
+    """What a cell holds; text where a number should be is left for `Entry` to refuse."""
     if name in TEXTS:
         return cell.removeprefix("'")
-    if not cell:
-        return None
-    try:
+    with contextlib.suppress(ValueError):
         return int(cell) if name == "trials" else float(cell)
-    except ValueError:
-        raise ValueError(f"{name} is {cell[:40]!r}, want a number") from None
-
-
-def _check(name: str, value: Any) -> None:
-    if name in TEXTS:
-        plain = isinstance(value, str) and len(value) <= LONGEST and value.isprintable()
-        if not plain:
-            raise ValueError(f"{name}: got {str(value)[:40]!r}, want one line of {LONGEST} at most")
-        if not value and name in ("date", "task"):
-            raise ValueError(f"{name}: got nothing")
-    elif value is not None:
-        kinds = (int,) if name == "trials" else (int, float)
-        if isinstance(value, bool) or not isinstance(value, kinds) or not math.isfinite(value):
-            raise ValueError(f"{name}: got {value!r}, want a finite number or None")
+    return cell or None
 
 
 @contextlib.contextmanager
 def _locked(path: Path) -> Iterator[None]:
     """Held by one writer at a time; given back when the writer ends, however it ends."""
     with path.open("a+", encoding="utf-8") as file:
-        _lock(file)
+        if sys.platform == "win32":
+            import msvcrt
+
+            msvcrt.locking(file.fileno(), msvcrt.LK_LOCK, 1)  # waits up to ten seconds
+        else:
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX)
         yield  # closing the file unlocks it
-
-
-def _lock(file: TextIO) -> None:
-    if sys.platform == "win32":
-        import msvcrt
-
-        msvcrt.locking(file.fileno(), msvcrt.LK_LOCK, 1)  # waits up to ten seconds
-    else:
-        import fcntl
-
-        fcntl.flock(file, fcntl.LOCK_EX)

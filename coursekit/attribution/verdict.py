@@ -1,62 +1,51 @@
-"""What the tests add up to: a verdict, or how many more trials one would take.
+"""From the misses of repeated grasps to what to repair: the calibration, the eyes, or the arm.
 
 A verdict costs something to act on, so it needs two things: a test that rejects the other
-explanation, and enough trials that the explanations which were not seen would have been.
-
-From the misses of repeated grasps to what to repair: the calibration, the eyes, or the arm.
-
-Three tests: is the mean miss zero, do the misses follow the pose, do they differ from place to
-place by more than repeats in one place do. `decision` says what they add up to.
+explanation, and enough trials that the explanations which were not seen would have been. So each
+cause that may be at work stands with its test, and with how surely that test would have found it
+(`Cause`); `decide` goes through them in a fixed order.
 """
 
 from __future__ import annotations
 
-import textwrap
 from bisect import bisect_left
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Literal, NamedTuple
 
 import numpy as np
 
+from coursekit import checks
 from coursekit.arrays import ArrayLike, Floats
-from coursekit.attribution.significance import (
-    GROUPS,
-    SAME_M,
-    STILL,
-    MeanTest,
-    PlaceTest,
-    PoseTest,
-    effective_axes,
-    mean_power,
-    mean_test,
-    place_test,
-    pose_columns,
-    pose_power,
-    pose_test,
-)
-from coursekit.hand_eye.poses import check_poses
+from coursekit.attribution import significance
+from coursekit.attribution.significance import MeanTest, PlaceTest, PoseTest
+from coursekit.checks import want
+from coursekit.words import wrapped
 
-Verdict = Literal["calibration", "perception", "pose_dependent", "cannot_tell_yet"]
+Blame = Literal["calibration", "perception", "pose_dependent", "cannot_tell_yet"]
 
-FEWEST = 5  # trials below which nothing is decided
-SURE = 0.9  # power with which "there is none" may be said
+TEST_LEVEL = 0.01  # of each test
+ENOUGH_POWER = 0.9  # with which "there is none" may be said
+FEWEST_TRIALS, MOST_TRIALS = 5, 500  # fewer decide nothing; nobody grasps more often to find out
+MATTERS_M = 0.003
+TOO_LONG_M = 0.5  # a miss that long was given in millimetres
+FEW_DIGITS = 1e-4  # of a rotation: poses are often written with five
+COVERAGE = 0.95
 # A mean is blamed on the calibration only if a part of the same size that follows the pose would
 # have shown in one set of three, and, unless it would have been sure to, if the tests of the pose
 # are not already close to showing one.
-SEEN, SUSPECT = 1 / 3, 0.02
-# Of that size if the places are WIDE_M apart (rms about their middle) or more; less if they are
+HINT_POWER, SUSPECT_LEVEL = 1 / 3, 0.02
+# Of that size if the places are so far apart (rms about their middle) or more; less if they are
 # nearer, where an arm errs nearly alike. All over the table of `simulate` is 0.18 m. There slipped
 # joints change a miss by a third of what they shift all by at 0.11 m, and by a tenth at 0.03 m.
-WIDE_M = 0.1
+FAR_APART_M = 0.1
 # The trials in repeated places count one by one for the mean only if these do not seem to differ:
 # the p-value that is usual for pooling (Bancroft 1944, Annals of Mathematical Statistics 15, 190,
 # and those after him). Otherwise the mean must stand out among the means of the places too.
-POOL = 0.25
-ANY_POSE = 7  # numbers of the general regression
-DOUBT = 0.05  # p-value of the mean below which "perception" is not said
-MOST = 500  # trials: nobody grasps more often to find out
-REMEDY: dict[Verdict, str] = {
+POOLING_LEVEL = 0.25
+DOUBT_LEVEL = 0.05  # of the mean, below which "perception" is not said
+REMEDY: dict[Blame, str] = {
     "calibration": "repeat the hand-eye calibration, which also takes up what the arm is wrong by "
     "everywhere, or measure the constant and subtract it; more frames will not help",
     "perception": "look at the detector, the depth and its averaging; a new calibration will not "
@@ -74,22 +63,84 @@ BY_PLACE = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Tests:
-    """All tests of a set of n trials with scatter S (3, 3), m^2, and their powers.
+# --- what may be at work ---
 
-    pose, places: None where they could not be had. spread: how much of its size an error of the arm
-    changes by over these poses, 0 (one place) to 1 (all over the table); None if they are not
-    known.
+
+@dataclass(frozen=True, eq=False)
+class Cause:
+    """One thing that may make grasps miss, as its test sees it.
+
+    p_value: of "there is none of it", 1 where that could not be tested. S (3, 3), m^2, and axes:
+    the scatter that it must stand out from. columns, beside: how many numbers describe it, and how
+    many others are fitted. share: of the level that its test has. counted: what the test counts in
+    the n trials that there are (trials, or places); more trials bring as many more of them.
+    """
+
+    p_value: float
+    S: Floats
+    axes: float
+    columns: int
+    beside: int
+    share: float
+    counted: int
+    n: int
+
+    def power(self, size_m: float, n: int, level: float = TEST_LEVEL) -> float:
+        """How surely it would be found in n trials, if it were of this size, m rms."""
+        counted, level = round(n * self.counted / self.n), level * self.share
+        return significance.power_of_test(
+            size_m, self.S, self.axes, counted, self.columns, self.beside, level
+        )
+
+    def shows(self, size_m: float, n: int, level: float = TEST_LEVEL) -> bool:
+        """Whether that is sure enough."""
+        return self.power(size_m, n, level) >= ENOUGH_POWER
+
+
+@dataclass(frozen=True, eq=False)
+class MissEvidence:
+    """What n trials say of each cause.
+
+    constant: all trials share it. by_pose: it follows the pose, by the regression. by_place: the
+    places differ, by their repeats; of_places: the means of the places share it. mean, pose,
+    places: the tests themselves. None where poses or repeats are missing. spread: how much of its
+    size an error of the arm changes by over these poses, 0 (one place) to 1 (all over the table);
+    None if they are not known.
     """
 
     n: int
-    S: Floats
     mean: MeanTest
     pose: PoseTest | None
     places: PlaceTest | None
     spread: float | None
-    level: float
+    constant: Cause
+    by_pose: Cause
+    by_place: Cause | None
+    of_places: Cause | None
+
+    @classmethod
+    def of(cls, misses: Floats, T_base_gripper: Floats | None) -> MissEvidence:
+        """All tests of misses (n, 3), m, at poses (n, 4, 4)."""
+        n, S, mean = len(misses), np.cov(misses.T), significance.mean_test(misses)
+        pose, places, spread = None, None, None
+        if T_base_gripper is not None:
+            pose = significance.pose_test(misses, significance.pose_columns(T_base_gripper))
+            places = significance.place_test(misses, T_base_gripper, TEST_LEVEL)
+            apart = float(np.sqrt(T_base_gripper[:, :3, 3].var(axis=0).sum()))
+            near = apart <= significance.ONE_PLACE_M
+            spread = 0.0 if near else min(1.0, apart / FAR_APART_M)
+        share = 1.0 if pose is None or places is None else 0.5  # two tests of the pose
+        p_pose, numbers = (1.0, 7) if pose is None else (pose.p_value, pose.columns)
+        # p-value, scatter and its axes, numbers of its own and beside, share of the level, how many
+        constant = Cause(mean.p_value, S, mean.axes, 3, 0, significance.POOLED_SHARE, n, n)
+        by_pose = Cause(p_pose, S, mean.axes, numbers, 3, share, n, n)
+        by_place, of_places = None, None
+        if places is not None:
+            k, p, axes, trials = places.places, places.p_value, places.axes, places.trials
+            by_place = Cause(p, places.S, axes, 3 * (k - 1), 3, share, trials, n)
+            own, means = np.cov(places.means_m.T), significance.mean_test(places.means_m)
+            of_places = replace(constant, p_value=means.p_value, S=own, axes=means.axes, counted=k)
+        return cls(n, mean, pose, places, spread, constant, by_pose, by_place, of_places)
 
     @property
     def p_pose(self) -> float | None:
@@ -97,151 +148,136 @@ class Tests:
         found = [test.p_value for test in (self.pose, self.places) if test is not None]
         return min(1.0, len(found) * min(found)) if found else None
 
-    def mean_power(self, size_m: float, n: int) -> float:
-        """How surely a constant of length size_m is found in n trials."""
-        return mean_power(size_m, self.S, self.mean.axes, n, self.level)
-
-    def pose_power(self, size_m: float, n: int, level: float | None = None) -> float:
-        """The same of a part that follows the pose, rms, by the regression."""
-        columns = ANY_POSE if self.pose is None else self.pose.columns
-        level = (level or self.level) / self._shares
-        return pose_power(size_m, self.S, self.mean.axes, n, columns, level)
-
-    def place_power(self, size_m: float, n: int, level: float | None = None) -> float:
-        """The same of any differences between the places that were repeated, rms; 1 without."""
-        if self.places is None:
-            return 1.0
-        some = round(n * self.places.trials / self.n)  # in the same places, as often
-        S, axes, level = self.places.S, self.places.axes, (level or self.level) / self._shares
-        return pose_power(size_m, S, axes, some, self.places.columns, level)
-
-    def none_power(self, size_m: float, n: int) -> float:
+    @property
+    def pose_cause(self) -> Cause:
         """What "the pose does not matter" rests on: the repeats; without them, the regression."""
-        if self.p_pose is None:
-            return 1.0  # not asked for
-        test = self.pose_power if self.places is None else self.place_power
-        return test(size_m, n)
+        return self.by_place or self.by_pose
 
-    def pose_may_be(self, size_m: float, spread: float | None) -> bool:
+    def pose_may_hide(self, size_m: float, spread: float) -> bool:
         """Whether what follows the pose, at poses spread so, may hide behind a mean of size_m.
 
         Unrelated errors of the places must be larger than their mean, by the root of their number.
         """
-        if spread is None:
-            return False
-        seen = self.pose_power(spread * size_m, self.n, SUSPECT)
-        if self.places is not None:
+        shows = self.by_pose.power(spread * size_m, self.n, SUSPECT_LEVEL)
+        if self.by_place is not None and self.places is not None:
             each = size_m * self.places.places**0.5
-            seen = min(seen, self.place_power(each, self.n, SUSPECT))
-        suspect = self.p_pose is not None and self.p_pose < SUSPECT
-        return seen < SEEN or (suspect and seen < SURE)
-
-    def places_may_be(self) -> bool:
-        """Whether the mean may be that of a few places with errors of their own."""
-        if self.places is None or self.places.p_value >= POOL:
-            return False
-        return mean_test(self.places.means_m).p_value >= self.level
-
-    def places_power(self, size_m: float, n: int) -> float:
-        """How surely a constant of size_m stands out among places like these, as often repeated."""
-        assert self.places is not None
-        S, places = np.cov(self.places.means_m.T), self.places.places
-        axes = effective_axes(S, places)
-        return mean_power(size_m, S, axes, round(places * n / self.n), self.level)
-
-    def finds_both(self, size_m: float, n: int) -> bool:
-        """Whether n trials are enough to say that there is neither, of size_m."""
-        return n >= FEWEST and min(self.mean_power(size_m, n), self.none_power(size_m, n)) >= SURE
-
-    @property
-    def _shares(self) -> int:
-        """How many tests of the pose share the level."""
-        return 1 if self.pose is None or self.places is None else 2
+            shows = min(shows, self.by_place.power(each, self.n, SUSPECT_LEVEL))
+        suspected = self.p_pose is not None and self.p_pose < SUSPECT_LEVEL
+        return shows < HINT_POWER or (suspected and shows < ENOUGH_POWER)
 
 
-@dataclass(frozen=True)
-class Decision:
-    """verdict, says: why. more_trials: that would settle it, 0 if it is, None beyond 500."""
+# --- the decision ---
 
-    verdict: Verdict
+
+class Decision(NamedTuple):
+    """verdict, says: why. more_trials: that would settle it, 0 if it is, None beyond 500. remedy:
+    what to do."""
+
+    verdict: Blame
     says: str
     more_trials: int | None
     remedy: str
 
 
-def decide(tests: Tests, length_m: float, matters_m: float) -> Decision:
-    """The verdict on trials whose mean has length_m, where matters_m is worth finding."""
-    if tests.n < FEWEST:
-        why = f"{tests.n} trials decide nothing, {FEWEST} are the fewest"
-        return _undecided(why, tests.n, lambda n: tests.finds_both(matters_m, n))
-    if tests.p_pose is not None and tests.p_pose < tests.level:
-        return _pose_dependent(tests)
-    if tests.mean.p_value < tests.level:
-        return _constant(tests, length_m)
-    return _scatter(tests, length_m, matters_m)
+def decide(seen: MissEvidence, length_m: float, matters_m: float) -> Decision:
+    """The verdict on trials whose mean has length_m, where matters_m is worth finding.
 
+    The first line that holds; "would show" is a power of 0.9:
 
-def _pose_dependent(tests: Tests) -> Decision:
-    places = tests.places
-    if places is None or places.p_value >= tests.level:
-        return _decided("pose_dependent", "the miss changes with the pose of the gripper")
-    says = (
-        f"the miss changes by {1e3 * places.part_m:.1f} mm from place to place, repeats in one "
-        f"place scatter by {1e3 * places.scatter_m:.1f} mm"
-    )
-    follows = places.p_follows is not None and places.p_follows < tests.level
-    return Decision("pose_dependent", says, 0, REMEDY["pose_dependent"] if follows else BY_PLACE)
-
-
-def _constant(tests: Tests, length_m: float) -> Decision:
-    share = f"the misses share {1e3 * length_m:.1f} mm"
-    seen = lambda n: tests.pose_power(length_m, n, SUSPECT) >= SURE  # noqa: E731
-    if tests.places_may_be():
-        says = f"{share}, but as likely because few places with errors of their own were tried"
-        more = lambda n: tests.places_power(length_m, n) >= SURE  # noqa: E731
-        return _undecided(says, tests.n, more, ELSEWHERE)
-    if not tests.pose_may_be(length_m, tests.spread):
-        return _decided("calibration", f"{share} in one direction")
-    if tests.spread and tests.pose_may_be(length_m, 1.0):
-        says = f"{share}, but too few trials rule out that they follow the pose"
-        return _undecided(says, tests.n, seen)
-    says = f"{share}, but the places are too near each other to tell it from an error of the arm"
-    elsewhere = lambda n: n >= tests.n + FEWEST and seen(n)  # noqa: E731
-    return _undecided(says, tests.n, elsewhere, ELSEWHERE)
-
-
-def _scatter(tests: Tests, length_m: float, matters_m: float) -> Decision:
-    of_size, n = f"{1e3 * matters_m:.0f} mm", tests.n
-    if not tests.finds_both(matters_m, n):
+    ==================================================================  ===============
+    fewer than 5 trials                                                 cannot tell yet
+    the pose matters (p < 0.01)                                         pose dependent
+    the mean is not zero (p < 0.01) ...                                 by `_constant`
+    a constant, or what follows the pose, of matters_m would not show   cannot tell yet
+    the mean is hardly zero (p < 0.05)                                  cannot tell yet
+    otherwise                                                           perception
+    ==================================================================  ===============
+    """
+    n, of_size = seen.n, f"{1e3 * matters_m:.0f} mm"
+    neither = [partial(seen.constant.shows, matters_m)]
+    if seen.p_pose is not None:
+        neither.append(partial(seen.pose_cause.shows, matters_m))
+    if n < FEWEST_TRIALS:
+        says = f"{n} trials decide nothing, {FEWEST_TRIALS} are the fewest"
+        return _undecided(n, says, neither)
+    if seen.p_pose is not None and seen.p_pose < TEST_LEVEL:
+        return _pose_dependent(seen)
+    if seen.mean.p_value < TEST_LEVEL:
+        return _constant(seen, length_m)
+    if not all(shows(n) for shows in neither):
         says = f"no cause shows, but one of {of_size} could hide in {n} trials with this scatter"
-        return _undecided(says, n, lambda n: tests.finds_both(matters_m, n))
-    if tests.mean.p_value < DOUBT:
+        return _undecided(n, says, neither)
+    if seen.mean.p_value < DOUBT_LEVEL:
         says = f"the misses share {1e3 * length_m:.1f} mm, which is hardly chance, but may be"
-        return _undecided(says, n, lambda n: tests.mean_power(length_m, n) >= SURE)
-    rest = "" if tests.p_pose is None else f", nor a part of {of_size} that follows the pose"
-    if tests.places is not None:
+        return _undecided(n, says, [partial(seen.constant.shows, length_m)])
+    rest = "" if seen.p_pose is None else f", nor a part of {of_size} that follows the pose"
+    if seen.places is not None:
         rest = f", nor a difference of {of_size} between the places"
-    return _decided("perception", f"scatter: no constant of {of_size}{rest} would have hidden")
+    says = f"scatter: no constant of {of_size}{rest} would have hidden"
+    return Decision("perception", says, 0, REMEDY["perception"])
 
 
-def _decided(verdict: Verdict, says: str) -> Decision:
-    return Decision(verdict, says, 0, REMEDY[verdict])
+def _pose_dependent(seen: MissEvidence) -> Decision:
+    """By the places where their repeats show it, else by the regression."""
+    says, remedy = "the miss changes with the pose of the gripper", REMEDY["pose_dependent"]
+    places = seen.places
+    if places is not None and places.p_value < TEST_LEVEL:
+        says = (
+            f"the miss changes by {1e3 * places.part_m:.1f} mm from place to place, repeats in one "
+            f"place scatter by {1e3 * places.scatter_m:.1f} mm"
+        )
+        if places.p_follows is None or places.p_follows >= TEST_LEVEL:
+            remedy = BY_PLACE
+    return Decision("pose_dependent", says, 0, remedy)
+
+
+def _constant(seen: MissEvidence, length_m: float) -> Decision:
+    """Of a mean that is not zero. The first line that holds:
+
+    ==================================================================  ===============
+    the places may differ, and their few means may be zero              cannot tell yet
+    a part as large that follows the pose would have shown a hint       calibration
+    it would not, even with the places far apart: too few trials        cannot tell yet
+    it would, were the places farther apart                             cannot tell yet
+    ==================================================================  ===============
+    """
+    n, share, of_places = seen.n, f"the misses share {1e3 * length_m:.1f} mm", seen.of_places
+    may_differ = seen.by_place is not None and seen.by_place.p_value < POOLING_LEVEL
+    if may_differ and of_places is not None and of_places.p_value >= TEST_LEVEL:
+        says = f"{share}, but as likely because few places with errors of their own were tried"
+        return _undecided(n, says, [partial(of_places.shows, length_m)], ELSEWHERE)
+    if seen.spread is None or not seen.pose_may_hide(length_m, seen.spread):
+        return Decision("calibration", f"{share} in one direction", 0, REMEDY["calibration"])
+    pose = [partial(seen.by_pose.shows, length_m, level=SUSPECT_LEVEL)]
+    if seen.spread and seen.pose_may_hide(length_m, 1.0):
+        says = f"{share}, but too few trials rule out that they follow the pose"
+        return _undecided(n, says, pose)
+    says = f"{share}, but the places are too near each other to tell it from an error of the arm"
+    return _undecided(n, says, pose, ELSEWHERE, n + FEWEST_TRIALS)
 
 
 def _undecided(
-    says: str, n: int, settled: Callable[[int], bool], remedy: str = REMEDY["cannot_tell_yet"]
+    n: int,
+    says: str,
+    needed: Sequence[Callable[[int], bool]],
+    remedy: str = REMEDY["cannot_tell_yet"],
+    least: int = FEWEST_TRIALS,
 ) -> Decision:
-    """more_trials from what total settles it; power only grows with trials."""
-    total = bisect_left(range(MOST + 1), True, lo=n + 1, key=settled)
-    return Decision("cannot_tell_yet", says, total - n if total <= MOST else None, remedy)
+    """more_trials from the least total in which all that is needed shows; power only grows.
+
+    needed: for each cause that has to show, whether it does in n trials. least: trials in any case.
+    """
+    total = bisect_left(
+        range(MOST_TRIALS + 1),
+        True,
+        lo=n + 1,
+        key=lambda n: n >= least and all(shows(n) for shows in needed),
+    )
+    more = total - n if total <= MOST_TRIALS else None
+    return Decision("cannot_tell_yet", says, more, remedy)
 
 
-LEVEL = 0.01
-MATTERS_M = 0.003
-COVERAGE = 0.95
-FAR_M = 0.5
-LINE = 88
-AXES = ("x", "y", "z")
+# --- the answer ---
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -250,134 +286,88 @@ class Attribution:
 
     verdict: "calibration" (one direction in the base), "perception" (scatter), "pose_dependent"
     (the miss follows the pose of the arm, or the place), "cannot_tell_yet". says: why, in a
-    sentence. remedy: what to do about it.
+    sentence. more_trials: how many more would settle it, 0 where it is settled, None where 500
+    would not do. remedy: what to do about it.
 
-    n: trials. mean_m (3,), interval_m (3, 2), scatter_m (3,): mean miss along the base's axes, its
-    95 % interval axis by axis, and the std of one trial. p_mean: of "the mean is zero", by
-    Hotelling's T^2 and the pooled test joined (`mean_test` has both). p_pose: of "the pose does not
-    matter", by the regression (`pose_test`, p_regression) and, where places were repeated, by the
-    places (`place_test`, p_places) joined with Bonferroni; each None where it could not be had.
-
-    power_mean, power_pose: how surely a constant, or a part that follows the pose (rms; with
-    repeats, any difference between the places), of matters_m would be found in n such trials;
-    level: of the tests. more_trials: how many more would settle it, 0 where it is settled, None
-    where 500 would not do.
+    mean_m (3,), interval_m (3, 2), scatter_m (3,): mean miss along the base's axes, its 95 %
+    interval axis by axis, and the std of one trial. evidence: each test, and how surely it would
+    have found what it looks for. matters_m: the size that is worth finding.
     """
 
-    verdict: Verdict
+    verdict: Blame
     says: str
-    n: int
+    more_trials: int | None
+    remedy: str
     mean_m: Floats
     interval_m: Floats
     scatter_m: Floats
-    mean_test: MeanTest
-    pose_test: PoseTest | None
-    place_test: PlaceTest | None
-    p_pose: float | None
-    power_mean: float
-    power_pose: float | None
-    more_trials: int | None
-    level: float
+    evidence: MissEvidence
     matters_m: float
-    remedy: str
 
-    @property
-    def p_mean(self) -> float:
-        """How often misses with a mean of zero look at least this constant."""
-        return self.mean_test.p_value
-
-    @property
-    def p_regression(self) -> float | None:
-        """How often misses that do not follow the pose look as if they did at least this much."""
-        return None if self.pose_test is None else self.pose_test.p_value
-
-    @property
-    def p_places(self) -> float | None:
-        """How often places that do not matter look at least this different, beside repeats."""
-        return None if self.place_test is None else self.place_test.p_value
-
-    @property
-    def p_hotelling(self) -> float | None:
-        """Of Hotelling's T^2 alone; None under 4 trials and for scatter in a plane."""
-        return self.mean_test.p_t2
-
-    @property
-    def evidence(self) -> tuple[str, ...]:
+    def lines(self) -> list[str]:
         """The numbers behind the verdict, a line each, mm."""
+        seen, pose, place = self.evidence, self.evidence.pose, self.evidence.places
         axes = ", ".join(
             f"{axis} {1e3 * mean:+.1f} ({1e3 * low:+.1f} to {1e3 * high:+.1f})"
-            for axis, mean, (low, high) in zip(AXES, self.mean_m, self.interval_m, strict=True)
+            for axis, mean, (low, high) in zip("xyz", self.mean_m, self.interval_m, strict=True)
         )
         scatter = ", ".join(f"{1e3 * std:.1f}" for std in self.scatter_m)
-        return (
+        t2 = (
+            "" if seen.mean.t2 is None else f"; T² = {seen.mean.t2:.1f}, alone {_p(seen.mean.p_t2)}"
+        )
+        find = f"; power to find {1e3 * self.matters_m:.0f} mm: "
+        constant = seen.constant.power(self.matters_m, seen.n)
+        lines = [
             f"mean miss {axes} mm (95 %)",
             f"scatter of one trial {scatter} mm along x, y, z",
-            self._mean_line(),
-            self._pose_line(),
-            *self._place_lines(),
-        )
-
-    def _mean_line(self) -> str:
-        test = self.mean_test
-        t2 = "" if test.t2 is None else f"; T² = {test.t2:.1f}, alone {_p(test.p_t2)}"
-        return (
-            f"mean of zero: {_p(self.p_mean)}{t2}; power to find "
-            f"{1e3 * self.matters_m:.0f} mm: {self.power_mean:.0%}"
-        )
-
-    def _pose_line(self) -> str:
-        test = self.pose_test
-        if test is None:
-            return "not tested against the pose: an arm error that follows it is not ruled out"
-        shares = ", ".join(f"{name} {share:.0%}" for name, share in test.shares.items())
-        alone = f"; of the scatter, alone: {shares}" if shares else ""
-        return (
-            f"pose does not matter: {_p(test.p_value)}; the part that follows it "
-            f"{1e3 * test.part_m:.1f} mm rms{alone}{'' if self.place_test else self._power_pose()}"
-        )
-
-    def _place_lines(self) -> tuple[str, ...]:
-        test = self.place_test
-        if test is None:
-            return ()
-        both = "" if self.pose_test is None else f"; with the line above {_p(self.p_pose)}"
-        return (
-            f"{test.places} places repeated, {test.trials} trials: place does not matter: "
-            f"{_p(test.p_value)}{both}; places differ by {1e3 * test.part_m:.1f} mm rms, repeats "
-            f"in one by {1e3 * test.scatter_m:.1f} mm{self._power_pose()}",
-        )
-
-    def _power_pose(self) -> str:
-        return f"; power to find {1e3 * self.matters_m:.0f} mm: {self.power_pose:.0%}"
+            f"mean of zero: {_p(seen.mean.p_value)}{t2}{find}{constant:.0%}",
+        ]
+        if pose is not None:
+            shares = [f"{name} {share:.0%}" for name, share in pose.shares.items()]
+            alone = f"; of the scatter, alone: {', '.join(shares)}" if shares else ""
+            lines.append(
+                f"pose does not matter: {_p(pose.p_value)}; the part that follows it "
+                f"{1e3 * pose.part_m:.1f} mm rms{alone}"
+            )
+        else:
+            lines.append(
+                "not tested against the pose: an arm error that follows it is not ruled out"
+            )
+        if place is not None:
+            both = f"; with the line above {_p(seen.p_pose)}" if pose is not None else ""
+            lines.append(
+                f"{place.places} places repeated, {place.trials} trials: place does not matter: "
+                f"{_p(place.p_value)}{both}; places differ by {1e3 * place.part_m:.1f} mm rms, "
+                f"repeats in one by {1e3 * place.scatter_m:.1f} mm"
+            )
+        if seen.p_pose is not None:
+            lines[-1] += f"{find}{seen.pose_cause.power(self.matters_m, seen.n):.0%}"
+        return lines
 
     def __repr__(self) -> str:
         name = self.verdict.replace("_", " ").upper()
         lines = [
-            _fill(f"{name} ({self.n} trials): {self.says}."),
-            *(_fill(line, "  ") for line in self.evidence),
-            _fill(f"What to do: {self.remedy}."),
+            wrapped(f"{name} ({self.evidence.n} trials): {self.says}."),
+            *(wrapped(line, first="  ", indent="    ") for line in self.lines()),
+            wrapped(f"What to do: {self.remedy}."),
         ]
         if self.verdict == "cannot_tell_yet":
-            lines.append(_fill(f"Trials: {_more(self.more_trials)}."))
+            more = f"about {self.more_trials} more would settle it, if they scatter like these"
+            if self.more_trials is None:
+                more = f"not even {MOST_TRIALS} would settle it with this scatter"
+            lines.append(wrapped(f"Trials: {more}."))
         return "\n".join(lines)
 
 
 def attribute(
-    misses: ArrayLike,
-    poses: ArrayLike | None = None,
-    *,
-    columns: ArrayLike | None = None,
-    level: float = LEVEL,
-    matters_m: float = MATTERS_M,
+    misses: ArrayLike, poses: ArrayLike | None = None, *, matters_m: float = MATTERS_M
 ) -> Attribution:
     """Decide what repeated grasps miss by: the calibration, perception, or the pose of the arm.
 
     misses (n, 3), n >= 2: where the gripper closed less where the object was, in the base, m, of
     independent trials. poses (n, 4, 4): T_base_gripper of each trial; without them nothing is said
-    about the pose. columns (n, 3, k): instead of what is read from poses, what k suspected numbers
-    do to each trial, such as `arm.jacobian(q)[:, 3:]` for the zeros of the joints. level: of each
-    test. matters_m: the smallest constant, or part that follows the pose, that is worth finding; it
-    decides when "perception" may be said.
+    about the pose. matters_m: the smallest constant, or part that follows the pose, that is worth
+    finding; it decides when "perception" may be said.
 
     The order: misses that follow the pose, or differ from place to place by more than repeats in
     one place do, are "pose_dependent"; else a mean that is not zero is "calibration", if the pose
@@ -393,112 +383,36 @@ def attribute(
     averages out over the table is scatter, hence "perception". And a depth or lens error that
     changes with the place looks like the arm's.
 
-    Raises ValueError for shapes, NaN, lengths of 0.5 m and more (millimetres?), and a level or
-    matters_m out of range.
+    Raises ValueError for shapes, NaN, lengths of 0.5 m and more (millimetres?), and a matters_m out
+    of range.
+
+    >>> from coursekit.attribution import simulate_misses
+    >>> grasps = simulate_misses("calibration", 20, seed=1)
+    >>> attribute(grasps.misses, grasps.T_base_gripper).verdict
+    'calibration'
     """
-    rows = _check_misses(misses)
-    if not 1e-4 <= level < 0.5:
-        raise ValueError(f"level: got {level!r}, want 0.0001 to 0.5")
-    if not 0 < matters_m < FAR_M:
-        raise ValueError(f"matters_m: got {matters_m!r}, want a length in m, such as 0.003")
-    tests = _run(rows, poses, columns, level)
-    center, scatter = rows.mean(axis=0), rows.std(axis=0, ddof=1)
-    half = _t_limit(len(rows)) * scatter / np.sqrt(len(rows))
-    decision = decide(tests, float(np.linalg.norm(center)), matters_m)
-    return Attribution(
-        verdict=decision.verdict,
-        says=decision.says,
-        n=len(rows),
-        mean_m=center,
-        interval_m=np.column_stack([center - half, center + half]),
-        scatter_m=scatter,
-        mean_test=tests.mean,
-        pose_test=tests.pose,
-        place_test=tests.places,
-        p_pose=tests.p_pose,
-        power_mean=tests.mean_power(matters_m, len(rows)),
-        power_pose=None if tests.p_pose is None else tests.none_power(matters_m, len(rows)),
-        more_trials=decision.more_trials,
-        level=level,
-        matters_m=matters_m,
-        remedy=decision.remedy,
-    )
-
-
-def _run(rows: Floats, poses: ArrayLike | None, columns: ArrayLike | None, level: float) -> Tests:
-    pose, places, spread = None, None, None
-    if columns is not None:
-        if poses is not None:
-            raise ValueError("columns: got poses too, want one of them")
-        pose, spread = _test_columns(rows, columns, level)
-    elif poses is not None:
-        T_base_gripper = check_poses("poses", poses)
-        if len(T_base_gripper) != len(rows):
-            raise ValueError(f"poses: got {len(T_base_gripper)}, want one for each of {len(rows)}")
-        pose = pose_test(rows, pose_columns(T_base_gripper), GROUPS, STILL, level)
-        places = place_test(rows, T_base_gripper, level)
-        spread = _spread(T_base_gripper)
-    S = np.cov(rows.T)
-    return Tests(len(rows), S, mean_test(rows), pose, places, spread, level)
-
-
-# --- input ---
-
-
-def _test_columns(rows: Floats, columns: ArrayLike, level: float) -> tuple[PoseTest | None, float]:
-    """The regression on given columns, and 0 where they do not differ from trial to trial."""
-    given = np.asarray(columns, dtype=np.float64)
-    if given.ndim != 3 or given.shape[:2] != rows.shape or not np.isfinite(given).all():
-        raise ValueError(f"columns: got shape {given.shape}, want finite ({len(rows)}, 3, k)")
-    still = STILL * float(np.sqrt((given**2).sum(axis=(1, 2)).mean()))
-    return pose_test(rows, given, {}, still, level), float(_rms(given) > still)
-
-
-def _spread(T_base_gripper: Floats) -> float:
-    apart = _rms(T_base_gripper[:, :3, 3])
-    return min(1.0, apart / WIDE_M) if apart > SAME_M else 0.0
-
-
-def _rms(values: Floats) -> float:
-    """Root mean square distance of values (n, ...) from their mean."""
-    centred = (values - values.mean(axis=0)).reshape(len(values), -1)
-    return float(np.sqrt((centred**2).sum(axis=1).mean()))
-
-
-def _check_misses(misses: ArrayLike) -> Floats:
-    rows = np.asarray(misses, dtype=np.float64)
-    if rows.ndim != 2 or rows.shape[1] != 3 or len(rows) < 2:
-        raise ValueError(f"misses: got shape {rows.shape}, want (n, 3) with 2 trials or more")
-    if not np.isfinite(rows).all():
-        raise ValueError(f"misses[{np.argwhere(~np.isfinite(rows))[0][0]}]: is not finite")
-    if np.linalg.norm(rows, axis=1).max() >= FAR_M:
-        raise ValueError(
-            f"misses: the largest is {np.linalg.norm(rows, axis=1).max():.1f} m "
-            "(are these millimetres?)"
-        )
-    return rows
-
-
-def _t_limit(n: int) -> float:
     from scipy.stats import t
 
-    return float(t.ppf((1 + COVERAGE) / 2, n - 1))
-
-
-# --- in words ---
-
-
-def _more(trials: int | None) -> str:
-    if trials is None:
-        return f"not even {MOST} would settle it with this scatter"
-    return f"about {trials} more would settle it, if they scatter like these"
+    rows = checks.array("misses", misses, (None, 3), finite=True)
+    n = len(rows)
+    want(n >= 2, "misses", rows, "2 trials or more")
+    longest = float(np.linalg.norm(rows, axis=1).max())
+    shorter = f"less than {TOO_LONG_M} m (are these millimetres?)"
+    want(longest < TOO_LONG_M, "misses", f"{longest:.1f} m", shorter)
+    checks.number(
+        "matters_m", matters_m, "a length in m, such as 0.003", above=0.0, most=TOO_LONG_M
+    )
+    if poses is not None:
+        poses = checks.transforms("poses", poses, FEW_DIGITS)
+        want(poses.shape == (n, 4, 4), "poses", poses, f"one (4, 4) for each of {n} trials")
+    seen = MissEvidence.of(rows, poses)
+    center, scatter = rows.mean(axis=0), rows.std(axis=0, ddof=1)
+    half = float(t.ppf((1 + COVERAGE) / 2, n - 1)) * scatter / np.sqrt(n)
+    interval = np.column_stack([center - half, center + half])
+    decision = decide(seen, float(np.linalg.norm(center)), matters_m)
+    return Attribution(*decision, center, interval, scatter, seen, matters_m)
 
 
 def _p(value: float | None) -> str:
-    if value is None:
-        return "p unknown"
-    return "p < 0.001" if value < 0.001 else f"p = {value:.3f}"
-
-
-def _fill(text: str, indent: str = "") -> str:
-    return textwrap.fill(text, LINE, initial_indent=indent, subsequent_indent=indent + "  ")
+    """A p-value to three digits; None only where the test was not done and nothing is printed."""
+    return "p < 0.001" if value is not None and value < 0.001 else f"p = {value:.3f}"

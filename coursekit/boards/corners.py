@@ -50,7 +50,7 @@ LEAST_PULL = 0.3  # per px; less than this and something else than one corner is
 FARTHEST_MOVE = 0.3  # squares from where the search began; farther away is something else
 BLOCK_PX = 4  # px; noise is measured in blocks,
 MOST_BLOCKS = 30_000  # at most so many
-FLAT_SHARE = 0.04  # of the contrast: a block as bright as its neighbours within this has no edge
+FLAT_CONTRAST = 0.04  # of the contrast: a block as bright as its neighbours within this has no edge
 CLIPPED = (3.0, 252.0)  # grey levels at which noise may be cut off
 BINS = 12  # of brightness
 FEWEST_BLOCKS = 30  # in a bin
@@ -104,7 +104,7 @@ def noise_levels(grey: Grey) -> tuple[Floats, Floats]:
     blocks = grey[: rows * n, : columns * n].reshape(rows, n, columns, n)
     level = blocks.mean(axis=(1, 3), dtype=np.float32)
     contrast = np.subtract(*np.quantile(level, [0.99, 0.01]))
-    flat = _is_flat(level, FLAT_SHARE * contrast) & (level > CLIPPED[0]) & (level < CLIPPED[1])
+    flat = _is_flat(level, FLAT_CONTRAST * contrast) & (level > CLIPPED[0]) & (level < CLIPPED[1])
     if flat.sum() < FEWEST_BLOCKS:  # nothing but edges: all blocks, whose lowest are still noise
         flat = np.ones_like(flat)
     row, column = np.nonzero(flat)

@@ -107,6 +107,13 @@ def detect_all(
 
     Raises ValueError when there is no such folder, when it is empty, or for anything else than
     images in a sequence.
+
+    >>> board = Board("charuco", (5, 4), 0.03)
+    >>> picture = np.pad(board.image(42), 40, constant_values=255)
+    >>> detect_all([picture, np.zeros((99, 99), np.uint8)], board)
+    1 view with 12 corners, 1 not used
+      image 0: 12 corners in 290x248, noise 0.115 px
+      not used: image 1: the picture is blank: nearly all of it has grey levels from 0 to 0
     """
     from tqdm.auto import tqdm
 

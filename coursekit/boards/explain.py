@@ -165,7 +165,8 @@ def _other_markers(markers: _Markers, board: Board) -> str:
         return f"{count}: use dictionary={name!r}"
     if _on_plan(markers, board):
         return ""
-    sizes = product(range(FEWEST_SQUARES["charuco"], MOST_SQUARES + 1), repeat=2)
+    counts = range(FEWEST_SQUARES["charuco"], MOST_SQUARES + 1)
+    sizes = ((columns, rows) for columns in counts for rows in counts)
     for squares in sorted(sizes, key=lambda size: (size[0] * size[1], size)):  # fewest first
         if (squares[0] * squares[1] + 1) // 2 <= markers.ids.max():
             continue

@@ -1,22 +1,20 @@
-"""The rows of an error budget: what is wrong, by how much, and what that does at the object.
+"""The error budget: every error at the object, in millimetres, bias and noise apart.
 
 A term has k components (two pixels, three angles, one depth). `matrix` says where one unit of each
 moves the object in the base: dp = M n, M (3, k). What is known of the components differs by kind:
 
-- noise: each component has standard deviation `high`, independent of the others; it averages down.
+- noise: each component has standard deviation `high`, independent of the others; it averages down
+  and adds in quadrature.
 - bias: the components are m n, with a length m between `low` and `high` and an unknown direction n
   (an unknown sign where k = 1); it repeats, so averaging does nothing to it.
 
-The table: every error at the object, in millimetres, bias and noise apart.
-
-Noise averages down and adds in quadrature. Bias repeats, and how biases add is a question of what
-is asked:
+How biases add is a question of what is asked:
 
 - worst case: how far off can it be, if every bias has its largest size and all point one way?
 - quadrature: how far off is it typically, if their directions have nothing to do with each other?
 - Monte Carlo: how often is it off by more than a tolerance, if sizes and directions are drawn?
 
-Two budgets in one table, row by row, and whose numbers each row uses.
+First the terms, then their table and its sums, then two tables side by side.
 """
 
 from __future__ import annotations
@@ -25,26 +23,31 @@ import html
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Literal, get_args
 
 import numpy as np
 
-from coursekit.arrays import Floats
-from coursekit.budget.propagation import intrinsics_jacobian, pixel_jacobian
+from coursekit import checks, words
+from coursekit.arrays import Bools, Floats, Interval
 from coursekit.budget.view import AXES, GraspAxes, View
+from coursekit.checks import want
 from coursekit.geometry import cross_matrix
-from coursekit.results import Kind
+from coursekit.results import ErrorKind
 from coursekit.stereo.law import depth_slope
-from coursekit.words import wrapped
+from coursekit.words import html_list, html_table, wrapped
 
 Along = Literal["image", "ray", "scale", "disparity", "turn", "shift", "intrinsics"]
+Directions = Literal["own", "isotropic"]
 MOST_ALIKE = 0.9999  # two frames; beyond it an autocorrelation says nothing more
 SIGMAS = 2.0  # a bias known by its standard deviation is taken to reach so many of them
+QUESTIONS = {
+    "worst case": "how far off can it be, if all point one way?",
+    "quadrature": "how far off is it, if the directions are unrelated?",
+}
 
 
-def _image(view: View) -> Floats:
-
-    return view.R_base_camera @ pixel_jacobian(view)
+# --- a term ---
 
 
 def _ray(view: View) -> Floats:
@@ -52,27 +55,27 @@ def _ray(view: View) -> Floats:
 
 
 def _disparity(view: View) -> Floats:
-    slope = depth_slope(view.distance_m, view.intrinsics.fx, view.baseline_m)
-    return float(slope) * _ray(view)
-
-
-def _intrinsics(view: View) -> Floats:
-
-    return view.R_base_camera @ intrinsics_jacobian(view)
+    return float(depth_slope(view.distance_m, view.intrinsics.fx, view.baseline_m)) * _ray(view)
 
 
 @dataclass(frozen=True)
 class _Conversion:
-    """How a kind of term reaches the object: unit of its magnitude, in words, and M (3, k)."""
+    """How a kind of term reaches the object: unit of its magnitude, unit and factor for people,
+    in words, and M (3, k) from a view."""
 
     unit: str
-    shown: tuple[str, float]  # unit and factor for people
+    shown: tuple[str, float]
     words: str
     matrix: Callable[[View], Floats]
 
 
 _CONVERSIONS: dict[str, _Conversion] = {
-    "image": _Conversion("px", ("px", 1.0), "times Z/f, across the view", _image),
+    "image": _Conversion(
+        "px",
+        ("px", 1.0),
+        "times Z/f, across the view",
+        lambda view: view.R_base_camera @ view.by_pixel,
+    ),
     "ray": _Conversion("m", ("mm", 1e3), "along the ray, leaks sideways by tan", _ray),
     "scale": _Conversion(
         "1", ("%", 1e2), "times Z along the ray", lambda view: view.distance_m * _ray(view)
@@ -86,7 +89,10 @@ _CONVERSIONS: dict[str, _Conversion] = {
     ),
     "shift": _Conversion("m", ("mm", 1e3), "direct", lambda view: np.eye(3)),
     "intrinsics": _Conversion(
-        "1", ("σ", 1.0), "through the derivatives by K and lens", _intrinsics
+        "1",
+        ("σ", 1.0),
+        "through the derivatives by K and lens",
+        lambda view: view.R_base_camera @ view.by_parameter,
     ),
 }
 
@@ -105,33 +111,35 @@ class ErrorTerm:
     factor (k, k'): a square root of the components' covariance; the magnitude then counts sigmas.
     stated_m: (low, high) at the object as somebody else has converted it; used instead of the
     conversion, with any direction. floor: the part of a noise that repeats, in the same unit.
+    Raises ValueError for a kind or direction that is not known, and for a range that is none.
+
+    >>> ErrorTerm("depth bias", "bias", 0.002, 0.005, "ray", "the lesson").magnitude
+    '2 to 5 mm'
     """
 
     name: str
-    kind: Kind
+    kind: ErrorKind
     low: float
     high: float
     along: Along
     source: str
     normal: bool = False
     factor: tuple[tuple[float, ...], ...] | None = None
-    stated_m: tuple[float, float] | None = None
+    stated_m: Interval | None = None
     floor: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.kind not in get_args(Kind):
-            raise ValueError(f"kind: got {self.kind!r}, want 'bias' or 'noise'")
-        if self.along not in _CONVERSIONS:
-            raise ValueError(f"along: got {self.along!r}, want one of {', '.join(_CONVERSIONS)}")
+        checks.choice("kind", self.kind, get_args(ErrorKind))
+        checks.choice("along", self.along, get_args(Along))
         for name, pair in (("low, high", (self.low, self.high)), ("stated_m", self.stated_m)):
-            if pair is not None and not (0 <= pair[0] <= pair[1] < math.inf):
-                raise ValueError(f"{name}: got {pair}, want 0 <= low <= high, finite")
-        if self.kind == "noise" and self.low != self.high:
-            raise ValueError(f"low: got {self.low}, want one standard deviation, {self.high}")
-        if not 0 <= self.floor < math.inf or (self.floor and self.kind == "bias"):
-            raise ValueError(f"floor: got {self.floor!r}, want 0 or more, and 0 for a bias")
-        if self.along == "intrinsics" and self.factor is None:
-            raise ValueError("factor: 'intrinsics' wants a square root of the covariance of K")
+            ordered = pair is None or 0 <= pair[0] <= pair[1] < math.inf
+            want(ordered, name, pair, "0 <= low <= high, finite")
+        one_sigma = self.kind == "bias" or self.low == self.high
+        want(one_sigma, "low", self.low, f"one standard deviation, {self.high}")
+        most = math.inf if self.kind == "noise" else 0.0
+        checks.number("floor", self.floor, "0 or more, and 0 for a bias", least=0.0, most=most)
+        rooted = self.along != "intrinsics" or self.factor is not None
+        want(rooted, "factor", self.factor, "a square root of the covariance of K")
 
     @property
     def unit(self) -> str:
@@ -152,7 +160,7 @@ class ErrorTerm:
         return f"{high} {unit}{repeats}" if low == high else f"{low} to {high} {unit}"
 
     @property
-    def range(self) -> tuple[float, float]:
+    def range(self) -> Interval:
         """(low, high) in the unit of the components of `matrix`."""
         return self.stated_m or (self.low, self.high)
 
@@ -163,12 +171,9 @@ class ErrorTerm:
         matrix = _CONVERSIONS[self.along].matrix(view)
         if self.factor is None:
             return matrix
-        factor = np.asarray(self.factor, dtype=np.float64)
-        if factor.ndim != 2 or factor.shape[0] != matrix.shape[1]:
-            raise ValueError(f"factor: got {factor.shape}, want ({matrix.shape[1]}, any number)")
-        return np.asarray(matrix @ factor)
+        return np.asarray(matrix @ checks.array("factor", self.factor, (matrix.shape[1], None)))
 
-    def at_object_m(self, view: View) -> tuple[float, float]:
+    def at_object_m(self, view: View) -> Interval:
         """(low, high) of the length of the displacement at the object, m.
 
         From the least magnitude in the direction that moves the object least, to the greatest in
@@ -185,61 +190,45 @@ class ErrorTerm:
 
     def scaled(self, factor: float) -> ErrorTerm:
         """The same row with `factor` times the magnitude."""
-        from dataclasses import replace
-
-        if not 0 <= factor < math.inf:
-            raise ValueError(f"factor: got {factor!r}, want 0 or more")
+        checks.number("factor", factor, "0 or more", least=0.0)
         stated = self.stated_m and (factor * self.stated_m[0], factor * self.stated_m[1])
-        return replace(
-            self,
-            low=factor * self.low,
-            high=factor * self.high,
-            stated_m=stated,
-            floor=factor * self.floor,
-        )
+        low, high, floor = (factor * value for value in (self.low, self.high, self.floor))
+        return replace(self, low=low, high=high, stated_m=stated, floor=floor)
 
 
-def effective_frames(frames: int, autocorrelation: float = 0.0) -> float:
+def independent_frames(frames: int, autocorrelation: float = 0.0) -> float:
     """How many independent frames N frames are worth, if noise is correlated as an AR(1) process.
 
     autocorrelation: of one frame with the next, rho. The variance of the mean of N frames is that
     of one, times [1 + 2 sum_k (1 - k/N) rho^k] / N. Raises ValueError for frames under 1 and rho
     outside (-1, 1). What does not average at all is a term's `floor`.
     """
-    if not isinstance(frames, (int, np.integer)) or frames < 1:
-        raise ValueError(f"frames: got {frames!r}, want a whole number, 1 or more")
+    checks.whole("frames", frames)
     rho = autocorrelation
-    if not -1 < rho < 1:
-        raise ValueError(f"autocorrelation: got {rho!r}, want between -1 and 1")
+    want(-1 < rho < 1, "autocorrelation", rho, "between -1 and 1")
     inflation = (1 + rho) / (1 - rho) - 2 * rho * (1 - rho**frames) / (frames * (1 - rho) ** 2)
     return frames / inflation
 
 
 def autocorrelation(frames: int, effective: float) -> float:
-    """The rho with which N frames are worth `effective` ones: `effective_frames` undone.
+    """The rho with which N frames are worth `effective` ones: `independent_frames` undone.
 
     0 where they are worth all N. Raises ValueError for fewer than two frames, and for an effective
     number that is not above 1 and at most N.
+
+    >>> round(autocorrelation(100, 33.7), 2)
+    0.5
     """
     from scipy.optimize import brentq
 
-    if not isinstance(frames, (int, np.integer)) or frames < 2:
-        raise ValueError(f"frames: got {frames!r}, want a whole number, 2 or more")
-    if not 1 < effective <= frames:
-        raise ValueError(f"effective: got {effective!r}, want above 1 and at most {frames}")
-    least = effective_frames(frames, MOST_ALIKE)
-    if effective <= least:
+    checks.whole("frames", frames, least=2)
+    checks.number("effective", effective, f"above 1 and at most {frames}", above=1, most=frames)
+    if effective <= independent_frames(frames, MOST_ALIKE):
         return MOST_ALIKE
-    return float(brentq(lambda rho: effective_frames(frames, rho) - effective, 0.0, MOST_ALIKE))
+    return float(brentq(lambda rho: independent_frames(frames, rho) - effective, 0.0, MOST_ALIKE))
 
 
-Range = tuple[float, float]
-Directions = Literal["own", "isotropic"]
-QUESTIONS = {
-    "worst case": "how far off can it be, if all point one way?",
-    "quadrature": "how far off is it, if the directions are unrelated?",
-    "Monte Carlo": "how often is it off by more than the tolerance?",
-}
+# --- the table and its sums ---
 
 
 @dataclass(frozen=True)
@@ -262,13 +251,8 @@ class AxisBudget:
     axis: str
     tolerance_m: float
     noise_m: float
-    worst_case_m: Range
-    quadrature_m: Range
-
-    @property
-    def fits(self) -> bool:
-        """Whether the worst case of the biases and two sigmas of noise stay in the tolerance."""
-        return self.worst_case_m[1] + 2 * self.noise_m <= self.tolerance_m
+    worst_case_m: Interval
+    quadrature_m: Interval
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,9 +288,13 @@ class Draws:
             return float((self.norm_m > tolerance_m).mean())
         return float((np.abs(self.along_m[:, axis_index(axis)]) > tolerance_m).mean())
 
+    def within(self) -> Bools:
+        """Which stay within the tolerance along each axis, (n, 3)."""
+        return np.abs(self.along_m) <= np.array(self.tolerance_m)
+
     def success(self) -> float:
         """The share that stays within the tolerance along all three axes."""
-        return float((np.abs(self.along_m) <= np.array(self.tolerance_m)).all(axis=1).mean())
+        return float(self.within().all(axis=1).mean())
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,7 +303,7 @@ class ErrorBudget:
 
     frames: how many frames are averaged; autocorrelation: of one frame's noise with the next's.
     title: of the table. Raises ValueError for no terms or two of one name, and for frames or
-    autocorrelation as `effective_frames` does.
+    autocorrelation as `independent_frames` does.
     """
 
     terms: tuple[ErrorTerm, ...]
@@ -327,16 +315,13 @@ class ErrorBudget:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "terms", tuple(self.terms))
-        names = [term.name for term in self.terms]
-        twice = [name for name in names if names.count(name) > 1]
-        if twice:
-            raise ValueError(f"terms: got {twice[0]!r} more than once, want different names")
-        if not names:
-            raise ValueError("terms: got none, want at least one")
-        effective_frames(self.frames, self.autocorrelation)  # says what is wrong with them
-        object.__setattr__(self, "_matrices", tuple(t.matrix(self.view) for t in self.terms))
+        want(self.terms, "terms", self.terms, "at least one")
+        different = len(set(self.names)) == len(self.names)
+        want(different, "terms", self.names, "different names")
+        independent_frames(self.frames, self.autocorrelation)  # says what is wrong with them
+        _ = self._matrices  # says so now if a factor does not fit
 
-    # --- the same budget otherwise ---
+    # the same budget otherwise
 
     def at(self, **changes: Any) -> ErrorBudget:
         """The budget from another place or with more frames: distance_m, u, v, off_axis_deg,
@@ -357,9 +342,8 @@ class ErrorBudget:
 
     def with_term(self, term: ErrorTerm) -> ErrorBudget:
         """The budget with this term in the place of the one of the same name, or added."""
-        if term.name not in self.names:
-            return replace(self, terms=(*self.terms, term))
-        return replace(self, terms=tuple(term if t.name == term.name else t for t in self.terms))
+        named = {known.name: known for known in self.terms} | {term.name: term}
+        return replace(self, terms=tuple(named.values()))
 
     def scaled(self, name: str, factor: float) -> ErrorBudget:
         """The budget with one term's magnitude times `factor`."""
@@ -371,18 +355,15 @@ class ErrorBudget:
         return tuple(term.name for term in self.terms)
 
     def __getitem__(self, name: str) -> ErrorTerm:
-        for term in self.terms:
-            if term.name == name:
-                return term
-        raise ValueError(f"name: got {name!r}, want one of {', '.join(self.names)}")
+        return self.terms[self.names.index(checks.choice("name", name, self.names))]
 
-    # --- what adds up ---
+    # what adds up
 
     @property
     def rows(self) -> tuple[Row, ...]:
         """Each term at the object, of single frames."""
         axes, found = self.grasp.directions, []
-        for term, matrix in zip(self.terms, self._terms_matrices, strict=True):
+        for term, matrix in zip(self.terms, self._matrices, strict=True):
             along = term.range[1] * np.linalg.norm(axes @ matrix, axis=1)
             found.append(Row(term, *term.at_object_m(self.view), tuple(along.tolist())))
         return tuple(found)
@@ -413,18 +394,13 @@ class ErrorBudget:
         return total
 
     @property
-    def noise_total_m(self) -> float:
-        """Root mean square length of the displacement by noise, all directions together."""
-        return float(np.sqrt(np.trace(self.noise_covariance)))
-
-    @property
-    def worst_case_m(self) -> Range:
+    def worst_case_m(self) -> Interval:
         """(low, high) of the biases if all point one way."""
         lows, highs = self._bias_lengths
         return sum(lows), sum(highs)
 
     @property
-    def quadrature_m(self) -> Range:
+    def quadrature_m(self) -> Interval:
         """(low, high) of the biases if their directions are unrelated."""
         lows, highs = self._bias_lengths
         return math.hypot(*lows), math.hypot(*highs)
@@ -439,15 +415,10 @@ class ErrorBudget:
             lows.append(term.range[0] * gain)
             highs.append(term.range[1] * gain)
         noise = float(np.sqrt(direction @ self.noise_covariance @ direction))
-        return AxisBudget(
-            axis,
-            self.grasp.tolerance_m[i],
-            noise,
-            (sum(lows), sum(highs)),
-            (math.hypot(*lows), math.hypot(*highs)),
-        )
+        worst, quadrature = (sum(lows), sum(highs)), (math.hypot(*lows), math.hypot(*highs))
+        return AxisBudget(axis, self.grasp.tolerance_m[i], noise, worst, quadrature)
 
-    # --- how often ---
+    # how often
 
     def draw(
         self,
@@ -465,47 +436,51 @@ class ErrorBudget:
         The same seed draws the same numbers term by term, so a budget with one term changed
         differs by that term only.
         """
-        chosen = [i for i, term in enumerate(self.terms) if noise or term.kind == "bias"]
-        total = np.zeros((3, _checked(n, directions)))
-        for i in chosen:
-            total += self._part(i, n, seed, directions)
+        checks.whole("n", n)
+        checks.choice("directions", directions, get_args(Directions))
+        total = np.zeros((3, n))
+        for i, term in enumerate(self.terms):
+            if noise or term.kind == "bias":
+                total += self._part(i, n, seed, directions)
         return self.as_draws(total)
 
-    def parts(self, n: int, seed: int = 0, directions: Directions = "own") -> Iterator[Floats]:
+    def parts(self, n: int, seed: int = 0) -> Iterator[Floats]:
         """What each term, noise included, does in n draws, (3, n) m in the base, in their order.
 
         `draw` is their sum. A part is proportional to its term's magnitude.
         """
-        _checked(n, directions)
-        return (self._part(i, n, seed, directions) for i in range(len(self.terms)))
+        return (self._part(i, n, seed, "own") for i in range(len(self.terms)))
 
     def as_draws(self, displacements: Floats) -> Draws:
         """Displacements (3, n), m in the base, with the axes and tolerances of the grasp."""
         return Draws(displacements.T, self.grasp.directions, self.grasp.tolerance_m)
 
-    # --- the inside ---
-
     def _part(self, i: int, n: int, seed: int, directions: Directions) -> Floats:
-        term, matrix = self.terms[i], self._terms_matrices[i]
-        rng, k = np.random.default_rng([seed, i]), matrix.shape[1]
+        """What term i does in n draws, (3, n): noise, or a bias of some length and direction."""
+        term, matrix = self.terms[i], self._matrices[i]
+        own = directions == "own" or term.kind == "noise"
+        rng = np.random.default_rng([seed, i])
+        drawn = rng.standard_normal((matrix.shape[1] if own else 3, n))
+        low, high = term.range if own else term.at_object_m(self.view)
         if term.kind == "noise":
-            return np.asarray(self._sigma(term) * matrix @ rng.standard_normal((k, n)))
-        if directions == "own":
-            return np.asarray(matrix @ _components(term.range, k, n, term.normal, rng))
-        return _components(term.at_object_m(self.view), 3, n, term.normal, rng)
+            drawn *= self._sigma(term)
+        elif term.normal:
+            drawn *= high / SIGMAS
+        else:
+            drawn *= rng.uniform(low, high, n) / np.linalg.norm(drawn, axis=0)
+        return np.asarray(matrix @ drawn) if own else drawn
 
-    @property
-    def _terms_matrices(self) -> tuple[Floats, ...]:
-        matrices: tuple[Floats, ...] = self.__dict__["_matrices"]
-        return matrices
+    @cached_property
+    def _matrices(self) -> tuple[Floats, ...]:
+        return tuple(term.matrix(self.view) for term in self.terms)
 
     def _of(self, kind: str) -> Iterator[tuple[ErrorTerm, Floats]]:
-        pairs = zip(self.terms, self._terms_matrices, strict=True)
+        pairs = zip(self.terms, self._matrices, strict=True)
         return ((term, matrix) for term, matrix in pairs if term.kind == kind)
 
     def _sigma(self, term: ErrorTerm) -> float:
         """Of a noise after averaging; its floor stays."""
-        effective = effective_frames(self.frames, self.autocorrelation)
+        effective = independent_frames(self.frames, self.autocorrelation)
         return math.hypot(term.range[1] / math.sqrt(effective), term.floor)
 
     @property
@@ -513,24 +488,15 @@ class ErrorBudget:
         ranges = [term.at_object_m(self.view) for term, _ in self._of("bias")]
         return [low for low, _ in ranges], [high for _, high in ranges]
 
-    # --- for people ---
+    # for people
 
     def table(self) -> tuple[Sequence[str], list[Sequence[str]]]:
         """Heading and one line of text a term."""
         head = ("error", "kind", "magnitude", "conversion", "at the object", "whose number")
         lines: list[Sequence[str]] = []
         for row in self.rows:
-            term = row.term
-            lines.append(
-                (
-                    term.name,
-                    term.kind,
-                    term.magnitude,
-                    term.conversion,
-                    span(row.low_m, row.high_m),
-                    term.source,
-                )
-            )
+            term, at = row.term, span(row.low_m, row.high_m)
+            lines.append((term.name, term.kind, term.magnitude, term.conversion, at, term.source))
         return head, lines
 
     def summary(self) -> list[str]:
@@ -538,8 +504,8 @@ class ErrorBudget:
         averaged = f", {self.frames} frames" if self.frames > 1 else ""
         text = [f"noise in quadrature{averaged}: {1e3 * self.noise_m:.2f} mm (one sigma)"]
         sums = {"worst case": self.worst_case_m, "quadrature": self.quadrature_m}
-        for name, (low, high) in sums.items():
-            text.append(f"bias, {name}: {span(low, high)} ({QUESTIONS[name]})")
+        for name, ends in sums.items():
+            text.append(f"bias, {name}: {span(*ends)} ({QUESTIONS[name]})")
         if all(term.stated_m is not None for term in self.terms):
             return text  # lengths alone know no direction
         for axis in AXES:
@@ -559,51 +525,17 @@ class ErrorBudget:
         )
 
     def __repr__(self) -> str:
-        shown = [(name, kind, what, at) for name, kind, what, _, at, _ in self.table()[1]]
-        shown.insert(0, ("error", "kind", "magnitude", "at the object"))
-        widths = [max(len(line[i]) for line in shown) for i in range(4)]
-        lines = [
-            "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
-            for line in shown
-        ]
-        return "\n".join([self._heading(), *lines, *self.summary()])
+        head, *lines = ([*cells[:3], cells[4]] for cells in (self.table()[0], *self.table()[1]))
+        return "\n".join([self._heading(), words.table(head, lines), *self.summary()])
 
     def _repr_html_(self) -> str:
-        head, lines = self.table()
-        top = "".join(f"<th style='text-align:left'>{html.escape(cell)}</th>" for cell in head)
-        body = "".join(
-            "<tr>"
-            + "".join(f"<td style='text-align:left'>{html.escape(c)}</td>" for c in line)
-            + "</tr>"
-            for line in lines
-        )
-        notes = "".join(f"<li>{html.escape(line)}</li>" for line in self.summary())
         heading = html.escape(self._heading())
-        return f"<p><b>{heading}</b></p><table><tr>{top}</tr>{body}</table><ul>{notes}</ul>"
+        return f"<p><b>{heading}</b></p>{html_table(*self.table())}{html_list(self.summary())}"
 
 
 def axis_index(axis: str) -> int:
     """Of "closing", "approach", "lateral"; ValueError for any other name."""
-    if axis not in AXES:
-        raise ValueError(f"axis: got {axis!r}, want one of {', '.join(AXES)}")
-    return AXES.index(axis)
-
-
-def _checked(n: int, directions: str) -> int:
-    if not isinstance(n, (int, np.integer)) or n < 1:
-        raise ValueError(f"n: got {n!r}, want a whole number of draws")
-    if directions not in ("own", "isotropic"):
-        raise ValueError(f"directions: got {directions!r}, want 'own' or 'isotropic'")
-    return int(n)
-
-
-def _components(span: Range, k: int, n: int, normal: bool, rng: np.random.Generator) -> Floats:
-    """Components (k, n) of a bias: a length from its range and a direction, or normal ones."""
-    directions = rng.standard_normal((k, n))
-    if normal:
-        return np.asarray(span[1] / 2 * directions)
-    lengths = rng.uniform(*span, n)
-    return np.asarray(directions * (lengths / np.linalg.norm(directions, axis=0)))
+    return AXES.index(checks.choice("axis", axis, AXES))
 
 
 def span(low_m: float, high_m: float, digits: int = 1) -> str:
@@ -612,7 +544,7 @@ def span(low_m: float, high_m: float, digits: int = 1) -> str:
     return f"{high} mm" if low == high else f"{low} to {high} mm"
 
 
-NOTHING = "-"
+# --- two tables side by side ---
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -631,12 +563,13 @@ class Beside:
             rows = [table.get(name) for table in tables]
             kind = next(row.term.kind for row in rows if row)
             lines.append((name, kind, *(_cell(row) for row in rows)))
+        closing = [budget.along("closing").worst_case_m for budget in budgets]
         return [
             *lines,
             ("sum, quadrature", "noise", *(span(b.noise_m, b.noise_m, 2) for b in budgets)),
             ("sum, quadrature", "bias", *(span(*b.quadrature_m) for b in budgets)),
             ("sum, worst case", "bias", *(span(*b.worst_case_m) for b in budgets)),
-            ("worst along closing", "bias", *(span(*_closing(b)) for b in budgets)),
+            ("worst along closing", "bias", *(span(*ends) for ends in closing)),
         ]
 
     @property
@@ -655,24 +588,12 @@ class Beside:
         ]
 
     def __repr__(self) -> str:
-        lines = [self.heading, *self.lines()]
-        widths = [max(len(line[i]) for line in lines) for i in range(4)]
-        table = [
-            "  ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)).rstrip()
-            for line in lines
-        ]
-        return "\n".join([*table, "Whose numbers the right-hand column uses:", *self.sources()])
+        whose = "Whose numbers the right-hand column uses:"
+        return "\n".join([words.table(self.heading, self.lines()), whose, *self.sources()])
 
     def _repr_html_(self) -> str:
-        cell = "<{0} style='text-align:left'>{1}</{0}>"
-        head = "".join(cell.format("th", html.escape(h)) for h in self.heading)
-        body = "".join(
-            f"<tr>{''.join(cell.format('td', html.escape(text)) for text in line)}</tr>"
-            for line in self.lines()
-        )
-        notes = "".join(f"<li>{html.escape(source)}</li>" for source in self.sources())
-        table = f"<table><tr>{head}</tr>{body}</table>"
-        return f"{table}<p>Whose numbers the right-hand column uses:</p><ul>{notes}</ul>"
+        whose = "<p>Whose numbers the right-hand column uses:</p>"
+        return f"{html_table(self.heading, self.lines())}{whose}{html_list(self.sources())}"
 
 
 def beside(theirs: ErrorBudget, yours: ErrorBudget) -> Beside:
@@ -682,9 +603,5 @@ def beside(theirs: ErrorBudget, yours: ErrorBudget) -> Beside:
 
 def _cell(row: Row | None) -> str:
     if row is None:
-        return NOTHING
+        return "-"
     return f"{row.term.magnitude}: {span(row.low_m, row.high_m)}".replace(" to ", "–")
-
-
-def _closing(budget: ErrorBudget) -> Range:
-    return budget.along("closing").worst_case_m

@@ -8,43 +8,44 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from coursekit import checks
 from coursekit.arrays import Floats
 from coursekit.budget.budget import ErrorBudget
-from coursekit.budget.view import AXES, GraspAxes, positive
-from coursekit.results import Kind
+from coursekit.budget.view import AXES
+from coursekit.checks import want
+from coursekit.results import ErrorKind
 
 DRAWS = 20_000  # of a probability that is redrawn while dragging: a standard error of 0.4 % at most
 DISTANCES = 200
-LARGEST_M = 1.0  # of a gripper or an object; more was meant in millimetres
 FEW_DRAWS = 10  # a gain of so many draws says nothing about which row is first
+WIDTH_WANTED = "a positive length of at most 1 m: 60 mm is 0.060"  # more was meant in millimetres
 
 
 @dataclass(frozen=True)
 class Gripper:
-    """Two fingers that open opening_m wide; source: who says so."""
+    """Two fingers that open opening_m wide; source: who says so.
+
+    Raises ValueError for a length that is not positive, or so large that it was meant in mm.
+    """
 
     opening_m: float
     source: str = ""
 
     def __post_init__(self) -> None:
-        _check_length("opening_m", self.opening_m)
+        checks.number("opening_m", self.opening_m, WIDTH_WANTED, above=0.0, most=1.0)
 
 
 @dataclass(frozen=True)
 class Target:
-    """What is to be grasped: its width between the fingers, m."""
+    """What is to be grasped: its width between the fingers, m.
+
+    Raises ValueError as `Gripper` does.
+    """
 
     width_m: float
 
     def __post_init__(self) -> None:
-        _check_length("width_m", self.width_m)
-
-
-def _check_length(name: str, value: float) -> None:
-    if not positive(value):
-        raise ValueError(f"{name}: got {value!r}, want a positive length, m")
-    if value > LARGEST_M:
-        raise ValueError(f"{name}: got {value!r} m; metres are wanted: 60 mm is 0.060")
+        checks.number("width_m", self.width_m, WIDTH_WANTED, above=0.0, most=1.0)
 
 
 LESSON_GRIPPER = Gripper(0.040, "the lesson; it is the travel of one finger")
@@ -56,21 +57,23 @@ def centring_tolerance_m(gripper: Gripper, target: Target) -> float:
     """How far the object may be from the middle between the fingers, to either side, m.
 
     (opening - width) / 2. Raises ValueError for an object that does not fit.
+
+    >>> round(1000 * centring_tolerance_m(WIDOWX_GRIPPER, CUBE), 1)
+    27.5
     """
     room = (gripper.opening_m - target.width_m) / 2
-    if room <= 0:
-        raise ValueError(
-            f"target: {1e3 * target.width_m:.0f} mm does not fit between fingers that open "
-            f"{1e3 * gripper.opening_m:.0f} mm"
-        )
+    opening = f"less than the {gripper.opening_m:g} m between the fingers"
+    want(room > 0, "target", target.width_m, opening)
     return room
 
 
 def with_gripper(budget: ErrorBudget, gripper: Gripper, target: Target) -> ErrorBudget:
-    """The budget with the tolerance along the closing axis that this gripper leaves."""
-    grasp: GraspAxes = budget.grasp
-    room = centring_tolerance_m(gripper, target)
-    return budget.at(grasp=replace(grasp, tolerance_m=(room, *grasp.tolerance_m[1:])))
+    """The budget with the tolerance along the closing axis that this gripper leaves.
+
+    Raises ValueError for an object that does not fit.
+    """
+    tolerance_m = (centring_tolerance_m(gripper, target), *budget.grasp.tolerance_m[1:])
+    return budget.at(grasp=replace(budget.grasp, tolerance_m=tolerance_m))
 
 
 @dataclass(frozen=True)
@@ -87,11 +90,6 @@ class Success:
     rigs: float
     by_axis: tuple[float, float, float]
 
-    @property
-    def weakest_axis(self) -> str:
-        """The axis along which most grasps fail."""
-        return AXES[int(np.argmin(self.by_axis))]
-
     def __repr__(self) -> str:
         axes = ", ".join(f"{a} {100 * p:.1f}" for a, p in zip(AXES, self.by_axis, strict=True))
         return (
@@ -100,24 +98,27 @@ class Success:
         )
 
 
-def success_probability(budget: ErrorBudget, n: int = DRAWS, seed: int = 0) -> Success:
-    """The probability that all three axes stay within their tolerances, by n draws of the rig.
+def success_probability(budget: ErrorBudget) -> Success:
+    """The probability that all three axes stay within their tolerances, by draws of the rig.
 
     Each bias has a magnitude from its range and a direction of its own kind, all independent; the
     noise is that after averaging. The object itself is taken as a block that fits or does not: no
-    tilt, no finger that pushes it into place.
+    tilt, no finger that pushes it into place. The same budget gets the same draws, so that dragging
+    a slider changes the probability smoothly.
+
+    >>> from coursekit.budget import lesson_budget
+    >>> round(success_probability(lesson_budget(stated=False)).probability, 2)
+    0.98
     """
-    parts = budget.parts(n, seed)
-    bias, noise = np.zeros((3, n)), np.zeros((3, n))
-    for term, part in zip(budget.terms, parts, strict=True):
+    bias, noise = np.zeros((3, DRAWS)), np.zeros((3, DRAWS))
+    for term, part in zip(budget.terms, budget.parts(DRAWS), strict=True):
         total = bias if term.kind == "bias" else noise
         total += part
-    biased, tried = budget.as_draws(bias), budget.as_draws(bias + noise)
-    within = np.abs(tried.along_m) <= np.array(tried.tolerance_m)
+    within = budget.as_draws(bias + noise).within()
     p = float(within.all(axis=1).mean())
     closing, approach, lateral = within.mean(axis=0).tolist()
-    error = math.sqrt(max(p * (1 - p), 0.25 / n) / n)
-    return Success(p, error, biased.success(), (closing, approach, lateral))
+    error = math.sqrt(max(p * (1 - p), 0.25 / DRAWS) / DRAWS)
+    return Success(p, error, budget.as_draws(bias).success(), (closing, approach, lateral))
 
 
 @dataclass(frozen=True)
@@ -128,7 +129,7 @@ class Gain:
     """
 
     name: str
-    kind: Kind
+    kind: ErrorKind
     factor: float
     worst_case_m: float
     noise_m: float
@@ -142,33 +143,27 @@ class Gain:
         )
 
 
-def sensitivity(
-    budget: ErrorBudget, factor: float = 0.5, n: int = DRAWS, seed: int = 0
-) -> tuple[Gain, ...]:
+def sensitivity(budget: ErrorBudget, factor: float = 0.5) -> tuple[Gain, ...]:
     """ "Halve this, gain that": every term by itself, the one to fix first in front.
 
-    By grasps gained; where that is within chance (all succeed, or none) by the worst case. The
-    same draws serve every term, so their differences are far quieter than the probabilities.
+    factor: by which each magnitude is multiplied. The order is by grasps gained; where that is
+    within chance (all succeed, or none) by the worst case. The same draws serve every term, so
+    their differences are far quieter than the probabilities.
+
+    >>> from coursekit.budget import lesson_budget
+    >>> sensitivity(lesson_budget(stated=False))[0].name
+    'hand-eye rotation'
     """
-    parts = list(budget.parts(n, seed))
+    parts = list(budget.parts(DRAWS))
     total = np.sum(parts, axis=0)
     before, at = budget.as_draws(total).success(), budget.along("closing")
     gains = []
     for term, part in zip(budget.terms, parts, strict=True):
         fewer = budget.as_draws(total + (factor - 1) * part)  # a part grows with its magnitude
-        better = budget.scaled(term.name, factor)
-        along = better.along("closing")
-        gains.append(
-            Gain(
-                term.name,
-                term.kind,
-                factor,
-                at.worst_case_m[1] - along.worst_case_m[1],
-                at.noise_m - along.noise_m,
-                fewer.success() - before,
-            )
-        )
-    chance = max(2 * math.sqrt(before * (1 - before) / n), FEW_DRAWS / n)
+        along = budget.scaled(term.name, factor).along("closing")
+        bias, noise = at.worst_case_m[1] - along.worst_case_m[1], at.noise_m - along.noise_m
+        gains.append(Gain(term.name, term.kind, factor, bias, noise, fewer.success() - before))
+    chance = max(2 * math.sqrt(before * (1 - before) / DRAWS), FEW_DRAWS / DRAWS)
     if max(abs(gain.success) for gain in gains) <= chance:
         return tuple(sorted(gains, key=lambda g: -(g.worst_case_m + 2 * g.noise_m)))
     return tuple(sorted(gains, key=lambda g: -g.success))
@@ -190,13 +185,12 @@ class Mounting:
     minimum_range_m: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("clearance_m", "reach_m"):
-            if not positive(getattr(self, name)):
-                raise ValueError(f"{name}: got {getattr(self, name)!r}, want a positive length, m")
-        if len(self.workspace_m) != 2 or not all(map(positive, self.workspace_m)):
-            raise ValueError(f"workspace_m: got {self.workspace_m!r}, want (width, height), m")
-        if self.minimum_range_m is not None and not positive(self.minimum_range_m):
-            raise ValueError(f"minimum_range_m: got {self.minimum_range_m!r}, want a length, m")
+        checks.positive("clearance_m", self.clearance_m, "a positive length, m")
+        checks.positive("reach_m", self.reach_m, "a positive length, m")
+        workspace = checks.array("workspace_m", self.workspace_m, (2,), finite=True)
+        want((workspace > 0).all(), "workspace_m", self.workspace_m, "(width, height), m")
+        if self.minimum_range_m is not None:
+            checks.positive("minimum_range_m", self.minimum_range_m, "a positive length, m")
 
     def least_m(self, budget: ErrorBudget) -> dict[str, float]:
         """The least distance that each constraint allows, by its name, m."""
@@ -248,19 +242,20 @@ def best_distance(
 
     The object stays at its pixel. Raises ValueError when no distance meets the constraints, with
     those that contradict each other, and when rows hold only where they were stated.
+
+    >>> from coursekit.budget import lesson_budget
+    >>> best_distance(lesson_budget(stated=False)).limit
+    'clearance'
     """
     mounting = mounting or Mounting()
     allowed = mounting.least_m(budget)
     binding = max(allowed, key=lambda name: allowed[name])
     low, high = allowed[binding], mounting.reach_m
-    if low > high:
-        raise ValueError(
-            f"mounting: the {binding} wants at least {low:.2f} m, the reach allows {high:.2f} m"
-        )
+    room = f"at least {low:.2f} m, for the {binding}"
+    want(low <= high, "mounting", f"a reach of {high:.2f} m", room)
     distances = np.linspace(low, high, DISTANCES)
     figures = np.array([figure(budget.at(distance_m=float(Z))) for Z in distances])
     best = int(np.argmin(figures))
     limit = binding if best == 0 else "reach" if best == len(distances) - 1 else ""
-    return BestDistance(
-        float(distances[best]), float(figures[best]), low, high, limit, distances, figures, allowed
-    )
+    at, figure_m = float(distances[best]), float(figures[best])
+    return BestDistance(at, figure_m, low, high, limit, distances, figures, allowed)

@@ -1,9 +1,8 @@
-"""The lesson's own table, and the same rig with the camera on the wrist.
+"""What notebooks 1 to 4 found, as rows of the budget, and the lesson's table to lay beside them.
 
-What notebooks 1 to 4 found becomes the rows of the budget, and each row says whose it is.
-
-A file that is missing, of another version, or damaged is named, and the reference that comes with
-the course is used in its place; so is a file that lacks a number. Nothing is replaced in silence.
+Each row says whose number it is. A file that is missing, of another version, or damaged is named,
+and the reference that comes with the course is used in its place; so is a file that lacks a number.
+Nothing is replaced in silence.
 """
 
 from __future__ import annotations
@@ -15,14 +14,16 @@ from pathlib import Path
 
 import numpy as np
 
-from coursekit import results
+from coursekit import checks, results
 from coursekit.arm import widowx
-from coursekit.arrays import ArrayLike, Floats
+from coursekit.arrays import ArrayLike
 from coursekit.budget.budget import SIGMAS, Along, ErrorBudget, ErrorTerm
-from coursekit.budget.propagation import PARAMETERS, Covariances
-from coursekit.budget.view import GraspAxes, View, looking_down
+from coursekit.budget.propagation import Covariances
+from coursekit.budget.view import GRIPPER_DOWN, View
+from coursekit.checks import want
 from coursekit.geometry import Intrinsics
-from coursekit.results import Covariance, Kind, Quantity, Result
+from coursekit.intrinsics.derivatives import PARAMETERS, scaled_root
+from coursekit.results import Covariance, ErrorKind, Quantity, Result
 from coursekit.specifications import DATA, device
 from coursekit.stereo.law import depth_slope
 
@@ -32,32 +33,43 @@ LESSON_BASELINE_M = 0.050
 LESSON_DISTANCE_M = 0.45
 LESSON_SIGMA_D_PX = 0.08
 WRIST_DISTANCE_M = 0.25
-GRIPPER_DOWN = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])  # R_base_gripper, fingers down
+REFERENCE = DATA / "reference_results"
+MOUNT_TWIST = ("rx", "ry", "rz", "tx", "ty", "tz")
+NEEDED: dict[str, tuple[str, ...]] = {  # by notebook; "a|b": either
+    "01_pinhole": ("depth_fx", "depth_fy", "depth_cx", "depth_cy"),
+    "02_depth_noise": ("sigma_d", "depth_bias_fitted_at_450_mm|depth_bias_at_450_mm"),
+    "03_intrinsics": ("fx", "fy", "cx", "cy"),
+    "04_hand_eye": MOUNT_TWIST,
+}
+BY_SIGMA = ("03_intrinsics", "04_hand_eye")  # their sigmas are the rows; without they say nothing
+TOGETHER = ("01_pinhole", "03_intrinsics", "04_hand_eye")  # all of it from one place, or none
+COVARIANCE_OF = {"03_intrinsics": "intrinsics", "04_hand_eye": "X"}  # its name in the file
+USUAL_DEPTH_SIZE = (848, 480)  # of the depth image, where notebook 1 did not keep it
 
 
-def lesson_view(distance_m: float = LESSON_DISTANCE_M) -> View:
+# --- the lesson's table ---
+
+
+def lesson_view() -> View:
     """The lesson's camera: 447 px, 50 mm, the object in the middle of the image at 0.45 m."""
-    return View(LESSON_CAMERA, distance_m, LESSON_BASELINE_M)
+    return View(LESSON_CAMERA, LESSON_DISTANCE_M, LESSON_BASELINE_M)
 
 
 def lesson_terms(stated: bool) -> tuple[ErrorTerm, ...]:
     """The lesson's six rows; stated: with its own rounded millimetres at the object."""
 
     def row(
-        name: str, kind: Kind, low: float, high: float, along: Along, *at_mm: float
+        name: str, kind: ErrorKind, low: float, high: float, along: Along, *at_mm: float
     ) -> ErrorTerm:
         at = (1e-3 * at_mm[0], 1e-3 * at_mm[-1]) if stated else None
         return ErrorTerm(name, kind, low, high, along, LESSON, stated_m=at)
 
-    turn = math.radians(0.5)
-    matching = (
-        row("depth noise", "noise", 7e-4, 7e-4, "ray", 0.7)
-        if stated
-        else row("depth noise", "noise", LESSON_SIGMA_D_PX, LESSON_SIGMA_D_PX, "disparity")
-    )
+    turn, matching = math.radians(0.5), LESSON_SIGMA_D_PX
     return (
         row("pixel", "noise", 1.0, 1.0, "image", 1.0),
-        matching,
+        row("depth noise", "noise", 7e-4, 7e-4, "ray", 0.7)
+        if stated
+        else row("depth noise", "noise", matching, matching, "disparity"),
         row("depth bias", "bias", 2e-3, 5e-3, "ray", 2.0, 6.0),
         row("hand-eye rotation", "bias", turn, turn, "turn", 0.0, 3.9),
         row("hand-eye translation", "bias", 1e-3, 2e-3, "shift", 1.0, 2.0),
@@ -65,55 +77,47 @@ def lesson_terms(stated: bool) -> tuple[ErrorTerm, ...]:
     )
 
 
-def lesson_budget(stated: bool = True, grasp: GraspAxes | None = None) -> ErrorBudget:
+def lesson_budget(stated: bool = True) -> ErrorBudget:
     """The lesson's table for a 25 mm cube seen from 0.45 m, eye-to-hand, tolerance ±7 mm.
 
     stated: with the lesson's own millimetres at the object, its ranges included ("up to 3.9" is 0
     to 3.9), each in any direction; they hold at 0.45 m only. Otherwise the same magnitudes are
     converted here, the depth noise from 0.08 px of disparity, and the budget can be moved.
+
+    >>> [round(1000 * end, 1) for end in lesson_budget().worst_case_m]
+    [5.0, 15.9]
     """
     title = "The lesson's table" if stated else "The lesson's magnitudes, converted"
-    return ErrorBudget(lesson_terms(stated), lesson_view(), grasp or GraspAxes(), title=title)
+    return ErrorBudget(lesson_terms(stated), lesson_view(), title=title)
 
 
-def wrist_budget(
-    distance_m: float = WRIST_DISTANCE_M, grasp: GraspAxes | None = None
-) -> ErrorBudget:
-    """The D405 on the wrist, looking at the object from `distance_m` along its optical axis.
+def wrist_budget() -> ErrorBudget:
+    """The D405 on the wrist, looking at the object from 0.25 m along its optical axis.
 
     Camera and baseline are those of data/devices.toml. Nobody has published the D405's bias:
     **assumed** is the lesson's 2 to 5 mm at 0.45 m read as an offset of disparity, 0.22 to 0.55 px,
     and the same offset here. The mount's and the arm's rows are the lesson's; for a camera on the
     wrist the arm's counts for what differs between looking and grasping, so it is the upper end.
     The gripper comes along the fingers' direction of the maker's mount, the camera 20° from it.
+
+    >>> wrist_budget().at(distance_m=0.40)["depth bias"].magnitude
+    '0.22 to 0.55 px'
     """
     unit = device("D405").unit
     T_base_camera = np.eye(4)  # where it stands does not matter, only how it is turned
     T_base_camera[:3, :3] = GRIPPER_DOWN @ widowx().T_gripper_camera[:3, :3]
-    view = View(unit.depth, distance_m, unit.baseline_m, T_base_camera=T_base_camera)
+    view = View(unit.depth, WRIST_DISTANCE_M, unit.baseline_m, T_base_camera=T_base_camera)
     per_px = -float(depth_slope(LESSON_DISTANCE_M, LESSON_CAMERA.fx, LESSON_BASELINE_M))
     assumed = "assumed: the lesson's, as a disparity"
     bias = ErrorTerm("depth bias", "bias", 2e-3 / per_px, 5e-3 / per_px, "disparity", assumed)
-    budget = ErrorBudget(lesson_terms(False), view, grasp or GraspAxes(), title="D405 on the wrist")
-    return budget.with_term(bias)
+    return ErrorBudget(lesson_terms(False), view, title="D405 on the wrist").with_term(bias)
 
 
-LESSONS = ("01_pinhole", "02_depth_noise", "03_intrinsics", "04_hand_eye")
-REFERENCE = DATA / "reference_results"
-NEEDED: dict[str, tuple[str, ...]] = {  # "a|b": either
-    "01_pinhole": ("depth_fx", "depth_fy", "depth_cx", "depth_cy"),
-    "02_depth_noise": ("sigma_d", "depth_bias_fitted_at_450_mm|depth_bias_at_450_mm"),
-    "03_intrinsics": ("fx", "fy", "cx", "cy"),
-    "04_hand_eye": ("rx", "ry", "rz", "tx", "ty", "tz"),
-}
-BY_SIGMA = ("03_intrinsics", "04_hand_eye")  # their sigmas are the rows; without they say nothing
-TOGETHER = ("01_pinhole", "03_intrinsics", "04_hand_eye")  # all of it from one place, or none
-GROUPS = {"03_intrinsics": "intrinsics", "04_hand_eye": "X"}
-SIZE = (848, 480)  # of the depth image, where notebook 1 did not keep it
+# --- what the notebooks found ---
 
 
 @dataclass(frozen=True)
-class Found:
+class NotebookResult:
     """One notebook's result. says: whose is used, and why if it is not the student's.
 
     yours: None where it cannot be used. lacks: what it does not hold and the reference gives.
@@ -144,55 +148,41 @@ class Found:
 class HandOver:
     """What the four notebooks hand over, by name of the lesson."""
 
-    found: dict[str, Found]
+    found: dict[str, NotebookResult]
 
-    def __getitem__(self, lesson: str) -> Found:
-        if lesson not in self.found:
-            raise ValueError(f"lesson: got {lesson!r}, want one of {', '.join(self.found)}")
-        return self.found[lesson]
+    def __getitem__(self, lesson: str) -> NotebookResult:
+        return self.found[checks.choice("lesson", lesson, self.found)]
 
-    def __iter__(self) -> Iterator[Found]:
+    def __iter__(self) -> Iterator[NotebookResult]:
         return iter(self.found.values())
 
     def quantity(self, lesson: str, names: str) -> Quantity:
         """A number of one notebook; names: "a|b" is b where there is no a."""
-        quantities = self[lesson].result(names).quantities
-        name = _first(quantities, names)
-        if name is None:
+        found = _first(self[lesson].result(names).quantities, names)
+        if found is None:
             raise ValueError(f"{lesson}: holds no {names.replace('|', ' or ')}")
-        return quantities[name]
+        return found
 
     def covariance(self, lesson: str) -> Covariance | None:
         """Of the numbers that this notebook estimated together, None where it kept none."""
-        return self[lesson].result().covariances.get(GROUPS.get(lesson, ""))
+        return self[lesson].result().covariances.get(COVARIANCE_OF.get(lesson, ""))
 
     def __repr__(self) -> str:
         return "\n".join(found.says for found in self)
 
-    # --- the budget ---
+    # the budget
 
-    def view(
-        self,
-        distance_m: float = LESSON_DISTANCE_M,
-        baseline_m: float | None = None,
-        T_base_camera: Floats | None = None,
-    ) -> View:
-        """The camera of notebook 1 with the object on its axis.
+    def view(self) -> View:
+        """The camera of notebook 1 with the object on its axis, at the lesson's distance.
 
-        baseline_m: None takes what that camera reports, and the D435's where it reports none.
+        Its baseline is what that camera reports, and the D435's where it reports none.
         """
         fx, fy, cx, cy = (self.quantity("01_pinhole", name).value for name in NEEDED["01_pinhole"])
-        width, height = (
-            round(self._also("01_pinhole", f"depth_{name}", size))
-            for name, size in zip(("width", "height"), SIZE, strict=True)
-        )
-        if baseline_m is None:
-            usual_mm = 1e3 * device("D435").unit.baseline_m
-            baseline_m = 1e-3 * self._also("01_pinhole", "baseline", usual_mm)
-        T = looking_down() if T_base_camera is None else T_base_camera
-        return View(
-            Intrinsics(width, height, fx, fy, cx, cy), distance_m, baseline_m, T_base_camera=T
-        )
+        width = round(self._also("01_pinhole", "depth_width", USUAL_DEPTH_SIZE[0]))
+        height = round(self._also("01_pinhole", "depth_height", USUAL_DEPTH_SIZE[1]))
+        usual_mm = 1e3 * device("D435").unit.baseline_m
+        baseline_m = 1e-3 * self._also("01_pinhole", "baseline", usual_mm)
+        return View(Intrinsics(width, height, fx, fy, cx, cy), LESSON_DISTANCE_M, baseline_m)
 
     def terms(self, subtract_depth_bias: bool = False) -> tuple[ErrorTerm, ...]:
         """The rows, each with its source.
@@ -208,39 +198,35 @@ class HandOver:
             self._depth_noise(),
             self._depth_bias(subtract_depth_bias),
             self._intrinsics(),
-            self._hand_eye("rotation"),
-            self._hand_eye("translation"),
+            self._hand_eye("rotation", MOUNT_TWIST[:3], "turn", math.radians(1.0)),
+            self._hand_eye("translation", MOUNT_TWIST[3:], "shift", 1e-3),
             arm,
         )
 
-    def budget(
-        self,
-        view: View | None = None,
-        grasp: GraspAxes | None = None,
-        subtract_depth_bias: bool = False,
-    ) -> ErrorBudget:
-        """The student's own table, the reference's numbers where there are no others."""
+    def budget(self, subtract_depth_bias: bool = False) -> ErrorBudget:
+        """The student's own table, the reference's numbers where there are no others.
+
+        subtract_depth_bias: as for `terms`. `at` and `with_term` of what comes back see it from
+        another place, with another grasp, or with another number.
+        """
         return ErrorBudget(
             self.terms(subtract_depth_bias),
-            view or self.view(),
-            grasp or GraspAxes(),
+            self.view(),
             autocorrelation=self._also("02_depth_noise", "frame_autocorrelation", 0.0),
             title="Your budget" if any(found.yours for found in self) else "The reference budget",
         )
 
-    def wrist_budget(self, grasp: GraspAxes | None = None) -> ErrorBudget:
-        """The D405 on the wrist with these numbers, as `tables.wrist_budget` sees it.
+    def wrist_budget(self) -> ErrorBudget:
+        """The D405 on the wrist with these numbers, as the function `wrist_budget` sees it.
 
         The matching noise, K and mount are those of the notebooks; the depth bias stays the
         assumed one there, because notebook 2's belongs to another camera.
         """
-        wrist, own = wrist_budget(grasp=grasp), self.budget()
-        for name in wrist.names:
-            if name != "depth bias":
-                wrist = wrist.with_term(own[name])
-        return wrist.with_term(own["intrinsics"]).at(
-            autocorrelation=own.autocorrelation, title=own.title
-        )
+        wrist, own = wrist_budget(), self.budget()
+        for term in own.terms:
+            if term.name != "depth bias":
+                wrist = wrist.with_term(term)
+        return wrist.at(autocorrelation=own.autocorrelation, title=own.title)
 
     def covariances(self, view: View, arm: ArrayLike | None = None) -> Covariances:
         """What `propagate` takes, from the same numbers: noise and what calibration left unknown.
@@ -250,9 +236,8 @@ class HandOver:
         which notebook 4 gave X: the gripper's for a camera on the wrist, else the base's; the
         `Chain` must be of the same mount.
         """
-        K = self._known("03_intrinsics", NEEDED["03_intrinsics"])
-        X = self._known("04_hand_eye", NEEDED["04_hand_eye"])
-        order = [X.names.index(name) for name in NEEDED["04_hand_eye"]]
+        K, X = self._known("03_intrinsics"), self._known("04_hand_eye")
+        order = [X.names.index(name) for name in MOUNT_TWIST]
         unit = np.repeat([math.radians(1.0), 1e-3], 3)
         depth = self._depth_noise()
         return Covariances(
@@ -264,17 +249,15 @@ class HandOver:
             arm=arm,
         )
 
-    def _known(self, lesson: str, names: tuple[str, ...]) -> Covariance:
-        """The covariance that the notebook kept, else the sigmas of these numbers."""
-        known = self.covariance(lesson)
-        usable = (*PARAMETERS, *NEEDED["04_hand_eye"])
-        if known is not None and set(names) <= set(known.names) <= set(usable):
+    def _known(self, lesson: str) -> Covariance:
+        """The covariance that the notebook kept, else the sigmas of the numbers needed."""
+        known, names = self.covariance(lesson), NEEDED[lesson]
+        if known is not None and set(names) <= set(known.names) <= {*PARAMETERS, *MOUNT_TWIST}:
             return known
         sigmas = [self.quantity(lesson, name).sigma for name in names]
         if None in sigmas:
             raise ValueError(f"{lesson}: {names[sigmas.index(None)]} has no sigma")
-        variances = np.square(np.array(sigmas, dtype=np.float64))
-        return Covariance(names, np.diag(variances))  # type: ignore[arg-type]
+        return Covariance(names, np.diag(np.square(np.array(sigmas, dtype=np.float64))))  # type: ignore[arg-type]
 
     def _also(self, lesson: str, name: str, otherwise: float) -> float:
         """A number that the notebook may have kept."""
@@ -305,61 +288,58 @@ class HandOver:
         Pessimistic where the same K was used for the hand-eye calibration, which takes up a part
         of its error.
         """
-        known = self._known("03_intrinsics", NEEDED["03_intrinsics"])
-        factor = np.zeros((len(PARAMETERS), len(known.names)))
-        factor[[PARAMETERS.index(name) for name in known.names]] = _root(np.array(known.matrix))
+        known, whose = self._known("03_intrinsics"), self["03_intrinsics"].whose()
+        root = scaled_root(np.array(known.matrix))
+        factor = np.zeros((len(PARAMETERS), root.shape[1]))
+        factor[[PARAMETERS.index(name) for name in known.names]] = root
         rows = tuple(map(tuple, factor.tolist()))
-        whose = self["03_intrinsics"].whose()
-        return ErrorTerm(
-            "intrinsics", "bias", 0.0, SIGMAS, "intrinsics", whose, normal=True, factor=rows
-        )
+        return ErrorTerm("intrinsics", "bias", 0.0, SIGMAS, "intrinsics", whose, True, rows)
 
-    def _hand_eye(self, part: str) -> ErrorTerm:
+    def _hand_eye(self, part: str, names: tuple[str, ...], along: Along, unit: float) -> ErrorTerm:
         """The root mean square over the three axes: a row knows no frame. What `propagate` takes
         is the whole covariance."""
-        names, along, unit = (
-            (("rx", "ry", "rz"), "turn", math.radians(1.0))
-            if part == "rotation"
-            else (("tx", "ty", "tz"), "shift", 1e-3)
-        )
-        known = self._known("04_hand_eye", NEEDED["04_hand_eye"])
+        known = self._known("04_hand_eye")
         variances = [known.matrix[i][i] for i in map(known.names.index, names)]
         high = SIGMAS * unit * math.sqrt(sum(variances) / 3)
         mount = self["04_hand_eye"].result().quantities["tx"].note.replace("_", " ")
         whose = self["04_hand_eye"].whose() + (f", {mount}" if mount else "")
-        return ErrorTerm(f"hand-eye {part}", "bias", 0.0, high, along, whose, normal=True)  # type: ignore[arg-type]
+        return ErrorTerm(f"hand-eye {part}", "bias", 0.0, high, along, whose, normal=True)
 
 
 def hand_over(reference: Path = REFERENCE) -> HandOver:
     """Read `results/01` to `04` where they are whole, else their reference, and say which.
 
-    Raises nothing: a number that neither has is a ValueError when it is asked for.
+    reference: the folder of the stand-ins. Raises nothing: a number that neither has is a
+    ValueError when it is asked for.
+
+    >>> [found.lesson for found in hand_over()]
+    ['01_pinhole', '02_depth_noise', '03_intrinsics', '04_hand_eye']
     """
-    return HandOver({lesson: _find(lesson, reference) for lesson in LESSONS})
+    return HandOver({lesson: _find(lesson, reference) for lesson in NEEDED})
 
 
-def _find(lesson: str, reference: Path) -> Found:
+def _find(lesson: str, reference: Path) -> NotebookResult:
     stand_in, comes_in = _stand_in(reference / f"{lesson}.json")
+    yours, file = None, f"results/{lesson}.json"
+    lacks: tuple[str, ...] = ()
     try:
         yours = results.load(lesson)
-        if yours.lesson != lesson:
-            raise ValueError(f"it is the result of notebook {yours.lesson}")
+        want(yours.lesson == lesson, "lesson", yours.lesson, lesson)
+        lacks = tuple(names for names in NEEDED[lesson] if not _usable(yours, lesson, names))
     except FileNotFoundError:
-        why = f"results/{lesson}.json is not there yet, notebook {lesson} has not saved it"
-        return Found(lesson, None, stand_in, f"{lesson}: {why}; {comes_in}.")
+        yours, why = None, f"{file} is not there yet, notebook {lesson} has not saved it"
     except (ValueError, OSError) as error:
         again = "" if "again" in str(error) else f". Run notebook {lesson} again"
-        why = f"results/{lesson}.json cannot be used ({str(error).rstrip('.')}{again})"
-        return Found(lesson, None, stand_in, f"{lesson}: {why}; {comes_in}.")
-    lacks = _lacking(lesson, yours)
+        yours, why = None, f"{file} cannot be used ({str(error).rstrip('.')}{again})"
     names = ", ".join(name.replace("|", " or ") for name in lacks)
-    what = f"no {names}" if lesson not in BY_SIGMA else f"no {names} with a sigma"
+    what = f"holds no {names}" + " with a sigma" * (lesson in BY_SIGMA)
     if lacks and lesson in TOGETHER:
-        why = f"results/{lesson}.json holds {what}"
-        return Found(lesson, None, stand_in, f"{lesson}: {why}; {comes_in}.")
-    but = f", but it holds {what}: for that, {comes_in}" if lacks else ""
-    whose = Found(lesson, yours, stand_in, "").whose()
-    return Found(lesson, yours, stand_in, f"{lesson}: {whose}{but}.", lacks)
+        yours, why = None, f"{file} {what}"
+    if yours is None:
+        return NotebookResult(lesson, None, stand_in, f"{lesson}: {why}; {comes_in}.")
+    but = f", but it {what}: for that, {comes_in}" if lacks else ""
+    whose = NotebookResult(lesson, yours, stand_in, "").whose()
+    return NotebookResult(lesson, yours, stand_in, f"{lesson}: {whose}{but}.", lacks)
 
 
 def _stand_in(path: Path) -> tuple[Result | None, str]:
@@ -372,22 +352,11 @@ def _stand_in(path: Path) -> tuple[Result | None, str]:
         return None, f"and the reference is damaged ({error})"
 
 
-def _lacking(lesson: str, result: Result) -> tuple[str, ...]:
-    def usable(names: str) -> bool:
-        name = _first(result.quantities, names)
-        if name is None:
-            return False
-        return lesson not in BY_SIGMA or result.quantities[name].sigma is not None
-
-    return tuple(names for names in NEEDED[lesson] if not usable(names))
+def _usable(result: Result, lesson: str, names: str) -> bool:
+    found = _first(result.quantities, names)
+    return found is not None and (lesson not in BY_SIGMA or found.sigma is not None)
 
 
-def _first(quantities: dict[str, Quantity], names: str) -> str | None:
-    return next((name for name in names.split("|") if name in quantities), None)
-
-
-def _root(matrix: Floats) -> Floats:
-    """A symmetric square root of a covariance whose entries differ by powers of ten, (p, p)."""
-    scale = np.sqrt(np.where(np.diag(matrix) > 0, np.diag(matrix), 1.0))
-    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
-    return np.asarray(scale[:, None] * vectors * np.sqrt(np.clip(values, 0, None)))
+def _first(quantities: dict[str, Quantity], names: str) -> Quantity | None:
+    """The number of this name; names: "a|b" is b where there is no a."""
+    return next((quantities[name] for name in names.split("|") if name in quantities), None)

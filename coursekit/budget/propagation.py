@@ -1,30 +1,32 @@
 """From the covariances of pixel, depth, K, mount and arm to one of the point in the base.
 
 p = T_base_camera deproject(u, v, Z; K): the chain that the budget's rows take apart. `propagate`
-is its first order, J S J^T with the Jacobians written out here; `monte_carlo` draws the errors and
-sends each through the exact chain. They part where the chain bends within the errors: turns of
-several degrees move a point inwards by the square of the angle, whatever their sign, and a depth
-from a disparity that errs by a tenth or more is skewed.
+is its first order, J S J^T; `monte_carlo` draws the errors and sends each through the exact chain.
+They part where the chain bends within the errors: turns of several degrees move a point inwards by
+the square of the angle, whatever their sign, and a depth from a disparity that errs by a tenth or
+more is skewed.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, get_args
 
 import numpy as np
 
+from coursekit import checks
 from coursekit.arrays import ArrayLike, Floats
-from coursekit.budget.view import View, positive
-from coursekit.checks import transform
-from coursekit.geometry import cross_matrix, distortion_jacobian
+from coursekit.budget.view import View
+from coursekit.checks import want
+from coursekit.geometry import cross_matrix
 from coursekit.hand_eye.poses import Mount
+from coursekit.intrinsics.derivatives import PARAMETERS, scaled_root
 
-PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+PINHOLE_PARAMETERS, LENS_PARAMETERS = PARAMETERS[:4], PARAMETERS[4:]
 CHUNK = 65_536  # samples at a time: what one step needs stays in the cache
-NEWTON_STEPS = 6  # from the nominal point, whose neighbours are all that is asked for
-NEWTON_TOLERANCE = 1e-7  # of the last step: the next, its square, is lost in rounding
+UNDISTORTION_STEPS = 6  # from the nominal point, whose neighbours are all that is asked for
+UNDISTORTION_TOLERANCE = 1e-7  # of the last step: the next, its square, is lost in rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,29 +44,31 @@ class Chain:
     T_base_gripper: Floats | None = None
 
     def __post_init__(self) -> None:
-        if self.mount not in ("eye_in_hand", "eye_to_hand"):
-            raise ValueError(f"mount: got {self.mount!r}, want 'eye_in_hand' or 'eye_to_hand'")
+        checks.choice("mount", self.mount, get_args(Mount))
         if self.mount == "eye_in_hand":
-            if self.T_base_gripper is None:
-                raise ValueError("T_base_gripper: eye_in_hand wants the arm's pose at the picture")
-            T = transform("T_base_gripper", self.T_base_gripper)
-            object.__setattr__(self, "T_base_gripper", T)
+            given = self.T_base_gripper
+            want(given is not None, "T_base_gripper", given, "the arm's pose at the picture")
+            checks.transform("T_base_gripper", self.gripper)
+
+    @property
+    def gripper(self) -> Floats:
+        """The frame that X is given in: T_base_gripper, or the base itself, (4, 4)."""
+        carried = self.mount == "eye_in_hand" and self.T_base_gripper is not None
+        return np.asarray(self.T_base_gripper) if carried else np.eye(4)
 
     @property
     def R_base_frame(self) -> Floats:
         """From the axes that X is given in (base or gripper) to the base's, (3, 3)."""
-        if self.mount == "eye_to_hand" or self.T_base_gripper is None:
-            return np.eye(3)
-        return self.T_base_gripper[:3, :3]
+        return self.gripper[:3, :3]
 
     @property
     def arm_lever(self) -> Floats:
         """From the gripper's origin to the point, base axes, (3,), m; 0 for a camera off the arm,
         where the fingertip is at the point."""
-        if self.mount == "eye_to_hand" or self.T_base_gripper is None:
+        if self.mount == "eye_to_hand":
             return np.zeros(3)
         there = self.view.T_base_camera[:3, 3] + self.view.lever_base
-        return np.asarray(there - self.T_base_gripper[:3, 3])
+        return np.asarray(there - self.gripper[:3, 3])
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,77 +85,43 @@ class Covariances:
     pixel: ArrayLike | None = None
     depth_sigma_m: float = 0.0
     intrinsics: ArrayLike | None = None
-    names: tuple[str, ...] = ("fx", "fy", "cx", "cy")
+    names: tuple[str, ...] = PINHOLE_PARAMETERS
     hand_eye: ArrayLike | None = None
     arm: ArrayLike | None = None
 
     def __post_init__(self) -> None:
-        unknown = [name for name in self.names if name not in PARAMETERS]
-        if unknown or len(set(self.names)) != len(self.names):
-            raise ValueError(f"names: got {self.names}, want different ones of {PARAMETERS}")
-        if self.depth_sigma_m != 0 and not positive(self.depth_sigma_m):
-            raise ValueError(f"depth_sigma_m: got {self.depth_sigma_m!r}, want 0 m or more")
-        for name, size in (
-            ("pixel", 2),
-            ("intrinsics", len(self.names)),
-            ("hand_eye", 6),
-            ("arm", 6),
-        ):
-            object.__setattr__(self, name, _covariance(name, getattr(self, name), size))
+        different = len(set(self.names)) == len(self.names) and set(self.names) <= set(PARAMETERS)
+        want(different, "names", self.names, f"different ones of {', '.join(PARAMETERS)}")
+        checks.number("depth_sigma_m", self.depth_sigma_m, "0 m or more", least=0.0)
+        sizes = {"pixel": 2, "intrinsics": len(self.names), "hand_eye": 6, "arm": 6}
+        for name, size in sizes.items():
+            given = getattr(self, name)
+            known = np.zeros((size, size)) if given is None else given
+            object.__setattr__(self, name, checks.covariance(name, known, size))
 
     @cached_property
     def joint(self) -> Floats:
         """Of (u, v), Z, K, the twist of X and that of the arm together, (15 + p, 15 + p)."""
         from scipy.linalg import block_diag
 
-        parts = (
-            self.pixel,
-            [[self.depth_sigma_m**2]],
-            self.intrinsics,
-            self.hand_eye,
-            self.arm,
-        )
-        return np.asarray(block_diag(*parts), dtype=np.float64)
+        depth = [[self.depth_sigma_m**2]]
+        joint = block_diag(self.pixel, depth, self.intrinsics, self.hand_eye, self.arm)
+        return np.asarray(joint, dtype=np.float64)
 
 
-def pixel_jacobian(view: View) -> Floats:
-    """d(X, Y, Z)/d(u, v) at fixed Z, camera frame, (3, 2), m/px: Z/fx and Z/fy without a lens."""
-    f = np.diag([1 / view.intrinsics.fx, 1 / view.intrinsics.fy])
-    return np.concatenate([view.distance_m * _undistortion(view) @ f, np.zeros((1, 2))])
+def jacobian(chain: Chain, names: tuple[str, ...] = PINHOLE_PARAMETERS) -> Floats:
+    """d p_base / d(u, v, Z, K, twist of X, twist of the arm), (3, 15 + p), m a unit.
 
-
-def intrinsics_jacobian(view: View, names: tuple[str, ...] = PARAMETERS) -> Floats:
-    """d(X, Y, Z)/d(K and distortion) at fixed (u, v) and Z, camera frame, (3, p), m a unit."""
-    camera, (x, y) = view.intrinsics, view.ray[:2]
-    u, v = view.pixel
-    seen = [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy]
-    r2 = x * x + y * y
-    columns = {  # of the distorted coordinates less the distortion's own change
-        "fx": (-seen[0] / camera.fx, 0.0),
-        "fy": (0.0, -seen[1] / camera.fy),
-        "cx": (-1 / camera.fx, 0.0),
-        "cy": (0.0, -1 / camera.fy),
-        "k1": (-x * r2, -y * r2),
-        "k2": (-x * r2**2, -y * r2**2),
-        "p1": (-2 * x * y, -(r2 + 2 * y * y)),
-        "p2": (-(r2 + 2 * x * x), -2 * x * y),
-        "k3": (-x * r2**3, -y * r2**3),
-    }
-    chosen = np.array([columns[name] for name in names]).reshape(-1, 2).T
-    lateral = view.distance_m * _undistortion(view) @ chosen
-    return np.concatenate([lateral, np.zeros((1, len(names)))])
-
-
-def jacobian(chain: Chain, names: tuple[str, ...] = ("fx", "fy", "cx", "cy")) -> Floats:
-    """d p_base / d(u, v, Z, K, twist of X, twist of the arm), (3, 15 + p)."""
-    view, R = chain.view, chain.view.R_base_camera
-    frame = chain.R_base_frame
+    names (p): the parameters of K and the lens that count, in their order.
+    """
+    view, R, frame = chain.view, chain.view.R_base_camera, chain.R_base_frame
+    chosen = [PARAMETERS.index(name) for name in names]
     turned = -cross_matrix(view.lever_base) @ frame
     arm = np.concatenate([-cross_matrix(chain.arm_lever), np.eye(3)], axis=1)
     parts = (
-        R @ pixel_jacobian(view),
+        R @ view.by_pixel,
         (R @ view.ray)[:, None],
-        R @ intrinsics_jacobian(view, names),
+        R @ view.by_parameter[:, chosen],
         turned,
         frame,
         arm if chain.mount == "eye_in_hand" else -arm,
@@ -179,16 +149,13 @@ def monte_carlo(
     where a drawn lens folds before it reaches the pixel.
     Raises ValueError for n under 1.
     """
-    if not isinstance(n, (int, np.integer)) or n < 1:
-        raise ValueError(f"n: got {n!r}, want a whole number of samples")
-    rng = np.random.default_rng(seed)
-    root = _root(covariances.joint)
-    draw = _Draw(chain, covariances, through_disparity)
+    n = checks.whole("n", n)
+    rng, root = np.random.default_rng(seed), scaled_root(covariances.joint)
     errors = np.empty((n, 3))
     for start in range(0, n, CHUNK):
-        stop = min(start + CHUNK, n)
-        used = rng.standard_normal((root.shape[1], stop - start))
-        errors[start:stop] = draw(root @ used).T
+        drawn = root @ rng.standard_normal((root.shape[1], min(CHUNK, n - start)))
+        moved = displacements(chain, covariances.names, drawn, through_disparity)
+        errors[start : start + CHUNK] = moved.T
     return errors
 
 
@@ -236,79 +203,65 @@ def check_first_order(
     seed: int = 0,
     through_disparity: bool = False,
 ) -> FirstOrderCheck:
-    """Compare `propagate` with `monte_carlo`; n samples tell variances to sqrt(2 / n)."""
+    """Compare `propagate` with `monte_carlo`; n samples tell variances to sqrt(2 / n).
+
+    seed, through_disparity: as for `monte_carlo`. Raises ValueError where fewer than two samples
+    gave a depth.
+
+    >>> from coursekit.budget import lesson_view
+    >>> known = Covariances(pixel=np.eye(2), depth_sigma_m=0.0007)
+    >>> check_first_order(Chain(lesson_view()), known, n=1000).worst < 0.2
+    True
+    """
     samples = monte_carlo(chain, covariances, n, seed, through_disparity)
     valid = samples[np.isfinite(samples).all(axis=1)]
-    if len(valid) < 2:
-        raise ValueError(f"n: got {n}, of which {len(valid)} gave a depth; want at least 2")
-    covariance = np.cov(valid.T)
-    return FirstOrderCheck(
-        propagate(chain, covariances), covariance, valid.mean(axis=0), len(valid)
-    )
-
-
-def ellipsoid(covariance: ArrayLike, level: float = 0.95) -> tuple[Floats, Floats]:
-    """The ellipsoid that holds a normal error with probability `level`.
-
-    covariance (3, 3): m². Returns its half axes (3,), m, the longest first, and their directions
-    (3, 3), columns. Raises ValueError for a level outside (0, 1).
-    """
-    from scipy.stats import chi2
-
-    if not 0 < level < 1:
-        raise ValueError(f"level: got {level!r}, want a probability between 0 and 1")
-    values, vectors = np.linalg.eigh(_covariance("covariance", covariance, 3))
-    half = np.sqrt(np.clip(values, 0, None) * chi2(3).ppf(level))
-    return half[::-1], vectors[:, ::-1]
+    want(len(valid) >= 2, "n", n, f"two samples with a depth at least; {len(valid)} had one")
+    first_order = propagate(chain, covariances)
+    return FirstOrderCheck(first_order, np.cov(valid.T), valid.mean(axis=0), len(valid))
 
 
 # --- the exact chain ---
 
 
-@dataclass(frozen=True, eq=False)
-class _Draw:
-    """The exact chain for errors (15 + p, m) in the order of `jacobian`; returns (3, m)."""
+def displacements(
+    chain: Chain, names: tuple[str, ...], errors: Floats, through_disparity: bool = False
+) -> Floats:
+    """Where errors move the point less where the gripper goes, base axes, (3, m), m.
 
-    chain: Chain
-    covariances: Covariances
-    through_disparity: bool
+    errors (15 + p, m): in the order of `jacobian`, of any size. names (p): of K and the lens.
+    through_disparity: the error of Z is one of its disparity, in the same relation to it. NaN where
+    there is no depth or no ray.
+    """
+    pixel, depth, K, X, arm = np.split(errors, np.cumsum([2, 1, len(names), 6]))
+    view, frame, lever = chain.view, chain.R_base_frame, chain.arm_lever[:, None]
+    seen = _seen(view, names, pixel, K) * _depth(view.distance_m, depth[0], through_disparity)
+    in_frame = _turn(X[:3], frame.T @ view.R_base_camera @ seen) + X[3:]
+    moved = frame @ in_frame - view.lever_base[:, None]
+    if chain.mount == "eye_to_hand":
+        return moved - arm[3:]  # the fingertip is at the point: turning it moves it not at all
+    return _turn(arm[:3], moved + lever) - lever + arm[3:]
 
-    def __call__(self, error: Floats) -> Floats:
-        p, chain = len(self.covariances.names), self.chain
-        view, frame = chain.view, chain.R_base_frame
-        seen = self._points(error[:2], error[2], error[3 : 3 + p])
-        omega, v = error[3 + p : 6 + p], error[6 + p : 9 + p]
-        R_frame_camera = frame.T @ view.R_base_camera
-        in_frame = _turn(omega, R_frame_camera @ seen)
-        in_frame += v
-        moved = frame @ in_frame - view.lever_base[:, None]
-        omega, v = error[9 + p : 12 + p], error[12 + p :]
-        if chain.mount == "eye_to_hand":
-            return moved - v  # the fingertip is at the point: turning it moves it not at all
-        lever = chain.arm_lever[:, None]
-        return _turn(omega, moved + lever) - lever + v
 
-    def _points(self, pixel: Floats, depth: Floats, intrinsics: Floats) -> Floats:
-        view = self.chain.view
-        values = {name: getattr(view.intrinsics, name) for name in PARAMETERS[:4]}
-        dist = view.intrinsics.dist
-        lens = np.zeros(5) if dist is None else dist
-        values |= dict(zip(PARAMETERS[4:], lens, strict=True))
-        for name, off in zip(self.covariances.names, intrinsics, strict=True):
-            values[name] = values[name] + off
-        x = (view.pixel[0] + pixel[0] - values["cx"]) / values["fx"]
-        y = (view.pixel[1] + pixel[1] - values["cy"]) / values["fy"]
-        if dist is not None or set(self.covariances.names) & set(PARAMETERS[4:]):
-            x, y = _ideal(x, y, view.ray, [values[name] for name in PARAMETERS[4:]])
-        z = self._depth(depth)
-        return np.stack([x * z, y * z, z])
+def _seen(view: View, names: tuple[str, ...], pixel: Floats, changes: Floats) -> Floats:
+    """(x, y, 1) of pixels that are off by `pixel` (2, m), by parameters off by `changes` (p, m)."""
+    camera = view.intrinsics
+    lens = (0.0,) * 5 if camera.dist is None else camera.coeffs
+    nominal = (camera.fx, camera.fy, camera.cx, camera.cy, *lens)
+    values: dict[str, Any] = dict(zip(PARAMETERS, nominal, strict=True))
+    for name, change in zip(names, changes, strict=True):
+        values[name] = values[name] + change
+    x = (view.pixel[0] + pixel[0] - values["cx"]) / values["fx"]
+    y = (view.pixel[1] + pixel[1] - values["cy"]) / values["fy"]
+    if camera.dist is not None or set(names) & set(LENS_PARAMETERS):
+        x, y = _ideal(x, y, view.ray, [values[name] for name in LENS_PARAMETERS])
+    return np.stack([x, y, np.ones_like(x)])
 
-    def _depth(self, error: Floats) -> Floats:
-        Z = self.chain.view.distance_m
-        if not self.through_disparity:
-            return np.asarray(Z + error)
-        disparity = 1 - error / Z  # over the true one: Z = f B / d
-        return np.asarray(Z / np.where(disparity > 0, disparity, np.nan))
+
+def _depth(Z: float, error: Floats, through_disparity: bool) -> Floats:
+    if not through_disparity:
+        return np.asarray(Z + error)
+    disparity = 1 - error / Z  # over the true one: Z = f B / d
+    return np.asarray(Z / np.where(disparity > 0, disparity, np.nan))
 
 
 def _ideal(x: Floats, y: Floats, start: Floats, lens: list[Floats]) -> tuple[Floats, Floats]:
@@ -318,7 +271,7 @@ def _ideal(x: Floats, y: Floats, start: Floats, lens: list[Floats]) -> tuple[Flo
     """
     k1, k2, p1, p2, k3 = lens
     a, b = np.full_like(x, start[0]), np.full_like(y, start[1])
-    for _ in range(NEWTON_STEPS):
+    for _ in range(UNDISTORTION_STEPS):
         r2 = a * a + b * b
         radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
         off_x = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a) - x
@@ -331,53 +284,12 @@ def _ideal(x: Floats, y: Floats, start: Floats, lens: list[Floats]) -> tuple[Flo
         step_a = (yy * off_x - xy * off_y) / determinant
         step_b = (xx * off_y - xy * off_x) / determinant
         a, b = a - step_a, b - step_b
-    found = (np.abs(step_a) + np.abs(step_b) < NEWTON_TOLERANCE) & (determinant > 0)
+    found = (np.abs(step_a) + np.abs(step_b) < UNDISTORTION_TOLERANCE) & (determinant > 0)
     return np.where(found, a, np.nan), np.where(found, b, np.nan)
 
 
 def _turn(omega: Floats, points: Floats) -> Floats:
-    """exp(omega) points by Rodrigues' formula; omega (3, m) in rad, points (3, m)."""
-    wx, wy, wz = omega
-    px, py, pz = points
-    angle = np.sqrt(wx * wx + wy * wy + wz * wz)
-    half = np.sinc(angle / (2 * math.pi))
-    sine, versine = np.sinc(angle / math.pi), half * half / 2
-    cosine, along = np.cos(angle), versine * (wx * px + wy * py + wz * pz)
-    turned = np.empty_like(points)
-    turned[0] = cosine * px + sine * (wy * pz - wz * py) + along * wx
-    turned[1] = cosine * py + sine * (wz * px - wx * pz) + along * wy
-    turned[2] = cosine * pz + sine * (wx * py - wy * px) + along * wz
-    return turned
+    """exp(omega) points; omega (3, m) in rad, points (3, m)."""
+    from scipy.spatial.transform import Rotation
 
-
-def _undistortion(view: View) -> Floats:
-    """d(ideal)/d(distorted) normalised coordinates at the view's pixel, (2, 2)."""
-    dist = view.intrinsics.dist
-    if dist is None:
-        return np.eye(2)
-    xx, xy, yy = distortion_jacobian(view.ray[:2], dist)
-    return np.array([[yy, -xy], [-xy, xx]]) / (xx * yy - xy * xy)
-
-
-def _root(covariance: Floats) -> Floats:
-    """A square root without the parts that are exact, (n, m): root root^T = covariance."""
-    scale = np.sqrt(np.where(np.diag(covariance) > 0, np.diag(covariance), 1.0))
-    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    kept = values > 1e-12
-    return np.asarray(scale[:, None] * vectors[:, kept] * np.sqrt(values[kept]))
-
-
-def _covariance(name: str, value: ArrayLike | None, size: int) -> Floats:
-    """`value` as (size, size) float64, zeros for None, or a ValueError under `name`."""
-    if value is None:
-        return np.zeros((size, size))
-    matrix = np.asarray(value, dtype=np.float64)
-    if matrix.shape != (size, size) or not np.isfinite(matrix).all():
-        raise ValueError(f"{name}: got shape {matrix.shape}, want finite ({size}, {size})")
-    scale = np.sqrt(np.clip(np.diag(matrix), 1e-300, None))
-    correlation = matrix / np.outer(scale, scale)  # units differ by powers of ten
-    if not np.allclose(correlation, correlation.T, atol=1e-9):
-        raise ValueError(f"{name}: is not symmetric")
-    if np.linalg.eigvalsh(correlation).min() < -1e-9:
-        raise ValueError(f"{name}: is no covariance, one of its eigenvalues is negative")
-    return matrix
+    return np.asarray(Rotation.from_rotvec(omega.T).apply(points.T).T)

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from coursekit import checks
 from coursekit.arrays import Floats
-from coursekit.checks import transform
+from coursekit.checks import want
 from coursekit.geometry import Intrinsics, undistort
+from coursekit.intrinsics.derivatives import project_with_derivatives
 
 AXES = ("closing", "approach", "lateral")
 MAX_DISPARITY_PX = 126  # the vendor's search range: nearer than fx baseline / 126 nothing is seen
+GRIPPER_DOWN = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])  # R_base_gripper, fingers down
 
 
 def looking_down(tilt_deg: float = 0.0) -> Floats:
@@ -22,9 +26,12 @@ def looking_down(tilt_deg: float = 0.0) -> Floats:
     Image right is the base's -y, image down its -x. tilt_deg: turned from there about image down,
     so that it looks along the base's +y as well; at 90 it looks along y alone. Where it stands does
     not matter to a budget, which knows only directions and the lever from camera to object.
+    Raises ValueError for an angle beyond half a turn.
+
+    >>> (looking_down()[:3, :3] @ [0, 0, 1]).tolist()  # the optical axis points down
+    [0.0, 0.0, -1.0]
     """
-    if not -180 <= tilt_deg <= 180:
-        raise ValueError(f"tilt_deg: got {tilt_deg!r}, want an angle in degrees")
+    checks.number("tilt_deg", tilt_deg, "an angle in degrees", least=-180, most=180)
     c, s = math.cos(math.radians(tilt_deg)), math.sin(math.radians(tilt_deg))
     T = np.eye(4)
     T[:3, :3] = np.array([[0, -1, 0], [-c, 0, s], [-s, 0, -c]])
@@ -39,6 +46,10 @@ class View:
     the stereo pair. T_base_camera (4, 4): camera coordinates to base coordinates.
     Raises ValueError for a distance or baseline that is not positive, a pixel that is not finite
     or belongs to no ray, and a transform that is not rigid.
+
+    >>> view = View(Intrinsics(848, 480, 447, 447, 424, 240), 0.45, 0.05, u=871)
+    >>> view.point_camera.tolist(), round(view.off_axis_deg, 1)
+    ([0.45, 0.0, 0.45], 45.0)
     """
 
     intrinsics: Intrinsics
@@ -49,30 +60,31 @@ class View:
     T_base_camera: Floats = field(default_factory=looking_down)
 
     def __post_init__(self) -> None:
-        for name in ("distance_m", "baseline_m"):
-            if not positive(getattr(self, name)):
-                raise ValueError(f"{name}: got {getattr(self, name)!r}, want a positive length, m")
-        for name, value in zip(("u", "v"), self.pixel, strict=True):
-            if not np.isfinite(value):
-                raise ValueError(f"{name}: got {value!r}, want a pixel coordinate")
+        checks.positive("distance_m", self.distance_m, "a positive length, m")
+        checks.positive("baseline_m", self.baseline_m, "a positive length, m")
+        for name, value in zip("uv", self.pixel, strict=True):
+            checks.number(name, value, "a pixel coordinate")
             object.__setattr__(self, name, float(value))
-        T = transform("T_base_camera", self.T_base_camera)
-        object.__setattr__(self, "T_base_camera", T)
-        object.__setattr__(self, "_ray", ray(self.intrinsics, *self.pixel))
+        object.__setattr__(
+            self, "T_base_camera", checks.transform("T_base_camera", self.T_base_camera)
+        )
+        _ = self.ray  # says so now if there is none
 
     @property
     def pixel(self) -> tuple[float, float]:
         """(u, v), px."""
-        u, v = self.u, self.v
-        return (
-            self.intrinsics.cx if u is None else u,
-            self.intrinsics.cy if v is None else v,
-        )
+        u, v, camera = self.u, self.v, self.intrinsics
+        return (camera.cx if u is None else u, camera.cy if v is None else v)
 
-    @property
+    @cached_property
     def ray(self) -> Floats:
-        """(x, y, 1): the point seen at this pixel at Z = 1, camera frame. Returns (3,)."""
-        return np.array(self.__dict__["_ray"])
+        """(x, y, 1): the point seen at this pixel at Z = 1, camera frame, (3,)."""
+        (u, v), camera = self.pixel, self.intrinsics
+        xy = np.array([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy])
+        if camera.dist is not None:
+            xy, converged = undistort(xy, camera.dist)
+            want(converged, "u, v", (u, v), "a pixel with a ray: there this lens model folds")
+        return np.append(xy, 1.0)
 
     @property
     def point_camera(self) -> Floats:
@@ -88,6 +100,24 @@ class View:
     def lever_base(self) -> Floats:
         """From the camera's centre to the object, in base directions, (3,), m."""
         return self.R_base_camera @ self.point_camera
+
+    @cached_property
+    def by_pixel(self) -> Floats:
+        """d(X, Y, Z)/d(u, v) at fixed Z, camera frame, (3, 2), m/px.
+
+        Z/fx and Z/fy without a lens; with one, the inverse of what the projection does.
+        """
+        *_, by_point = project_with_derivatives(self.point_camera[None], self.intrinsics)
+        return np.vstack([np.linalg.inv(by_point[0, :, :2]), np.zeros(2)])
+
+    @cached_property
+    def by_parameter(self) -> Floats:
+        """d(X, Y, Z)/d(`intrinsics.derivatives.PARAMETERS`) at fixed pixel and Z, (3, 9), m a unit.
+
+        Camera frame. The object has to move so that its pixel stays where it was seen.
+        """
+        _, by_parameter, _ = project_with_derivatives(self.point_camera[None], self.intrinsics)
+        return np.asarray(-self.by_pixel @ by_parameter[0])
 
     @property
     def off_axis_deg(self) -> float:
@@ -105,15 +135,11 @@ class View:
         Raises ValueError for an angle that is not between -90 and 90, and as the class does.
         """
         if off_axis_deg is not None:
-            if not -90 < off_axis_deg < 90:
-                raise ValueError(f"off_axis_deg: got {off_axis_deg!r}, want between -90 and 90")
-            if self.intrinsics.dist is not None:
-                raise ValueError("off_axis_deg: this lens distorts; give u and v")
-            tangent = math.tan(math.radians(off_axis_deg))
-            changes |= {
-                "u": self.intrinsics.cx + self.intrinsics.fx * tangent,
-                "v": self.intrinsics.cy,
-            }
+            want(-90 < off_axis_deg < 90, "off_axis_deg", off_axis_deg, "between -90 and 90")
+            undistorted = self.intrinsics.dist is None
+            want(undistorted, "off_axis_deg", off_axis_deg, "u and v: this lens distorts")
+            u = self.intrinsics.cx + self.intrinsics.fx * math.tan(math.radians(off_axis_deg))
+            changes |= {"u": u, "v": self.intrinsics.cy}
         return replace(self, **changes)
 
 
@@ -126,6 +152,10 @@ class GraspAxes:
     gripper may be to either side along closing, approach and lateral (approach x closing). The
     defaults come from above and close along the base's y; only the lesson's 7 mm is given by
     anybody, 10 mm along the other two axes is **assumed**.
+    Raises ValueError for what is no direction, no right angle, and no three positive tolerances.
+
+    >>> GraspAxes(closing=(2.0, 0.0, 0.0)).directions[2].tolist()  # lateral
+    [0.0, -1.0, 0.0]
     """
 
     closing: tuple[float, float, float] = (0.0, 1.0, 0.0)
@@ -134,33 +164,16 @@ class GraspAxes:
 
     def __post_init__(self) -> None:
         for name in ("closing", "approach"):
-            given = np.asarray(getattr(self, name), dtype=np.float64)
-            length = float(np.linalg.norm(given)) if given.shape == (3,) else math.nan
-            if not positive(length):
-                raise ValueError(f"{name}: got {getattr(self, name)!r}, want a direction (3,)")
-            object.__setattr__(self, name, tuple((given / length).tolist()))
-        if abs(np.dot(self.closing, self.approach)) > 1e-6:
-            raise ValueError("approach: is not at right angles to closing")
-        if len(self.tolerance_m) != 3 or not all(map(positive, self.tolerance_m)):
-            raise ValueError(f"tolerance_m: got {self.tolerance_m!r}, want three positive lengths")
+            given = checks.array(name, getattr(self, name), (3,), finite=True)
+            want(given.any(), name, given, "a direction, not zero")
+            object.__setattr__(self, name, tuple((given / np.linalg.norm(given)).tolist()))
+        right_angle = abs(np.dot(self.closing, self.approach)) <= 1e-6
+        want(right_angle, "approach", self.approach, "a direction at right angles to closing")
+        tolerance = checks.array("tolerance_m", self.tolerance_m, (3,), finite=True)
+        want((tolerance > 0).all(), "tolerance_m", self.tolerance_m, "three positive lengths, m")
 
     @property
     def directions(self) -> Floats:
         """Unit vectors in the base, (3, 3): rows closing, approach, lateral."""
         lateral = np.cross(self.approach, self.closing)
         return np.array([self.closing, self.approach, lateral])
-
-
-def ray(intrinsics: Intrinsics, u: float, v: float) -> Floats:
-    """(x, y, 1) of a pixel, (3,); ValueError for one that no ray of this lens reaches."""
-    xy = np.array([(u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy])
-    if intrinsics.dist is not None:
-        xy, converged = undistort(xy, intrinsics.dist)
-        if not converged:
-            raise ValueError(f"u, v: got ({u:g}, {v:g}), where this lens model folds: no ray there")
-    return np.append(xy, 1.0)
-
-
-def positive(value: object) -> bool:
-    """Whether `value` is a finite number above 0."""
-    return isinstance(value, (int, float, np.number)) and bool(0 < value < math.inf)

@@ -1,8 +1,10 @@
 """Hand-eye calibration: where the camera is on the arm, or where the arm is before the camera.
 
-`solve` takes arm poses and what the camera saw at each. `observability` says beforehand which
-directions of X the poses determine, `next_pose` which pose to take next, `held_out` how far the
-result is off at poses that it has not seen. The frames and the equation are in `hand_eye.poses`.
+A `HandEyeSession` is arm poses and what the camera saw at each; `solve` finds the camera from it,
+by a closed form or by refinement, and the `HandEyeResult` says how well it is known. Before that,
+`observability` says which directions of X the poses determine; after it, `held_out` how far the
+result is off at poses that it has not seen, and `next_pose` which pose to take next. `diagnose`
+names what is wrong with a session. The frames and the equation are in `hand_eye.poses`.
 
 Metres and radians; T_base_gripper takes gripper coordinates to base coordinates.
 """
@@ -21,29 +23,21 @@ from coursekit.hand_eye.closed_form import (
     translation_half,
 )
 from coursekit.hand_eye.diagnosis import diagnose
-from coursekit.hand_eye.planning import NextPose, candidate_joints, next_pose
-from coursekit.hand_eye.poses import MOUNTS
-from coursekit.hand_eye.refinement import BoardPose, board_pose, board_poses
-from coursekit.hand_eye.result import HandEyeResult, HeldOut, Observability, held_out, observability
-from coursekit.hand_eye.session import HandEyeSession
-from coursekit.hand_eye.solver import METHODS, solve
+from coursekit.hand_eye.planning import held_out, next_pose
+from coursekit.hand_eye.poses import MOUNTS, observability
+from coursekit.hand_eye.session import METHODS, HandEyeResult, HandEyeSession, solve
+from coursekit.hand_eye.views import board_poses
 
 __all__ = [
     "CLOSED_FORMS",
     "METHODS",
     "MOUNTS",
-    "BoardPose",
     "HandEyeResult",
     "HandEyeSession",
-    "HeldOut",
-    "NextPose",
     "NotDetermined",
-    "Observability",
     "SolverFailed",
     "StudyPoint",
-    "board_pose",
     "board_poses",
-    "candidate_joints",
     "diagnose",
     "error_study",
     "held_out",

@@ -21,18 +21,17 @@ import numpy as np
 
 from coursekit.arm import Arm, ArmErrors, fk_covariance
 from coursekit.arrays import Floats
-from coursekit.causes import CauseSearch, Hypothesis, Tested, likelihood_ratios
-from coursekit.causes import search as search_causes
+from coursekit.causes import CauseSearch, Hypothesis, Tested, likelihood_ratios, search
+from coursekit.geometry import turned
 from coursekit.hand_eye.pairs import LEAST_M, LEAST_RAD, MEDIAN_3D, Fit, PosePairs, robust_fit
-from coursekit.hand_eye.poses import turned
-from coursekit.hand_eye.refinement import by_arm_twist
+from coursekit.hand_eye.poses import by_arm_twist
 
 SCALE, LATE, ARM_ERROR = "wrong_square_size", "late_time_stamps", "arm_error"
 SLIP, OUTLIER = "slipping_board", "outlier_pose"
 SMOOTH = (SCALE, LATE, ARM_ERROR)  # one number that acts on all pairs
 # At most 2 % of healthy sessions may get a finding, and five kinds of test at this level make
 # 0.05 %; the rest is for arms whose errors are not quite normal.
-CHANCE_LEVEL = 1e-4
+_CHANCE_LEVEL = 1e-4
 # What careful people have, and no finding: squares measured with a ruler, a driver's own delay, a
 # board that settles, a pose in which the arm still swings, a zero that a jig sets.
 NORMAL_SIZE = {SCALE: 0.01, LATE: 5e-3, SLIP: 2e-3, OUTLIER: 5e-3, ARM_ERROR: np.radians(0.6)}
@@ -206,9 +205,9 @@ class MendedPairs:
         return self.arms.arm.jacobian(self._joints())
 
 
-def search(pairs: PosePairs, arms: Arms) -> CauseSearch[MendedPairs]:
+def search_pairs(pairs: PosePairs, arms: Arms) -> CauseSearch[MendedPairs]:
     """The causes that the residuals of pairs speak for, the strongest first."""
-    return search_causes(MendedPairs(arms, pairs.fit), CHANCE_LEVEL)
+    return search(MendedPairs(arms, pairs.fit), _CHANCE_LEVEL)
 
 
 def turn_and_shift(test: Tested) -> tuple[float, float]:

@@ -1,6 +1,10 @@
 """Closed forms of A X = X B: our own, rotation first and then translation, and OpenCV's.
 
-An experiment: how X gets better with more poses and with more rotation.
+    rotation      R_A R_X = R_X R_B:  the axis of A is that of B, seen from the other frame
+    translation   (R_A - 1) t_X = R_X t_B - t_A
+
+A and B are what carrier and board do between two poses (`hand_eye.poses`). At the end stands an
+experiment: how X gets better with more poses and with more rotation (`error_study`).
 """
 
 from __future__ import annotations
@@ -9,35 +13,36 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import product
 from typing import Literal
 
+import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from coursekit.arm import pose_difference
-from coursekit.arrays import ArrayLike, Floats
-from coursekit.geometry import invert_transform
+from coursekit.arrays import ArrayLike, Floats, Integers
+from coursekit.checks import choice, positive, want, whole
+from coursekit.geometry import invert_transform, pose_difference, turned
 from coursekit.hand_eye.poses import (
+    MOUNTS,
+    SCATTER,
     Mount,
+    axis_text,
     carrier_stand,
-    check_mount,
     check_poses,
     mean_pose,
     nearest_rotation,
-    same_number,
-    turned,
+    stand_board,
 )
 
-Pairs = Literal["all", "consecutive"]
-
-HAND_EYE = {"tsai": "TSAI", "park": "PARK", "horaud": "HORAUD", "andreff": "ANDREFF",
-            "daniilidis": "DANIILIDIS"}  # fmt: skip
-ROBOT_WORLD = {"shah": "SHAH", "li": "LI"}
+HAND_EYE = ("tsai", "park", "horaud", "andreff", "daniilidis")  # OpenCV's, of A X = X B
+ROBOT_WORLD = ("shah", "li")  # OpenCV's, of X and Y together
 CLOSED_FORMS = ("closed_form", *HAND_EYE, *ROBOT_WORLD)
-FEWEST = 3
+FEWEST_POSES = 3
 HALF_TURN_DEG = 170.0  # beyond it noise can turn an axis round
 LEAST_TURN_RAD = np.radians(0.1)  # less than any arm's own wobble
-FAR_M = 1e5  # farther away is no camera, not even in millimetres that pass for metres
-ROTATION_OFF = 1e-2  # R R^T - 1 of a solver's output: below it rounding, above it nonsense
+NO_CAMERA_M = 1e5  # farther away is no camera, not even in millimetres that pass for metres
+NONSENSE_ROTATION = 1e-2  # R R^T - 1 of a solver's output: below it rounding, above it nonsense
 
 
 class SolverFailed(ValueError):
@@ -49,7 +54,15 @@ class NotDetermined(ValueError):
 
 
 def motions(T_base_gripper: Floats, T_camera_board: Floats, mount: Mount) -> tuple[Floats, Floats]:
-    """A and B (p, 4, 4) of A X = X B for all pairs of poses i < j."""
+    """A and B (p, 4, 4) of A X = X B for all pairs of poses i < j.
+
+    T_base_gripper, T_camera_board (n, 4, 4): what arm and camera say, m; p = n (n - 1) / 2.
+
+    >>> T = turned(np.eye(4), np.array([[0.0, 0, 0, 0, 0, 0.3], [0.0, 0, 0, 0, 0, 0.5]]))
+    >>> A, B = motions(T, T, "eye_to_hand")
+    >>> A[0, :3, 3].round(6).tolist()
+    [0.0, 0.0, 0.2]
+    """
     M = carrier_stand(T_base_gripper, mount)
     i, j = np.triu_indices(len(M), 1)
     return M[j] @ invert_transform(M[i]), T_camera_board[j] @ invert_transform(T_camera_board[i])
@@ -57,8 +70,6 @@ def motions(T_base_gripper: Floats, T_camera_board: Floats, mount: Mount) -> tup
 
 def half_angle_vectors(R: Floats) -> Floats:
     """2 sin(angle / 2) axis of rotations (..., 3, 3): (..., 3). Source: Tsai and Lenz (1989)."""
-    from scipy.spatial.transform import Rotation
-
     turns = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat(canonical=True)[:, :3]
     return 2.0 * turns.reshape(*R.shape[:-2], 3)
 
@@ -71,7 +82,7 @@ def rotation_half(A: Floats, B: Floats) -> Floats:
     have fewer than two axes. Source: Kabsch (1976); Park and Martin (1994) for the idea.
     """
     a = half_angle_vectors(A[:, :3, :3])
-    spread = _turns(a)
+    spread = np.asarray(np.linalg.svd(a, compute_uv=False)) / math.sqrt(max(1, len(a)))  # rad
     if spread[1] < LEAST_TURN_RAD:
         raise NotDetermined(_too_few_axes(a, spread))
     return rotation_by_axes(A, B)
@@ -86,7 +97,12 @@ def rotation_by_axes(A: Floats, B: Floats) -> Floats:
 
 
 def translation_half(A: Floats, B: Floats, R_X: Floats) -> Floats:
-    """t_X (..., 3) in m of (R_A - 1) t_X = R_X t_B - t_A, by least squares over p pairs."""
+    """t_X (..., 3) in m of (R_A - 1) t_X = R_X t_B - t_A, by least squares over p pairs.
+
+    A, B (..., p, 4, 4) and R_X (..., 3, 3), which comes first: an error of R_X acts on t_B, so the
+    board's distance decides how much of it ends up in t_X. Raises LinAlgError where the rotations
+    of A have fewer than two axes and the normal matrix is singular.
+    """
     rows = A[..., :3, :3] - np.eye(3)
     right = B[..., :3, 3] @ np.swapaxes(R_X, -1, -2) - A[..., :3, 3]
     normal = np.einsum("...pki,...pkj->...ij", rows, rows)
@@ -96,25 +112,24 @@ def translation_half(A: Floats, B: Floats, R_X: Floats) -> Floats:
 def rotation_from_shifts(
     T_base_gripper: ArrayLike, T_camera_board: ArrayLike, mount: Mount
 ) -> Floats:
-    """R_X (3, 3) from poses that do not turn: then R_A = 1 and t_A = R_X t_B.
+    """R_X (3, 3) from poses (n, 4, 4) that do not turn: then R_A = 1 and t_A = R_X t_B.
 
-    What a grid at fixed orientation still determines; of t_X it says nothing. Raises NotDetermined
-    for shifts along one line.
+    What a grid at fixed orientation still determines; of t_X it says nothing. Raises ValueError
+    for poses that are none or of different number, and NotDetermined for shifts along one line.
+
+    >>> T = turned(np.eye(4), np.array([[0, 0, 0, x, y, 0.0] for x, y in ((0, 0), (1, 0), (0, 1))]))
+    >>> (rotation_from_shifts(T, T, "eye_to_hand").round(6) + 0.0).tolist()
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    arm = check_poses("T_base_gripper", T_base_gripper, FEWEST)
-    seen = check_poses("T_camera_board", T_camera_board, FEWEST)
-    same_number(len(arm), len(seen))
-    A, B = motions(arm, seen, check_mount(mount))
+    arm = check_poses("T_base_gripper", T_base_gripper, FEWEST_POSES)
+    seen = check_poses("T_camera_board", T_camera_board, FEWEST_POSES)
+    want(len(seen) == len(arm), "T_camera_board", len(seen), f"{len(arm)}, one an arm pose")
+    A, B = motions(arm, seen, choice("mount", mount, MOUNTS))
     a, b = A[:, :3, 3], B[:, :3, 3]
     lengths = np.linalg.svd(a, compute_uv=False)
     if lengths[1] < 1e-3 * lengths[0] or lengths[0] == 0:
         raise NotDetermined("T_base_gripper: the shifts lie on one line; R_X is free about it")
     return nearest_rotation(a.T @ b)
-
-
-def _turns(a: Floats) -> Floats:
-    """Root mean square rotation (3,), rad, about the pairs' principal axes, descending."""
-    return np.asarray(np.linalg.svd(a, compute_uv=False) / math.sqrt(max(1, len(a))))
 
 
 def _too_few_axes(a: Floats, spread: Floats) -> str:
@@ -123,118 +138,98 @@ def _too_few_axes(a: Floats, spread: Floats) -> str:
             "T_base_gripper: the poses do not turn against each other (R_A = 1), so t_X drops out "
             "of (R_A - 1) t_X = R_X t_B - t_A: translation is free in all directions"
         )
-    axis = np.linalg.svd(a)[2][0]
-    axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
-    text = "({:.2f}, {:.2f}, {:.2f})".format(*(axis + 0.0))
+    axis = axis_text(np.linalg.svd(a)[2][0])
     return (
-        f"T_base_gripper: all poses turn about one axis, {text} in the frame that carries the "
+        f"T_base_gripper: all poses turn about one axis, {axis} in the frame that carries the "
         "camera: rotation about it and translation along it are free; turn about a second axis"
     )
+
+
+# --- the solvers ---
 
 
 def closed_form(
     T_base_gripper: Floats, T_camera_board: Floats, mount: Mount, method: str
 ) -> tuple[Floats, Floats]:
+    """X and Y (4, 4) by one of `CLOSED_FORMS` from checked poses (n, 4, 4), m.
+
+    Raises NotDetermined where the arm did not turn about two axes, SolverFailed where what OpenCV
+    returns is no pose.
+    """
+    M = carrier_stand(T_base_gripper, mount)
     if method == "closed_form":
         A, B = motions(T_base_gripper, T_camera_board, mount)
         X = np.eye(4)
         X[:3, :3] = rotation_half(A, B)
         X[:3, 3] = translation_half(A, B, X[:3, :3])
     elif method in HAND_EYE:
-        X = _opencv_hand_eye(T_base_gripper, T_camera_board, mount, method)
-    else:
-        return _opencv_robot_world(T_base_gripper, T_camera_board, mount, method)
+        with _opencv(method):
+            R, t = cv2.calibrateHandEye(
+                *_parts(invert_transform(M)),
+                *_parts(T_camera_board),
+                method=getattr(cv2, f"CALIB_HAND_EYE_{method.upper()}"),
+            )
+        if np.array_equal(R, np.eye(3)):
+            raise SolverFailed(
+                f"{method}: OpenCV returned the identity, which is what it does when it finds no "
+                "pair of poses with enough rotation between them; turn the wrist more"
+            )
+        X = _rigid(method, R, t)
+    else:  # OpenCV's world is the board, its base the stand and its gripper the carrier
+        with _opencv(method):
+            R_Y, t_Y, R_X, t_X = cv2.calibrateRobotWorldHandEye(
+                *_parts(T_camera_board),
+                *_parts(M),
+                method=getattr(cv2, f"CALIB_ROBOT_WORLD_HAND_EYE_{method.upper()}"),
+            )
+        X = invert_transform(_rigid(method, R_X, t_X))
+        return X, invert_transform(_rigid(method, R_Y, t_Y))
     return X, mean_pose(stand_board(T_base_gripper, T_camera_board, X, mount))
 
 
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """OpenCV without its log: what goes wrong is raised here, not printed there."""
-    import cv2
+def _parts(T: Floats) -> tuple[list[Floats], list[Floats]]:
+    """The rotations and the translations of poses (n, 4, 4), as OpenCV takes them."""
+    return list(T[:, :3, :3]), list(T[:, :3, 3])
 
+
+@contextmanager
+def _opencv(method: str) -> Iterator[None]:
+    """OpenCV without its log: what goes wrong is raised here, not printed there."""
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         yield
+    except cv2.error as error:
+        raise SolverFailed(f"{method}: OpenCV gave up ({error.err})") from error
     finally:
         cv2.utils.logging.setLogLevel(level)
 
 
-def _opencv_hand_eye(
-    T_base_gripper: Floats, T_camera_board: Floats, mount: Mount, method: str
-) -> Floats:
-    import cv2
-
-    stand_carrier = invert_transform(carrier_stand(T_base_gripper, mount))
-    try:
-        with _quiet():
-            R, t = cv2.calibrateHandEye(
-                list(stand_carrier[:, :3, :3]), list(stand_carrier[:, :3, 3]),
-                list(T_camera_board[:, :3, :3]), list(T_camera_board[:, :3, 3]),
-                method=getattr(cv2, f"CALIB_HAND_EYE_{HAND_EYE[method]}"),
-            )  # fmt: skip
-    except cv2.error as error:
-        raise SolverFailed(f"{method}: OpenCV gave up ({error.err})") from error
-    if np.array_equal(R, np.eye(3)):
-        raise SolverFailed(
-            f"{method}: OpenCV returned the identity, which is what it does when it finds no pair "
-            "of poses with enough rotation between them; turn the wrist more"
-        )
-    return _rigid(method, R, t)
-
-
-def _opencv_robot_world(
-    T_base_gripper: Floats, T_camera_board: Floats, mount: Mount, method: str
-) -> tuple[Floats, Floats]:
-    """OpenCV's world is the board, its base the stand and its gripper the carrier."""
-    import cv2
-
-    M = carrier_stand(T_base_gripper, mount)
-    try:
-        R_board_stand, t_board_stand, R_camera_carrier, t_camera_carrier = (
-            cv2.calibrateRobotWorldHandEye(
-                list(T_camera_board[:, :3, :3]), list(T_camera_board[:, :3, 3]),
-                list(M[:, :3, :3]), list(M[:, :3, 3]),
-                method=getattr(cv2, f"CALIB_ROBOT_WORLD_HAND_EYE_{ROBOT_WORLD[method]}"),
-            )
-        )  # fmt: skip
-    except cv2.error as error:
-        raise SolverFailed(f"{method}: OpenCV gave up ({error.err})") from error
-    return (
-        invert_transform(_rigid(method, R_camera_carrier, t_camera_carrier)),
-        invert_transform(_rigid(method, R_board_stand, t_board_stand)),
-    )
-
-
-def _rigid(method: str, R: Floats, t: Floats) -> Floats:
+def _rigid(method: str, R: ArrayLike, t: ArrayLike) -> Floats:
     """A solver's output as (4, 4), or SolverFailed where it is no rotation."""
     R, t = np.asarray(R, float), np.asarray(t, float).ravel()
-    if not (np.isfinite(R).all() and np.isfinite(t).all()):
-        raise SolverFailed(f"{method}: returned NaN or infinity; do the poses turn about two axes?")
-    if np.linalg.norm(t) > FAR_M:
-        raise SolverFailed(
-            f"{method}: returned a place {np.linalg.norm(t):.0g} m away; do the poses turn "
-            "about two axes?"
-        )
-    if np.linalg.det(R) < 0:
-        raise SolverFailed(f"{method}: returned a reflection (determinant -1), which is no pose")
-    off = float(np.abs(R @ R.T - np.eye(3)).max())
-    if off > ROTATION_OFF:
-        raise SolverFailed(f"{method}: returned a matrix that is no rotation (off by {off:.1g})")
+    off, away = np.abs(R @ R.T - np.eye(3)).max(), np.linalg.norm(t)
+    fault = ""
+    if not np.isfinite(off + away):
+        fault = "NaN or infinity; do the poses turn about two axes?"
+    elif away > NO_CAMERA_M:
+        fault = f"a place {away:.0g} m away; do the poses turn about two axes?"
+    elif np.linalg.det(R) < 0:
+        fault = "a reflection (determinant -1), which is no pose"
+    elif off > NONSENSE_ROTATION:
+        fault = f"a matrix that is no rotation (off by {off:.1g})"
+    if fault:
+        raise SolverFailed(f"{method}: returned {fault}")
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = nearest_rotation(R), t
     return T
 
 
-def stand_board(T_base_gripper: Floats, T_camera_board: Floats, X: Floats, mount: Mount) -> Floats:
-    """Where each view puts the board on its stand, (n, 4, 4); all the same if all were right."""
-    return invert_transform(carrier_stand(T_base_gripper, mount)) @ X @ T_camera_board
-
+# --- an experiment ---
 
 WORKPLACE = np.array([0.3, 0.0, 0.3])  # m, where the gripper is on average
 SHIFT_M = 0.1  # and how far from there it goes along each axis
-BOARD_M = 0.3  # from the camera
-FEWEST_POSES = 3
+BOARD_AWAY_M = 0.3  # from the camera
 
 
 @dataclass(frozen=True)
@@ -263,70 +258,54 @@ def error_study(
     ranges_deg: Sequence[float] = (10.0, 20.0, 30.0, 40.0),
     axes: Sequence[int] = (2, 3),
     *,
-    rotation_deg: float = 0.1,
-    position_mm: float = 0.5,
     trials: int = 200,
-    seed: int = 0,
-    pairs: Pairs = "all",
+    pairs: Literal["all", "consecutive"] = "all",
 ) -> tuple[StudyPoint, ...]:
-    """Errors of the closed form, eye-in-hand, for each number of poses, range and axes.
+    """Errors of the closed form, eye-in-hand, for each number of poses, range (deg) and axes.
 
-    Every arm pose and every board pose is off by normal noise of rotation_deg about and
-    position_mm along each axis. pairs: "consecutive" builds A and B from each pose and the next,
-    as many scripts do; "all" takes every pair, which costs nothing and is a fifth better.
-    Raises ValueError for fewer than three poses and anything that is not positive.
+    Every arm pose and every board pose is off by normal noise of 0.1 deg about and 0.5 mm along
+    each axis. trials: sessions behind each median, the same ones in every call. pairs:
+    "consecutive" builds A and B from each pose and the next, as many scripts do; "all" takes every
+    pair, which costs nothing and is a fifth better. Raises ValueError for fewer than three poses
+    and anything that is not positive.
+
+    >>> few, many = error_study((6, 30), (40.0,), (3,), trials=20)
+    >>> many.translation_mm < few.translation_mm
+    True
     """
-    if min(poses) < FEWEST_POSES:
-        raise ValueError(f"poses: got {min(poses)}, want at least {FEWEST_POSES}")
-    if not set(axes) <= {2, 3}:
-        raise ValueError(f"axes: got {tuple(axes)}, want 2 or 3")
-    if pairs not in ("all", "consecutive"):
-        raise ValueError(f"pairs: got {pairs!r}, want 'all' or 'consecutive'")
-    if trials < 1 or min(ranges_deg) <= 0:
-        raise ValueError("trials, ranges_deg: want positive numbers")
-    noise = np.repeat([math.radians(rotation_deg), 1e-3 * position_mm], 3)
+    whole("poses", min(poses), least=FEWEST_POSES)
+    want(set(axes) <= {2, 3}, "axes", tuple(axes), "2 or 3")
+    choice("pairs", pairs, ("all", "consecutive"))
+    whole("trials", trials)
+    positive("ranges_deg", min(ranges_deg))
     points = []
-    for n in poses:
-        for about in axes:
-            for range_deg in ranges_deg:
-                rng = np.random.default_rng([seed, n, about])
-                turn, shift = np.median(_errors(rng, trials, n, range_deg, about, noise, pairs), 1)
-                points.append(
-                    StudyPoint(n, range_deg, about, math.degrees(turn), 1e3 * float(shift))
-                )
+    for n, about, range_deg in product(poses, axes, ranges_deg):
+        i, j = np.triu_indices(n, 1) if pairs == "all" else (np.arange(n - 1), np.arange(1, n))
+        rng = np.random.default_rng([0, n, about])
+        off = _errors(*_rigs(rng, trials, n, range_deg, about), rng, i, j)
+        turn, shift = np.median(np.linalg.norm(off.reshape(-1, 2, 3), axis=2), axis=0)
+        points.append(StudyPoint(n, range_deg, about, math.degrees(turn), 1e3 * float(shift)))
     return tuple(points)
 
 
 def _errors(
-    rng: np.random.Generator,
-    trials: int,
-    n: int,
-    range_deg: float,
-    axes: int,
-    noise: Floats,
-    pairs: Pairs,
-) -> tuple[Floats, Floats]:
-    """Lengths of the errors of X in sessions of n poses: rad and m, (trials,) each."""
-    T, X, Y = _rigs(rng, trials, n, range_deg, axes)
+    T: Floats, X: Floats, Y: Floats, rng: np.random.Generator, i: Integers, j: Integers
+) -> Floats:
+    """Twists (trials, 6) from the true X to the one found from noisy poses, pairs i and j."""
     seen = invert_transform(X)[:, None] @ invert_transform(T) @ Y[:, None]
-    seen, T = (turned(poses, noise * rng.normal(size=(trials, n, 6))) for poses in (seen, T))
+    seen, T = (turned(poses, SCATTER * rng.normal(size=(*T.shape[:2], 6))) for poses in (seen, T))
     M = invert_transform(T)
-    i, j = np.triu_indices(n, 1) if pairs == "all" else (np.arange(n - 1), np.arange(1, n))
     A, B = M[:, j] @ invert_transform(M[:, i]), seen[:, j] @ invert_transform(seen[:, i])
-    found = np.empty((trials, 4, 4))
-    found[:] = np.eye(4)
+    found = np.tile(np.eye(4), (len(T), 1, 1))
     found[:, :3, :3] = rotation_by_axes(A, B)
     found[:, :3, 3] = translation_half(A, B, found[:, :3, :3])
-    off = pose_difference(X, found)
-    return np.linalg.norm(off[:, :3], axis=1), np.linalg.norm(off[:, 3:], axis=1)
+    return pose_difference(X, found)
 
 
 def _rigs(
     rng: np.random.Generator, trials: int, n: int, range_deg: float, axes: int
 ) -> tuple[Floats, Floats, Floats]:
     """T_base_gripper (trials, n, 4, 4), and X and Y (trials, 4, 4) of as many eye-in-hand rigs."""
-    from scipy.spatial.transform import Rotation
-
     turns = math.radians(range_deg) * rng.uniform(-1.0, 1.0, (trials * n, 3))
     turns[:, axes:] = 0.0
     T = np.tile(np.eye(4), (trials, n, 1, 1))
@@ -335,5 +314,5 @@ def _rigs(
     X, Y = np.tile(np.eye(4), (2, trials, 1, 1))
     X[:, :3, :3] = Y[:, :3, :3] = Rotation.random(trials, rng=rng).as_matrix()
     X[:, :3, 3] = SHIFT_M * rng.uniform(-1.0, 1.0, (trials, 3))
-    Y[:, :3, 3] = WORKPLACE + BOARD_M * X[:, :3, 2]
+    Y[:, :3, 3] = WORKPLACE + BOARD_AWAY_M * X[:, :3, 2]
     return T, X, Y

@@ -19,14 +19,14 @@ from coursekit.causes import Accepted, CauseSearch, DiagnosisTexts
 from coursekit.checks import want
 from coursekit.hand_eye import causes, misread
 from coursekit.hand_eye.causes import Arms, MendedPairs
-from coursekit.hand_eye.closed_form import FEWEST
+from coursekit.hand_eye.closed_form import FEWEST_POSES
 from coursekit.hand_eye.pairs import Fit, PosePairs
 from coursekit.hand_eye.poses import camera_board, mean_pose
 from coursekit.hand_eye.session import HandEyeSession
 from coursekit.words import Finding, Findings
 
-FARTHEST_M = 10.0  # that an arm reaches or a board is seen at; more is in millimetres
-NEAREST_M = 2e-3  # nor do either stay within 2 mm: metres had been divided by 1,000
+_FARTHEST_M = 10.0  # that an arm reaches or a board is seen at; more is in millimetres
+_NEAREST_M = 2e-3  # nor do either stay within 2 mm: metres had been divided by 1,000
 # The typical (rms) turn about each principal axis. A wrist that turns +-30 deg makes 15 to 20.
 STILL_DEG, SMALL_DEG, SINGLE_DEG = 0.5, 6.0, 4.0
 AS_COMPUTED_M = 1e-3  # a pose is that of the joint angles given with it, within rounding
@@ -34,7 +34,7 @@ BELONGS_M = 1e-2  # joint angles that are off by more tell nothing of the arm's 
 POOR_RAD, POOR_M = np.radians(2.0), 0.02  # residuals that no working arm has
 HOPELESS_RAD = np.radians(10.0)  # beyond any slip, delay or wrong zero
 VIDEO_STEP_M, VIDEO_STEP_RAD = 0.1, np.radians(20.0)  # at most, for velocities from positions
-TEXTS = DiagnosisTexts.of("hand_eye")
+_TEXTS = DiagnosisTexts.of("hand_eye")
 
 
 def diagnose(
@@ -51,7 +51,7 @@ def diagnose(
     >>> diagnose(HandEyeSession("eye_in_hand", still, still)).names
     ('millimetres', 'pure_translation')
     """
-    want(len(session) >= FEWEST, "session", len(session), f"at least {FEWEST} pairs")
+    want(len(session) >= FEWEST_POSES, "session", len(session), f"at least {FEWEST_POSES} pairs")
     case = _Case(session, arm or widowx(), errors, PosePairs.of(session), session.q)
     case.units()
     case.joints_in_degrees()
@@ -80,12 +80,12 @@ class _Case:
 
     def add(self, key: str, **figures: Any) -> None:
         """A finding."""
-        self.found.append(TEXTS.finding(key, **figures))
+        self.found.append(_TEXTS.finding(key, **figures))
 
     def findings(self, *unseen: str) -> Findings:
         """What was found, with what could not be tested."""
-        reasons = [TEXTS.not_tested[key].format(pairs=causes.FEWEST_PAIRS) for key in unseen]
-        return Findings(self.found, TEXTS.looked_for, reasons)
+        reasons = [_TEXTS.not_tested[key].format(pairs=causes.FEWEST_PAIRS) for key in unseen]
+        return Findings(self.found, _TEXTS.looked_for, reasons)
 
     # --- units ---
 
@@ -97,10 +97,10 @@ class _Case:
             ("camera", "the board is seen", self.pairs.T_camera_board),
         ):
             far = float(np.median(np.linalg.norm(T[:, :3, 3], axis=1)))
-            if NEAREST_M <= far <= FARTHEST_M:
+            if _NEAREST_M <= far <= _FARTHEST_M:
                 continue
             scaled = self.pairs.arm_scaled if side == "arm" else self.pairs.scaled
-            self.pairs = scaled(1e-3 if far > FARTHEST_M else 1e3)
+            self.pairs = scaled(1e-3 if far > _FARTHEST_M else 1e3)
             sides.append(f"the {side}'s")
             evidence.append(f"typically {what} {far:.4g} m away")
         if sides:
@@ -233,7 +233,7 @@ class _Case:
         if q is not None and self._off_joints(pairs.T_base_gripper, q[pairs.row]) > BELONGS_M:
             q = None
         velocity = self._velocity(q)
-        search = causes.search(self.pairs, Arms(self.arm, self.errors, q, velocity))
+        search = causes.search_pairs(self.pairs, Arms(self.arm, self.errors, q, velocity))
         self.found += _from_residuals(search, self.session)
         return self.findings(*["motion"] * (velocity is None), *["joints"] * (q is None))
 
@@ -309,7 +309,7 @@ def _from_residuals(search: CauseSearch[MendedPairs], session: HandEyeSession) -
         figures = _figures(step, search.model, session) | _change(step.before.fit, step.after.fit)
         if odd:
             figures |= {"names": ", ".join(names), "left": odd[-1].after.fit.says()}
-        found.append(TEXTS.finding(step.test.cause, step.test.p_value, **figures))
+        found.append(_TEXTS.finding(step.test.cause, step.test.p_value, **figures))
     return found
 
 

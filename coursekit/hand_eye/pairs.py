@@ -13,10 +13,9 @@ import numpy as np
 
 from coursekit.arm import pose_difference
 from coursekit.arrays import Floats, NDArray
-from coursekit.geometry import invert_transform
+from coursekit.geometry import invert_transform, turned
 from coursekit.hand_eye.closed_form import motions, rotation_by_axes
-from coursekit.hand_eye.poses import Mount, camera_board, carrier_stand, mean_pose, turned
-from coursekit.hand_eye.refinement import by_X_and_Y
+from coursekit.hand_eye.poses import Mount, by_X_and_Y, camera_board, carrier_stand, mean_pose
 from coursekit.hand_eye.session import HandEyeSession
 
 ROBUST_STEPS, SMALLEST_STEP = 15, 1e-7  # m and rad

@@ -1,26 +1,111 @@
-"""Which arm pose to take next: the one that shrinks the worst direction of X most."""
+"""Poses beyond those of a fit: how far it is off there, and which of them to take next.
+
+`held_out` compares what a result predicts with what is seen at poses that it was not fitted to.
+`next_pose` looks for the arm pose that shrinks the worst direction of X most.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from coursekit.arm import Arm
-from coursekit.arrays import ArrayLike, Floats, NDArray
-from coursekit.boards import Board
+from coursekit.arm import FkErrors
+from coursekit.arrays import ArrayLike, Floats, Mask
+from coursekit.boards import Board, Detection
 from coursekit.boards.view import seen
+from coursekit.checks import want
 from coursekit.geometry import Intrinsics
-from coursekit.hand_eye.poses import camera_board, check_poses
-from coursekit.hand_eye.refinement import PixelViews, by_X_and_Y
-from coursekit.hand_eye.result import POSITION_M, ROTATION_RAD, HandEyeResult, units
+from coursekit.hand_eye.poses import IN_METRES, SCATTER, by_X_and_Y, camera_board, check_poses
+from coursekit.hand_eye.refinement import arm_poses_with
+from coursekit.hand_eye.session import HandEyeResult, HandEyeSession
+from coursekit.hand_eye.views import PixelViews, board_gap, rms_length, view_residuals
 
 CORNER_PX = 0.1  # corner noise where no images have told
-ROOM_PX = 10.0
+VIEW_ROOM_PX = 10.0  # that a proposed view leaves between the board and the image's border
 LEAST_FACING = 0.5  # cosine between the board's normal and the line of sight: 60 deg
-NEARER, FARTHER = 0.6, 1.5  # times the nearest and farthest view so far
-STEP_RAD, DRAWN, MOST = 0.35, 4000, 400  # of the candidates
-NOTHING = np.repeat([10.0, 10.0], 3)  # prior std, rad and m: keeps what is unknown finite
+NEARER_THAN_EVER, FARTHER_THAN_EVER = 0.6, 1.5  # times the nearest and farthest view so far
+DRAW_RAD, DRAWN, PROPOSALS = 0.35, 4000, 400  # std about known joints; how many, how many stay
+UNKNOWN_POSE = np.repeat([10.0, 10.0], 3)  # prior std, rad and m: keeps what is unknown finite
+
+
+# --- poses that were held out ---
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class HeldOut:
+    """What a result predicts of m poses that it has not seen.
+
+    residuals: observed - predicted of each view, (N_i, 2) px, None without detections. gap_m (m,):
+    between the board as the image alone places it and as predicted, root mean square over the
+    corners. along_m, across_m (m,): the same along the line of sight, where an image knows least,
+    and across it.
+    """
+
+    residuals: tuple[Floats, ...] | None
+    gap_m: Floats
+    along_m: Floats
+
+    @property
+    def across_m(self) -> Floats:
+        """The part (m,) of `gap_m` across the line of sight."""
+        return np.sqrt(np.maximum(self.gap_m**2 - self.along_m**2, 0.0))
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square length of the residual vectors, px; ValueError without detections."""
+        if self.residuals is None:
+            raise ValueError("seen: poses have no residuals in px; give detections")
+        return rms_length(np.concatenate(self.residuals))
+
+    @property
+    def rms_mm(self) -> float:
+        """Root mean square of `gap_m`, mm."""
+        return 1e3 * rms_length(self.gap_m[:, None])
+
+    def __repr__(self) -> str:
+        pixels = "" if self.residuals is None else f"{self.rms_px:.2f} px, "
+        across, along = (1e3 * rms_length(part[:, None]) for part in (self.across_m, self.along_m))
+        return (
+            f"{len(self.gap_m)} poses held out: {pixels}{self.rms_mm:.2f} mm at the board "
+            f"({across:.2f} across the line of sight, {along:.2f} along it), "
+            f"worst {1e3 * self.gap_m.max():.2f} mm"
+        )
+
+
+def held_out(
+    result: HandEyeResult,
+    T_base_gripper: ArrayLike,
+    seen: Sequence[Detection] | ArrayLike,
+    *,
+    board: Board | None = None,
+    intrinsics: Intrinsics | None = None,
+    q: ArrayLike | None = None,
+    fk: FkErrors | None = None,
+) -> HeldOut:
+    """The gap between prediction and sight at poses that were not used for the fit.
+
+    T_base_gripper (m, 4, 4), m, and seen as in a session; board and intrinsics are the result's
+    unless given. q (m, 6), rad, or fk for these poses apply what the fit has learnt of the arm's
+    own errors; without them the arm is taken at its word. Compare its rms_px with the result's own:
+    where it is much larger, X fits the noise of its poses. Raises ValueError as a session does.
+    """
+    given, fit = result.session, result.refined
+    board, intrinsics = board or given.board, intrinsics or given.intrinsics
+    other = HandEyeSession(result.mount, T_base_gripper, seen, board, intrinsics, q)  # type: ignore[arg-type]
+    poses = other.T_base_gripper
+    offsets = fit is not None and fit.problem.arm is not None and other.q is not None
+    if fit is not None and (fk is not None or offsets):
+        poses = arm_poses_with(fit, replace(fit.problem, T_base_gripper=poses, q=other.q, fk=fk))
+    expected = camera_board(poses, result.X, result.Y, result.mount)
+    residuals = None
+    if other.detections is not None:
+        residuals = view_residuals(other.corners(), expected, result.scale)
+    return HeldOut(residuals, *board_gap(other.T_camera_board, expected, other.board, result.scale))
+
+
+# --- the next pose ---
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -28,9 +113,9 @@ class NextPose:
     """The pose to take next.
 
     index: among the candidates. T_base_gripper (4, 4), and q (6,) in rad where joints are known.
-    now_mm: standard deviation of X in its worst direction (rotations by what they do
-    `observability.LEVER_M` in front of the camera). then_mm (m,): the same with each candidate
-    added, NaN where the board would not be seen or the joints cannot go.
+    now_mm: standard deviation of X in its worst direction (rotations by what they do 0.3 m in front
+    of the camera). then_mm (m,): the same with each candidate added, NaN where the board would not
+    be seen or the joints cannot go.
     """
 
     index: int
@@ -39,100 +124,85 @@ class NextPose:
     now_mm: float
     then_mm: Floats
 
-    @property
-    def usable(self) -> NDArray[np.bool_]:
-        """Which candidates are within the limits and see the board, (m,)."""
-        return np.isfinite(self.then_mm)
-
     def __repr__(self) -> str:
         place = "({:.0f}, {:.0f}, {:.0f}) mm".format(*(1e3 * self.T_base_gripper[:3, 3] + 0.0))
-        joints = ""
+        usable, joints = np.isfinite(self.then_mm).sum(), ""
         if self.q is not None:
             angles = ", ".join(f"{angle:.1f}" for angle in np.degrees(self.q) + 0.0)
             joints = f",\n  joints ({angles}) deg"
         return (
             f"next: gripper at {place}{joints}\n"
             f"X in its worst direction: {self.now_mm:.2f} mm now, "
-            f"{self.then_mm[self.index]:.2f} mm with it ({int(self.usable.sum())} candidates)"
+            f"{self.then_mm[self.index]:.2f} mm with it ({usable} candidates)"
         )
 
 
 def next_pose(
-    result: HandEyeResult,
-    candidates: ArrayLike | None = None,
-    *,
-    arm: Arm | None = None,
-    board: Board | None = None,
-    intrinsics: Intrinsics | None = None,
-    rotation_rad: float = ROTATION_RAD,
-    position_m: float = POSITION_M,
-    seed: int = 0,
+    result: HandEyeResult, candidates: ArrayLike | None = None, seed: int = 0
 ) -> NextPose:
     """The arm pose that shrinks the worst direction of X most, from the result so far.
 
-    candidates: arm poses (m, 4, 4), or joint angles (m, 6) in rad with the arm; None draws joint
-    angles within the arm's limits, by `seed`. A candidate counts only if the arm may go there and
-    the whole board would be in view, its face towards the camera and about as far away as so far.
-    board, intrinsics: the result's unless given. rotation_rad, position_m: by how much the arm
-    itself scatters; corners alone would make every pose look perfect. Where the poses do not
+    candidates: arm poses (m, 4, 4), m, or joint angles (m, 6), rad, of the session's arm; None
+    draws joint angles within the arm's limits, by `seed`. A candidate counts only if the arm may go
+    there and the whole board would be in view, its face towards the camera and about as far away as
+    so far; so the session needs the board and the intrinsics. The arm itself is taken to scatter by
+    0.1 deg and 0.5 mm; corners alone would make every pose look perfect. Where the poses do not
     determine X, solve with a `guess` first: the proposal then turns about the missing axis.
     Raises ValueError where no candidate is usable.
     """
-    board, intrinsics = board or result.data.board, intrinsics or result.data.intrinsics
-    if board is None or intrinsics is None:
-        raise ValueError("board, intrinsics: want both, to know what is in view")
-    if candidates is None:
-        if arm is None:
-            raise ValueError("candidates: got None; give poses, or the arm to draw them")
-        candidates = candidate_joints(result, arm, board, intrinsics, seed)
-    q, poses = _poses_of(candidates, arm)
-    allowed = np.ones(len(poses), bool) if q is None or arm is None else _may_go(arm, q)
-    allowed &= in_view(result, poses, board, intrinsics)
-    if not allowed.any():
-        raise ValueError(f"candidates: in none of {len(poses)} is the arm free and the board seen")
-    scatter = np.repeat([rotation_rad, position_m], 3)
-    known = _information(result, result.data.T_base_gripper, board, intrinsics, scatter)
-    total = known.sum(axis=0) + np.diag(np.tile(NOTHING, 2) ** -2)
+    arm = result.session.arm
+    given = _drawn(result, seed) if candidates is None else np.asarray(candidates, float)
+    q = given if given.ndim == 2 and given.shape[1] == 6 else None
+    poses = check_poses("candidates", given if q is None else arm.forward(q))
+    usable = _in_view(result, poses)
+    if q is not None:
+        usable &= arm.within_limits(q) & arm.is_free(q)
+    want(usable.any(), "candidates", len(poses), "one where the arm is free and the board seen")
+    known = _information(result, result.session.T_base_gripper)
+    total = known.sum(axis=0) + np.diag(np.tile(UNKNOWN_POSE, 2) ** -2)
     then = np.full(len(poses), np.nan)
-    added = _information(result, poses[allowed], board, intrinsics, scatter)
-    then[allowed] = _worst_mm(total + added)
+    then[usable] = _worst_mm(total + _information(result, poses[usable]))
     best = int(np.nanargmin(then))
     now = float(_worst_mm(total[None])[0])
     return NextPose(best, poses[best], None if q is None else q[best], now, then)
 
 
-def candidate_joints(
-    result: HandEyeResult, arm: Arm, board: Board, intrinsics: Intrinsics, seed: int = 0
-) -> Floats:
+def _drawn(result: HandEyeResult, seed: int) -> Floats:
     """Joint angles (m, 6), rad, near the poses so far and elsewhere, at which the board is seen."""
     rng = np.random.default_rng([seed, 17])
-    known = result.data.q
+    arm, known = result.session.arm, result.session.q
     if known is None:
-        known, reached = arm.inverse(result.data.T_base_gripper)
+        known, reached = arm.inverse(result.session.T_base_gripper)
         known = known[reached]
     if not len(known):
         raise ValueError("arm: reaches none of the poses in the result; is it this arm?")
-    near = known[rng.integers(len(known), size=DRAWN)] + STEP_RAD * rng.normal(size=(DRAWN, 6))
+    near = known[rng.integers(len(known), size=DRAWN)] + DRAW_RAD * rng.normal(size=(DRAWN, 6))
     drawn = np.concatenate([near, arm.random(rng, DRAWN)])
-    low, high = arm.limits.T
-    drawn = drawn[((drawn > low) & (drawn < high)).all(axis=1)]
-    drawn = drawn[in_view(result, arm.forward(drawn), board, intrinsics)]
-    return rng.permutation(drawn[arm.is_free(drawn)])[:MOST]
+    drawn = drawn[arm.within_limits(drawn)]
+    drawn = drawn[_in_view(result, arm.forward(drawn))]
+    return rng.permutation(drawn[arm.is_free(drawn)])[:PROPOSALS]
 
 
-def in_view(
-    result: HandEyeResult, T_base_gripper: Floats, board: Board, intrinsics: Intrinsics
-) -> NDArray[np.bool_]:
+def _seen_with(result: HandEyeResult) -> tuple[Board, Intrinsics]:
+    """The session's board and intrinsics, or a ValueError."""
+    board, intrinsics = result.session.board, result.session.intrinsics
+    if board is None or intrinsics is None:
+        raise ValueError("board, intrinsics: want both in the session, to know what is in view")
+    return board, intrinsics
+
+
+def _in_view(result: HandEyeResult, T_base_gripper: Floats) -> Mask:
     """(m,): whether the camera would see the whole board well from arm poses (m, 4, 4)."""
+    board, intrinsics = _seen_with(result)
     C = camera_board(T_base_gripper, result.X, result.Y, result.mount)
     facing, away = _facing(C, board)
     facing_so_far, away_so_far = _facing(result.T_camera_board, board)
     side = np.sign(np.median(facing_so_far))  # z may point into the board or out of it
     return (
-        seen(board.points, C, intrinsics, ROOM_PX).all(axis=1)
+        seen(board.points, C, intrinsics, VIEW_ROOM_PX).all(axis=1)
         & (side * facing > LEAST_FACING)
-        & (away > NEARER * away_so_far.min())
-        & (away < FARTHER * away_so_far.max())
+        & (away > NEARER_THAN_EVER * away_so_far.min())
+        & (away < FARTHER_THAN_EVER * away_so_far.max())
     )
 
 
@@ -143,33 +213,18 @@ def _facing(C: Floats, board: Board) -> tuple[Floats, Floats]:
     return np.einsum("ni,ni->n", C[:, :3, 2], centre) / away, away
 
 
-def _poses_of(candidates: ArrayLike, arm: Arm | None) -> tuple[Floats | None, Floats]:
-    given = np.asarray(candidates, float)
-    if given.ndim == 2 and given.shape[1] == 6:
-        if arm is None:
-            raise ValueError("arm: got None; joint angles need the arm")
-        return given, arm.forward(given)
-    return None, check_poses("candidates", given)
-
-
-def _may_go(arm: Arm, q: Floats) -> NDArray[np.bool_]:
-    low, high = arm.limits.T
-    return ((q >= low) & (q <= high)).all(axis=1) & arm.is_free(q)
-
-
-def _information(
-    result: HandEyeResult, poses: Floats, board: Board, intrinsics: Intrinsics, scatter: Floats
-) -> Floats:
+def _information(result: HandEyeResult, poses: Floats) -> Floats:
     """What a pair of pose and image at each of (m, 4, 4) says about X and Y, (m, 12, 12)."""
+    board, intrinsics = _seen_with(result)
     C = camera_board(poses, result.X, result.Y, result.mount)
-    noise_px = result.data.corner_sigma_px if result.data.detections is not None else CORNER_PX
-    count = len(board.points)
-    views = PixelViews(
-        np.tile(board.points, (len(C), 1)), np.zeros((len(C) * count, 2)),
-        np.arange(len(C)) * count, intrinsics, noise_px,
-    )  # fmt: skip
+    noise_px = CORNER_PX
+    if result.session.detections is not None:
+        noise_px = result.session.corner_sigma_px
+    count, starts = len(board.points), len(board.points) * np.arange(len(C))
+    points, pixels = np.tile(board.points, (len(C), 1)), np.zeros((len(C) * count, 2))
+    views = PixelViews(points, pixels, starts, intrinsics, noise_px)
     of_image = np.linalg.inv(views.linear(C, 1.0)[2][:, :6, :6])
-    weight = np.linalg.inv(of_image + np.diag(scatter**2))
+    weight = np.linalg.inv(of_image + np.diag(SCATTER**2))
     columns = by_X_and_Y(poses, result.X, result.Y, result.mount)
     return np.swapaxes(columns, 1, 2) @ weight @ columns
 
@@ -179,5 +234,5 @@ def _worst_mm(information: Floats) -> Floats:
     scale = np.sqrt(np.einsum("mii->mi", information))
     covariance = np.linalg.inv(information / (scale[:, :, None] * scale[:, None, :]))
     covariance /= scale[:, :, None] * scale[:, None, :]
-    of_X = covariance[:, :6, :6] * units()[:, None] * units()
+    of_X = covariance[:, :6, :6] * IN_METRES[:, None] * IN_METRES
     return 1e3 * np.sqrt(np.linalg.eigvalsh(of_X)[:, -1])

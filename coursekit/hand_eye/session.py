@@ -1,7 +1,8 @@
-"""A hand-eye session: arm poses and what the camera saw at each, in memory and in a folder.
+"""A hand-eye session, and the camera that it gives: `HandEyeSession`, `solve`, `HandEyeResult`.
 
-A folder holds the images, `poses.csv` with one row for each, and `session.json` with the mount, the
-board and the intrinsics. The columns of poses.csv, in any order, others are ignored:
+A session is arm poses and what the camera saw at each, in memory or in a folder. A folder holds the
+images, `poses.csv` with one row for each, and `session.json` with the mount, the board and the
+intrinsics. The columns of poses.csv, in any order, others are ignored:
 
     file                        the image's name in the folder
     x, y, z                     T_base_gripper's translation, m           } these seven,
@@ -9,39 +10,56 @@ board and the intrinsics. The columns of poses.csv, in any order, others are ign
     q0 .. q5                    joint angles, rad                         } these six, or both
     dq0 .. dq5                  joint velocities at that moment, rad/s (optional)
     time                        of the image, s (optional)
+
+`solve` finds X and Y of `hand_eye.poses`: by a closed form, and from there, unless only that was
+asked for, by the joint refinement. The result says how well X is known and what is left over.
 """
 
 from __future__ import annotations
 
 import csv
 import json
+import math
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.stats import f as f_distribution
 
-from coursekit.arm import widowx
-from coursekit.arrays import ArrayLike, Floats, NDArray
-from coursekit.boards import Board, Detections, detect_all
+from coursekit.arm import Arm, FkErrors, widowx
+from coursekit.arrays import ArrayLike, Floats, Integers
+from coursekit.boards import Board, Detection, Detections, detect_all
 from coursekit.boards.board import Skipped
 from coursekit.boards.detector import SESSION
-from coursekit.geometry import Intrinsics, make_transform
-from coursekit.hand_eye.closed_form import FEWEST
-from coursekit.hand_eye.poses import Mount, check_mount, check_poses
-from coursekit.hand_eye.refinement import BoardPose, board_poses
-from coursekit.hand_eye.result import HandEyeResult
-from coursekit.hand_eye.solver import solve
+from coursekit.checks import array, choice, instance, transform, want
+from coursekit.geometry import Intrinsics, invert_transform, make_transform, pose_difference
+from coursekit.hand_eye import refinement, views
+from coursekit.hand_eye.closed_form import CLOSED_FORMS, FEWEST_POSES, closed_form
+from coursekit.hand_eye.poses import (
+    FRAMES,
+    LEVER_M,
+    MOUNTS,
+    Mount,
+    camera_board,
+    check_poses,
+    mean_pose,
+    observability,
+    stand_board,
+)
 from coursekit.results import write_bytes
+from coursekit.words import Estimate, wrapped
 
+METHODS = ("refine", *CLOSED_FORMS)
 POSES = "poses.csv"
 PLACE = ("x", "y", "z")
 TURN = ("qx", "qy", "qz", "qw")
 JOINTS = tuple(f"q{joint}" for joint in range(6))
-SPEEDS = tuple(f"d{name}" for name in JOINTS)
+OPTIONAL = {"times": ("time",), "q": JOINTS, "dq": tuple(f"d{name}" for name in JOINTS)}
 UNIT_TOLERANCE = 1e-3  # of a quaternion's length: four digits
 
 
@@ -53,6 +71,7 @@ class HandEyeSession:
     seen: detections, with board and intrinsics, or poses T_camera_board (n, 4, 4), m. q (n, 6): the
     joint angles, rad; dq (n, 6): their velocities when the image was taken, rad/s; times (n,): of
     the images, s; all three optional. names: of the views. skipped: what was not used, and why.
+    arm: whose joint angles q are, the WidowX unless given.
 
     Raises ValueError that names the argument, and the index, for what does not belong together.
     """
@@ -67,29 +86,34 @@ class HandEyeSession:
     times: Floats | None = None
     names: tuple[str, ...] = ()
     skipped: tuple[Skipped, ...] = ()
+    arm: Arm = field(default_factory=widowx)
 
     def __post_init__(self) -> None:
-        check_mount(self.mount)
-        poses = check_poses("T_base_gripper", self.T_base_gripper)
-        object.__setattr__(self, "T_base_gripper", poses)
+        choice("mount", self.mount, MOUNTS)
+        poses, seen = check_poses("T_base_gripper", self.T_base_gripper), self.seen
         n = len(poses)
-        if isinstance(self.seen, Detections):
+        if isinstance(seen, (list, tuple)) and any(isinstance(one, Detection) for one in seen):
+            seen = Detections(seen)
+        if isinstance(seen, Detections):
             for name in ("board", "intrinsics"):
-                if getattr(self, name) is None:
-                    raise ValueError(f"{name}: got None; detections need the board and intrinsics")
+                given = getattr(self, name)
+                want(given is not None, name, given, "it: detections need board and intrinsics")
         else:
-            object.__setattr__(self, "seen", check_poses("seen", self.seen))
-        if len(self.seen) != n:
-            raise ValueError(f"seen: got {len(self.seen)}, T_base_gripper has {n}: one for each")
-        for name, width in (("q", (6,)), ("dq", (6,)), ("times", ())):
+            seen = check_poses("seen", seen)
+        one_each = f"{n}, one for each arm pose (an image without a board takes its pose with it)"
+        want(len(seen) == n, "seen", len(seen), one_each)
+        checked: dict[str, Any] = {"T_base_gripper": poses, "seen": seen}
+        for name, columns in OPTIONAL.items():
             if getattr(self, name) is not None:
-                object.__setattr__(self, name, _rows(name, getattr(self, name), (n, *width)))
-        if self.dq is not None and self.q is None:
-            raise ValueError("dq: velocities need the joint angles q as well")
-        names = self.names or tuple(f"view {i:02d}" for i in range(n))
-        if len(names) != n:
-            raise ValueError(f"names: got {len(names)}, T_base_gripper has {n}")
-        object.__setattr__(self, "names", names)
+                shape = (n,) if name == "times" else (n, len(columns))
+                checked[name] = array(name, getattr(self, name), shape)
+                for i, row in enumerate(checked[name]):
+                    want(np.isfinite(row).all(), f"{name}[{i}]", row, "finite numbers")
+        want(self.dq is None or self.q is not None, "q", None, "the joint angles of these dq")
+        checked["names"] = self.names or tuple(f"view {i:02d}" for i in range(n))
+        want(len(checked["names"]) == n, "names", len(checked["names"]), f"{n}, one a view")
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
 
     @property
     def detections(self) -> Detections | None:
@@ -97,13 +121,11 @@ class HandEyeSession:
         return self.seen if isinstance(self.seen, Detections) else None
 
     @cached_property
-    def board_poses(self) -> tuple[BoardPose, ...]:
+    def board_poses(self) -> tuple[views.BoardPose, ...]:
         """What each image alone says of the board; () where only poses are known."""
-        if self.detections is None:
+        if self.detections is None or self.board is None or self.intrinsics is None:
             return ()
-        assert self.board is not None
-        assert self.intrinsics is not None
-        return tuple(board_poses(self.detections, self.board, self.intrinsics))
+        return tuple(views.board_poses(self.detections, self.board, self.intrinsics))
 
     @cached_property
     def T_camera_board(self) -> Floats:
@@ -112,16 +134,29 @@ class HandEyeSession:
             return np.stack([pose.T_camera_board for pose in self.board_poses])
         return self.seen
 
+    @property
+    def corner_sigma_px(self) -> float:
+        """Std of one corner coordinate, px, each image with a pose of its own: no arm is in it."""
+        counts = np.array([len(seen.ids) for seen in self.detections or ()])
+        squares = sum(c * p.rms_px**2 for c, p in zip(counts, self.board_poses, strict=True))
+        return max(math.sqrt(squares / max(1, 2 * counts.sum() - 6 * len(counts))), 1e-6)
+
+    def corners(self, sigma_px: float = 1.0) -> views.PixelViews:
+        """The corners as the refinement takes them; ValueError where only poses are known."""
+        if self.detections is None or self.board is None or self.intrinsics is None:
+            raise ValueError("seen: poses have no residuals in px; want detections")
+        return views.PixelViews.of(self.detections, self.board, self.intrinsics, sigma_px)
+
     def __len__(self) -> int:
         """How many pairs of arm pose and image."""
         return len(self.T_base_gripper)
 
-    def pick(self, which: Sequence[int] | NDArray[np.intp]) -> HandEyeSession:
+    def pick(self, which: Sequence[int] | Integers) -> HandEyeSession:
         """The pairs with these numbers, in this order."""
         which = np.asarray(which, int)
         rows: dict[str, Any] = {
             name: None if getattr(self, name) is None else getattr(self, name)[which]
-            for name in ("T_base_gripper", "q", "dq", "times")
+            for name in ("T_base_gripper", *OPTIONAL)
         }
         seen = self.seen.pick(which) if isinstance(self.seen, Detections) else self.seen[which]
         names = tuple(self.names[i] for i in which)
@@ -129,16 +164,13 @@ class HandEyeSession:
 
     def solve(self, method: str = "refine", **options: Any) -> HandEyeResult:
         """`hand_eye.solve` of this session; options as there."""
-        known = {"board": self.board, "intrinsics": self.intrinsics} | options
-        return solve(self.T_base_gripper, self.seen, self.mount, method, **known)
+        return solve(self, method, **options)
 
     def __repr__(self) -> str:
+        extras = {"joint angles": self.q, "joint velocities": self.dq, "times": self.times}
         what = "poses of the board" if self.detections is None else "images"
-        extras = [text for value, text in (
-            (self.q, "joint angles"), (self.dq, "joint velocities"), (self.times, "times"),
-        ) if value is not None]  # fmt: skip
-        lines = [f"{self.mount}: {len(self)} arm poses and {what}" + "".join(
-            f", {text}" for text in extras)]  # fmt: skip
+        known = [what, *(name for name, value in extras.items() if value is not None)]
+        lines = [f"{self.mount}: {len(self)} arm poses and {', '.join(known)}"]
         if self.board is not None:
             lines.append(f"  {self.board.text}, squares of {1e3 * self.board.square_m:g} mm")
         return "\n".join([*lines, *(f"  not used: {skip!r}" for skip in self.skipped)])
@@ -163,36 +195,27 @@ class HandEyeSession:
         fewer than three pairs are left.
         """
         place = Path(folder)
-        if not place.is_dir():
-            raise ValueError(f"folder: got {os.fspath(folder)!r}, want a folder that exists")
+        want(place.is_dir(), "folder", os.fspath(folder), "a folder that exists")
         card = _card(place)
-        mount = check_mount(mount or _from_card(card, "mount", place))
-        board = board or _board(_from_card(card, "board", place))
-        intrinsics = intrinsics or Intrinsics.from_dict(_from_card(card, "intrinsics", place))
+        mount = mount or _from_card(card, "mount")
+        board = board or _board(_from_card(card, "board"))
+        intrinsics = intrinsics or Intrinsics.from_dict(_from_card(card, "intrinsics"))
         rows, skipped = _table(place)
-        files = [place / row.file for row in rows]
+        files = [place / file for file in rows]
         seen = detect_all(files, board, progress) if files else Detections()
-        found = {view.name: view for view in seen}
-        used = [row for row in rows if row.file in found]
         skipped += seen.skipped
-        if len(used) < FEWEST:
+        found = {view.name: view for view in seen}
+        used = [file for file in rows if file in found]
+        if len(used) < FEWEST_POSES:
             raise ValueError(
                 f"folder: {len(used)} usable pairs of arm pose and image in "
-                f"{os.fspath(folder)!r}, want at least {FEWEST}"
+                f"{os.fspath(folder)!r}, want at least {FEWEST_POSES}"
                 + "".join(f"; {skip!r}" for skip in skipped[:3])
             )
-        return cls(
-            mount,
-            np.stack([row.T_base_gripper for row in used]),
-            Detections([found[row.file] for row in used]),
-            board,
-            intrinsics,
-            _all_or_none([row.q for row in used]),
-            _all_or_none([row.dq for row in used]),
-            _all_or_none([row.time for row in used]),
-            tuple(row.file for row in used),
-            tuple(skipped),
-        )
+        T, columns = _stacked(rows[file] for file in used)
+        seen = Detections(found[file] for file in used)
+        names, unused = tuple(used), tuple(skipped)
+        return cls(mount, T, seen, board, intrinsics, names=names, skipped=unused, **columns)
 
     def save(
         self,
@@ -206,9 +229,8 @@ class HandEyeSession:
         session.json should say, such as where the session comes from.
         Raises ValueError where an image is missing, or there is no board or intrinsics to write.
         """
-        missing = [name for name in self.names if name not in images]
-        if missing:
-            raise ValueError(f"images: no {missing[0]!r}; want one for each of {len(self)} views")
+        for name in self.names:
+            want(name in images, "images", sorted(images), f"one for each view, also {name!r}")
         if self.board is None or self.intrinsics is None:
             raise ValueError("board, intrinsics: a folder of images needs both")
         place = Path(folder)
@@ -225,61 +247,41 @@ class HandEyeSession:
         write_bytes(place / SESSION, (json.dumps(card, indent=1) + "\n").encode())
 
     def _csv(self) -> str:
-        from scipy.spatial.transform import Rotation
-
         turns = Rotation.from_matrix(self.T_base_gripper[:, :3, :3]).as_quat(canonical=True)
         columns = [*PLACE, *TURN]
         blocks = [self.T_base_gripper[:, :3, 3], turns]
-        for names, values in ((("time",), self.times), (JOINTS, self.q), (SPEEDS, self.dq)):
-            if values is not None:
+        for name, names in OPTIONAL.items():
+            if getattr(self, name) is not None:
                 columns += names
-                blocks.append(values.reshape(len(self), -1))
+                blocks.append(getattr(self, name).reshape(len(self), -1))
         lines = [",".join(["file", *columns])]
         for name, row in zip(self.names, np.hstack(blocks), strict=True):
             lines.append(",".join([name, *(f"{value + 0.0:.8g}" for value in row)]))
         return "\n".join(lines) + "\n"
 
 
-def _rows(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
-    rows = np.asarray(value, float)
-    if rows.shape != shape:
-        raise ValueError(f"{name}: got shape {rows.shape}, want {shape}")
-    bad = np.flatnonzero(~np.isfinite(rows.reshape(len(rows), -1)).all(axis=1))
-    if bad.size:
-        raise ValueError(f"{name}[{bad[0]}]: has NaN or infinite entries")
-    return rows
-
-
 # --- reading a folder ---
 
 
-@dataclass(frozen=True, eq=False)
-class _Row:
-    """One usable row of poses.csv."""
-
-    file: str
-    T_base_gripper: Floats
-    q: Floats | None
-    dq: Floats | None
-    time: float | None
+class _BadRow(Exception):
+    """A row cannot be used; the message says why."""
 
 
 def _card(folder: Path) -> dict[str, Any]:
+    """What session.json says, {} where there is none."""
     path = folder / SESSION
     if not path.exists():
         return {}
     try:
         card = json.loads(path.read_text("utf-8"))
     except ValueError as error:
-        raise ValueError(f"folder: {path.name} is no JSON ({error})") from error
-    if not isinstance(card, dict):
-        raise ValueError(f"folder: {path.name} holds a {type(card).__name__}, want an object")
-    return card
+        raise ValueError(f"folder: {SESSION} is no JSON ({error})") from error
+    return instance(SESSION, card, dict)
 
 
-def _from_card(card: dict[str, Any], key: str, folder: Path) -> Any:
+def _from_card(card: dict[str, Any], key: str) -> Any:
     if key not in card:
-        raise ValueError(f"{key}: neither given nor in {folder.name}/{SESSION}")
+        raise ValueError(f"{key}: neither given nor in {SESSION}")
     return card[key]
 
 
@@ -290,33 +292,28 @@ def _board(card: dict[str, Any]) -> Board:
         raise ValueError(f"board: {SESSION} does not describe one ({error})") from error
 
 
-def _table(folder: Path) -> tuple[list[_Row], list[Skipped]]:
-    """The usable rows of poses.csv, and what is wrong with the others."""
+def _table(folder: Path) -> tuple[dict[str, dict[str, Any]], list[Skipped]]:
+    """The usable rows of poses.csv by their file, and what is wrong with the others."""
     path = folder / POSES
     if not path.exists():
         raise ValueError(f"folder: has no {POSES}, the table of arm poses")
+    rows: dict[str, dict[str, Any]] = {}
+    skipped = []
     with path.open(newline="", encoding="utf-8-sig") as lines:
         table = csv.DictReader(lines, skipinitialspace=True)
         columns = {name.strip() for name in table.fieldnames or ()}
         _check_columns(columns)
-        rows, skipped = [], []
-        taken: set[str] = set()
         for values in table:
-            cells = {key.strip(): value for key, value in values.items() if key is not None}
-            file = (cells.get("file") or "").strip()
-            where = f"{POSES}, line {table.line_num}" + (f" ({file})" if file else "")
+            cells = {key.strip(): (value or "").strip() for key, value in values.items() if key}
+            file = cells.get("file", "")
             try:
-                row = _read_row(file, cells, columns, folder, taken)
+                if file in rows:
+                    raise _BadRow("the file has a row already; which of the two is right?")
+                rows[file] = _read_row(file, cells, columns, folder)
             except _BadRow as reason:
+                where = f"{POSES}, line {table.line_num}" + (f" ({file})" if file else "")
                 skipped.append(Skipped(where, str(reason)))
-            else:
-                taken.add(file)
-                rows.append(row)
     return rows, skipped
-
-
-class _BadRow(Exception):
-    """A row cannot be used; the message says why."""
 
 
 def _check_columns(columns: set[str]) -> None:
@@ -331,29 +328,32 @@ def _check_columns(columns: set[str]) -> None:
 
 
 def _read_row(
-    file: str, cells: Mapping[str, str | None], columns: set[str], folder: Path, taken: set[str]
-) -> _Row:
+    file: str, cells: Mapping[str, str], columns: set[str], folder: Path
+) -> dict[str, Any]:
+    """T (4, 4), and of `OPTIONAL` what the table has, None for the rest."""
     if not file:
         raise _BadRow("no file is named")
-    if file in taken:
-        raise _BadRow("the file has a row already; which of the two is right?")
     if not (folder / file).is_file():
         raise _BadRow("there is no such file in the folder")
-    q = _numbers(cells, JOINTS) if columns.issuperset(JOINTS) else None
-    dq = _numbers(cells, SPEEDS) if columns.issuperset(SPEEDS) else None
-    time = float(_numbers(cells, ("time",))[0]) if "time" in columns else None
-    if columns.issuperset((*PLACE, *TURN)):
-        T = _pose(_numbers(cells, PLACE), _numbers(cells, TURN))
-    else:
-        assert q is not None
-        T = widowx().forward(q)
-    return _Row(file, T, q, dq, time)
+    row: dict[str, Any] = {
+        name: _numbers(cells, names) if columns.issuperset(names) else None
+        for name, names in OPTIONAL.items()
+    }
+    if row["times"] is not None:
+        row["times"] = row["times"][0]
+    if not columns.issuperset((*PLACE, *TURN)):
+        return row | {"T": widowx().forward(row["q"])}
+    place, turn = _numbers(cells, PLACE), _numbers(cells, TURN)
+    length = float(np.linalg.norm(turn))
+    if abs(length - 1) > UNIT_TOLERANCE:
+        raise _BadRow(f"the quaternion has length {length:.4g}, want 1")
+    return row | {"T": make_transform(Rotation.from_quat(turn), place)}
 
 
-def _numbers(cells: Mapping[str, str | None], names: Sequence[str]) -> Floats:
+def _numbers(cells: Mapping[str, str], names: Sequence[str]) -> Floats:
     values = []
     for name in names:
-        text = (cells.get(name) or "").strip()
+        text = cells.get(name, "")
         try:
             value = float(text)
         except ValueError:
@@ -364,14 +364,392 @@ def _numbers(cells: Mapping[str, str | None], names: Sequence[str]) -> Floats:
     return np.array(values)
 
 
-def _pose(place: Floats, turn: Floats) -> Floats:
-    from scipy.spatial.transform import Rotation
-
-    length = float(np.linalg.norm(turn))
-    if abs(length - 1) > UNIT_TOLERANCE:
-        raise _BadRow(f"the quaternion has length {length:.4g}, want 1")
-    return make_transform(Rotation.from_quat(turn).as_matrix(), place)
+def _stacked(rows: Iterable[dict[str, Any]]) -> tuple[Floats, dict[str, Any]]:
+    """T_base_gripper (n, 4, 4), and of `OPTIONAL` what all rows have, None for the rest."""
+    T, *others = zip(*([row[name] for name in ("T", *OPTIONAL)] for row in rows), strict=True)
+    known = (None if any(row is None for row in rows) else np.array(rows) for rows in others)
+    return np.stack(T), dict(zip(OPTIONAL, known, strict=True))
 
 
-def _all_or_none(values: Sequence[Any]) -> Floats | None:
-    return None if any(value is None for value in values) else np.array(values)
+# --- where the camera is ---
+
+
+def solve(
+    session: HandEyeSession,
+    method: str = "refine",
+    *,
+    free_scale: bool = False,
+    free_offsets: bool = False,
+    fk: FkErrors | None = None,
+    guess: ArrayLike | None = None,
+) -> HandEyeResult:
+    """Where the camera is, from arm poses and what the camera saw at each.
+
+    A session "eye_in_hand" (camera in the gripper, board on the table) gives X = T_gripper_camera
+    and Y = T_base_board; "eye_to_hand" (camera on the table, board in the gripper) gives
+    X = T_base_camera and Y = T_gripper_board. For eye-to-hand every solver of A X = X B works on
+    the inverted arm poses: T_base_gripper T_gripper_board = T_base_camera T_camera_board has the
+    form of eye-in-hand with base and gripper exchanged.
+
+    method: "refine" (the best: X and Y together by least squares on the pixels, or on the poses
+    where no detections are given), "closed_form" (rotation first, then translation), OpenCV's
+    "tsai", "park", "horaud", "andreff", "daniilidis", and its robot-world "shah", "li".
+
+    With "refine" only: free_scale also estimates how much larger the board is than it says;
+    free_offsets also estimates the offsets of the session's joint angles; fk weighs the arm's
+    errors (`arm.fk_covariance` at the session's q). guess (4, 4): an X to start from, in place of
+    the closed form.
+
+    Raises ValueError that names the argument for fewer than three poses and for images without a
+    pose; NotDetermined where the arm did not turn about two axes; SolverFailed where a solver's
+    output is no rotation (OpenCV's Park can return a reflection, its Tsai the identity).
+
+    >>> arm = widowx().forward([[0, 1.2, 1.0, 0.2, a, b] for a, b in ((0, 0), (0.5, 0), (0, 0.5))])
+    >>> seen = camera_board(arm, np.eye(4), np.eye(4), "eye_to_hand")
+    >>> solve(HandEyeSession("eye_to_hand", arm, seen), "park").X.round(6)[:3, 3] + 0.0
+    array([0., 0., 0.])
+    """
+    choice("method", method, METHODS)
+    asked = {"free_scale": free_scale, "free_offsets": free_offsets, "fk": fk, "guess": guess}
+    for name, value in asked.items():
+        refined = value is None or value is False or method == "refine"
+        want(refined, "method", method, f"'refine' with {name}: a closed form has none")
+    n = len(session)
+    want(n >= FEWEST_POSES, "T_base_gripper", n, f"at least {FEWEST_POSES} poses")
+    want(not free_offsets or session.q is not None, "q", None, "joint angles, to free_offsets")
+    if fk is not None:
+        want(session.detections is not None, "seen", "poses", "detections, to weigh fk against")
+        want(fk.each.shape == (n, 6, 6), "fk", fk.each.shape, f"({n}, 6, 6), one an arm pose")
+    first = "closed_form" if method == "refine" else method
+    X, Y, measured = _first(session, first, None if guess is None else transform("guess", guess))
+    if method != "refine":
+        return HandEyeResult(X, Y, method, session, measured)
+    arm, q = (session.arm, session.q) if free_offsets else (None, None)
+    seen: views.Views = views.PoseViews(measured, np.zeros((0, 6, 6)))
+    fit = refinement.refine_poses
+    if session.detections is not None:
+        seen, fit = session.corners(session.corner_sigma_px), refinement.refine_pixels
+    given = session.T_base_gripper, session.mount, seen
+    best = fit(refinement.Problem(*given, free_scale, arm, q, fk), X, Y)
+    return HandEyeResult(best.state.X, best.state.Y, method, session, measured, best)
+
+
+def _first(
+    session: HandEyeSession, method: str, guess: Floats | None
+) -> tuple[Floats, Floats, Floats]:
+    """X, Y and T_camera_board (n, 4, 4): where an image allows two poses, the one that fits."""
+    arm, mount, measured = session.T_base_gripper, session.mount, session.T_camera_board
+    for _ in range(2):
+        if guess is not None:
+            X, Y = guess, mean_pose(stand_board(arm, measured, guess, mount))
+        else:
+            X, Y = closed_form(arm, measured, mount, method)
+        expected = camera_board(arm, X, Y, mount)
+        before, measured = measured, session.T_camera_board.copy()
+        for index, pose in enumerate(session.board_poses):
+            if pose.other is not None:
+                both = np.stack([pose.T_camera_board, pose.other])
+                turns = np.linalg.norm(pose_difference(expected[index], both)[:, :3], axis=1)
+                measured[index] = both[np.argmin(turns)]
+        if np.array_equal(before, measured):
+            break
+    return X, Y, measured
+
+
+# --- what the result says ---
+
+GOOD_MM, USABLE_MM = 2.0, 5.0  # 95 %, worst direction, lever arm included
+CONSISTENT_P = 0.001  # less likely than this, arm and images disagree by more than chance
+STATED_EXCESS = 4.0  # a unit of an arm may have twice the gear play of most: still as stated
+UNKNOWN_DEG, UNKNOWN_MM = 90.0, 1e3  # what is known no better is not known
+GOOD_POSES = 15
+GOOD_TURN_DEG = 15.0  # rms about the second axis: +-25 deg or so
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class HandEyeResult(Estimate):
+    """Where the camera is, and how far the data speak for it.
+
+    X (4, 4): T_gripper_camera (eye-in-hand) or T_base_camera (eye-to-hand). Y (4, 4): T_base_board
+    or T_gripper_board. session: what was given. measured (n, 4, 4): T_camera_board as the images
+    say, of two poses that one allows the one that fits the arm. refined: the refinement, None after
+    a closed form, which says nothing about its own uncertainty.
+    """
+
+    X: Floats
+    Y: Floats
+    method: str
+    session: HandEyeSession
+    measured: Floats
+    refined: refinement.Refined | None = None
+
+    @property
+    def mount(self) -> Mount:
+        """ "eye_in_hand" or "eye_to_hand"."""
+        return self.session.mount
+
+    # --- how well X is known ---
+
+    @property
+    def _fit(self) -> refinement.Refined:
+        if self.refined is None:
+            raise ValueError(f"method: {self.method} gives no covariance; solve with 'refine'")
+        return self.refined
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What was estimated, in the order of `covariance`.
+
+        "rx", "ry", "rz", "tx", "ty", "tz" of X, the same with "Y." before it of Y, and where they
+        were asked for "scale" and "offset_0" to "offset_5"; then the arm's errors that `fk` shares.
+        """
+        return self._fit.problem.names
+
+    @property
+    def covariance(self) -> Floats:
+        """(g, g) of `names`: first of the twists of X, then Y; ValueError after a closed form.
+
+        A twist is (omega, v), rad and m, along the axes of the frame that X is given in (gripper
+        or base): omega turns the camera about its own origin, v shifts it.
+        """
+        return self._fit.covariance
+
+    @property
+    def sigma_deg(self) -> Floats:
+        """Standard deviations (3,) of X's rotation about the axes of the frame it is given in."""
+        return np.degrees(np.sqrt(np.diag(self.covariance)[:3]))
+
+    @property
+    def sigma_mm(self) -> Floats:
+        """Standard deviations (3,) of X's translation."""
+        return 1e3 * np.sqrt(np.diag(self.covariance)[3:6])
+
+    def _index(self, name: str) -> int:
+        return self.names.index(choice("name", name, self.names))
+
+    def value(self, name: str) -> float:
+        """One of `names`: m or rad, and 0 for a rotation: its interval tells how far the true
+        camera may be turned from this one."""
+        return float(self._fit.problem.values(self._fit.state)[self._index(name)])
+
+    def sigma(self, name: str) -> float:
+        """The standard deviation of one of `names`, m or rad."""
+        return float(np.sqrt(np.diag(self.covariance)[self._index(name)]))
+
+    @property
+    def dof(self) -> float:
+        """Degrees of freedom; infinite with `fk`, whose priors fix the scale of the noise."""
+        return math.inf if self._fit.problem.fk is not None else self._fit.problem.dof
+
+    @property
+    def scale(self) -> float:
+        """Real size of the board over the size it claims; 1 unless it was estimated."""
+        return self.refined.state.scale if self.refined else 1.0
+
+    # --- what is left over ---
+
+    @cached_property
+    def T_base_gripper(self) -> Floats:
+        """The arm poses (n, 4, 4) as the result takes them to be.
+
+        As reported, but for the errors that belong to the arm (joint offsets and what `fk`
+        shares) where those were estimated.
+        """
+        if self.refined is None:
+            return self.session.T_base_gripper
+        return refinement.arm_poses_with(self.refined, self.refined.problem)
+
+    @cached_property
+    def T_camera_board(self) -> Floats:
+        """Where the camera should see the board, (n, 4, 4)."""
+        return camera_board(self.T_base_gripper, self.X, self.Y, self.mount)
+
+    @cached_property
+    def residuals(self) -> tuple[Floats, ...]:
+        """Observed - predicted of each view, (N_i, 2) px; ValueError without detections."""
+        return views.view_residuals(self.session.corners(), self.T_camera_board, self.scale)
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square length of the residual vectors, px."""
+        return views.rms_length(np.concatenate(self.residuals))
+
+    @cached_property
+    def gap_m(self) -> Floats:
+        """How far the board is from where it should be, (n,), m.
+
+        Between the pose that the image alone gives and the one that arm, X and Y give: root mean
+        square over the corners, or at the origin where no board is known. Along the line of sight
+        an image knows least, so this is larger than the residuals in px would say.
+        """
+        board = self.session.board
+        return views.board_gap(self.measured, self.T_camera_board, board, self.scale)[0]
+
+    @property
+    def rms_mm(self) -> float:
+        """Root mean square of `gap_m`, mm."""
+        return 1e3 * float(np.sqrt(np.mean(self.gap_m**2)))
+
+    @property
+    def spread_board_mm(self) -> float:
+        """Root mean square distance of the board's origin from its mean over the poses, mm.
+
+        Each pose puts the board somewhere on its stand (base or gripper): T X T_camera_board.
+        """
+        seen = views.enlarged(self.measured, self.scale)
+        places = stand_board(self.T_base_gripper, seen, self.X, self.mount)[:, :3, 3]
+        return 1e3 * views.rms_length(places - places.mean(axis=0))
+
+    @property
+    def gripper_twists(self) -> Floats:
+        """From where the arm says the gripper is to where the camera implies, (n, 6), rad and m."""
+        M = self.X @ views.enlarged(self.measured, self.scale) @ invert_transform(self.Y)
+        implied = M if self.mount == "eye_to_hand" else invert_transform(M)
+        return pose_difference(self.T_base_gripper, implied)
+
+    @property
+    def spread_gripper_mm(self) -> float:
+        """Root mean square distance at the gripper between what arm and camera say, mm."""
+        return 1e3 * views.rms_length(self.gripper_twists[:, 3:])
+
+    @property
+    def spread_gripper_deg(self) -> float:
+        """Root mean square angle at the gripper between what arm and camera say, deg."""
+        return math.degrees(views.rms_length(self.gripper_twists[:, :3]))
+
+    @property
+    def excess(self) -> float:
+        """How far arm and images disagree: variance over what noise and stated errors explain.
+
+        About 1 where all is as stated. The corners' noise is measured with a pose for each image
+        alone, no arm in it; ValueError where there are no corners.
+        """
+        self.session.corners()
+        return max(0.0, self._fit.squares - self._degrees[1]) / self._degrees[0]
+
+    @property
+    def _degrees(self) -> tuple[int, int]:
+        """Numbers that tie images to the arm, six a pose, less those that X, Y and scale took; and
+        those left within the images."""
+        problem, ties = self._fit.problem, 6 * len(self.session)
+        return max(1, ties - 12 - problem.free_scale), max(1, problem.views.observations - ties)
+
+    @property
+    def consistency_p_value(self) -> float:
+        """How often chance alone gives such an `excess`; small where something errs unstated.
+
+        With `fk` it is rough: how much play a unit has differs from unit to unit.
+        """
+        return float(f_distribution.sf(self.excess, *self._degrees))
+
+    # --- in words ---
+
+    @cached_property
+    def free(self) -> tuple[str, ...]:
+        """What the arm poses leave undetermined, in words; solvers return something anyway."""
+        return observability(self.session.T_base_gripper, self.mount).free
+
+    def __repr__(self) -> str:
+        name_X, name_Y = FRAMES[self.mount]
+        detections, fit = self.session.detections, self.refined
+        corners = pixels = ""
+        if detections is not None:
+            corners = f", {sum(len(seen.ids) for seen in detections)} corners"
+            pixels = f"{self.rms_px:.2f} px, "
+        unsure = "; NOT CONVERGED" if fit is not None and not fit.converged else ""
+        lines = [
+            f"{self.mount}, {self.method}, {len(self.session)} poses{corners}{unsure}",
+            self._pose_line(name_X, self.X, 0),
+            self._pose_line(name_Y, self.Y, 6),
+        ]
+        for name in self.names[12:] if fit is not None else ():
+            value, half = self.value(name), self.quantile() * self.sigma(name)
+            if name == "scale":
+                lines.append(f"scale = {value:.5f} ± {half:.5f} (95 %)")
+            elif name.startswith("offset_"):
+                value, half = math.degrees(value), math.degrees(half)
+                lines.append(f"{name} = {value:.3f} ± {half:.3f} deg (95 %)")
+        if self.free:
+            lines.append(wrapped(f"NOT DETERMINED: {'; '.join(self.free)}", indent=""))
+        lines.append(f"residuals: {pixels}{self.rms_mm:.2f} mm at the board (rms)")
+        lines.append(
+            f"spread: {self.spread_board_mm:.2f} mm of the board on its stand, "
+            f"{self.spread_gripper_mm:.2f} mm and {self.spread_gripper_deg:.3f} deg of the gripper"
+        )
+        return "\n".join(lines)
+
+    def _pose_line(self, name: str, T: Floats, first: int) -> str:
+        """A pose with its intervals; first: where its twist begins in the covariance."""
+        place, turns = 1e3 * T[:3, 3] + 0.0, Rotation.from_matrix(T[:3, :3]).as_rotvec() + 0.0
+        turned = "turned ({:.2f}, {:.2f}, {:.2f})".format(*(np.degrees(turns) + 0.0))
+        if self.refined is None:
+            return f"{name}: ({', '.join(f'{p:.2f}' for p in place)}) mm, {turned} deg"
+        sigma = self.quantile() * np.sqrt(np.diag(self.covariance)[first : first + 6])
+        wide, far = np.degrees(sigma[:3].max()), 1e3 * sigma[3:]
+        if wide > UNKNOWN_DEG or far.max() > UNKNOWN_MM:
+            one = "({:.0f}, {:.0f}, {:.0f}) mm".format(*place)
+            return f"{name}: unknown in part; one that fits: {one}"
+        where = ", ".join(f"{p:.2f} ± {s:.2f}" for p, s in zip(place, far, strict=True))
+        return f"{name}: ({where}) mm,\n  {turned} ± {wide:.3f} deg (95 %)"
+
+    def verdict(self) -> str:
+        """In words: how far to trust X, and what to do about what is weak."""
+        known = observability(self.session.T_base_gripper, self.mount)
+        weak = [f"{direction}: the poses do not determine it." for direction in known.free]
+        if known.poses < GOOD_POSES:
+            weak.append(f"{known.poses} poses are few: take 15 to 30.")
+        if known.turns_deg[1] < GOOD_TURN_DEG:
+            weak.append(
+                f"about its second axis the wrist turned by {known.turns_deg[1]:.0f} deg (rms) "
+                "only: turn it by 30 deg or more about two axes."
+            )
+        weak += self._inconsistent()
+        if self.refined is not None and not self.refined.converged:
+            weak.append("the refinement did not converge: are some pairs of pose and image wrong?")
+        lines = [self._head(bool(weak)), *(f"- {reason}" for reason in weak)]
+        return "\n".join(map(wrapped, lines))
+
+    def _head(self, weak: bool) -> str:
+        """The finding in a sentence or two."""
+        if self.refined is None:
+            return (
+                f"Uncertain: {self.method} says nothing about its own error. Solve with 'refine' "
+                "for an interval."
+            )
+        worst = self.quantile() * self.reach_sigma_mm
+        if self.free or worst > USABLE_MM:
+            grade = "Not good enough"
+        elif self._inconsistent():
+            grade = "Not to be trusted"
+        else:
+            grade = "Usable with care" if weak or worst > GOOD_MM else "Good"
+        at_its_word = self.refined.problem.fk is None
+        return (
+            f"{grade}: a point {1e3 * LEVER_M:.0f} mm in front of the camera is placed within "
+            f"± {worst:.1f} mm (95 %, worst direction), as far as the mount goes."
+            + " That takes the arm at its word: an arm's own error comes on top."
+            * at_its_word
+        )
+
+    @property
+    def reach_sigma_mm(self) -> float:
+        """Standard deviation, mm, worst direction, of where X puts a point `LEVER_M` ahead."""
+        by_turn = np.cross(np.eye(3), self.X[:3, 2] * LEVER_M).T  # omega moves it by omega x lever
+        by_twist = np.hstack([by_turn, np.eye(3)])
+        spread = by_twist @ self.covariance[:6, :6] @ by_twist.T
+        return 1e3 * float(np.sqrt(np.linalg.eigvalsh(spread)[-1]))
+
+    def _inconsistent(self) -> list[str]:
+        """That arm and images disagree by more than chance, [] where they do not."""
+        if self.refined is None or self.session.detections is None:
+            return []
+        stated = self.refined.problem.fk is not None
+        if self.consistency_p_value > CONSISTENT_P or (stated and self.excess < STATED_EXCESS):
+            return []
+        said = "more than was stated (fk)" if stated else "which was taken as exact"
+        return [
+            f"arm and images disagree by {self.spread_gripper_mm:.1f} mm and "
+            f"{self.spread_gripper_deg:.2f} deg at the gripper, more than the corners' noise "
+            f"explains: the arm errs, {said}, or a pair is wrong. The intervals are too narrow "
+            "then."
+        ]

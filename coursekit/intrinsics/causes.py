@@ -27,12 +27,10 @@ import numpy as np
 
 from coursekit.arrays import Floats, Interval, Mask, NDArray
 from coursekit.boards import Detection, Detections
-from coursekit.causes import CauseSearch, Explained, Hypothesis, Projection, Tested
-from coursekit.causes import search as search_causes
-from coursekit.geometry import Intrinsics
+from coursekit.causes import CauseSearch, Explained, Hypothesis, Projection, Tested, search
+from coursekit.geometry import Intrinsics, moved
 from coursekit.intrinsics.derivatives import (
     NormalEquations,
-    moved,
     parameter_vector,
     project_with_derivatives,
     selection,
@@ -44,11 +42,11 @@ from coursekit.words import p_text
 
 BOW, FOCUS, SHUTTER, LENS = "bowed_board", "focus_drift", "rolling_shutter", "lens_model"
 PHYSICAL = (BOW, FOCUS, SHUTTER, LENS)
-VIEW, CORNERS = "spoiled_view", "bad_corners"
+SPOILED_VIEW, BAD_CORNERS = "spoiled_view", "bad_corners"
 OWN = {FOCUS: 1, SHUTTER: 3}  # columns of the causes that each view has of its own
 # What a cause's coefficients are when it matters: bow, motion during the readout in m, relative
 # focal length, px for the rest.
-TYPICAL = {BOW: 5e-4, FOCUS: 0.01, SHUTTER: 1e-3, LENS: 0.5, VIEW: 1.0, CORNERS: 1.0}
+TYPICAL = {BOW: 5e-4, FOCUS: 0.01, SHUTTER: 1e-3, LENS: 0.5, SPOILED_VIEW: 1.0, BAD_CORNERS: 1.0}
 # At most 2 % of healthy sessions may get a finding. Six kinds of test at this level make 0.2 %; the
 # rest is for noise that is not quite Gaussian and for the checks that are no F-tests.
 CHANCE_LEVEL = 3e-4
@@ -66,7 +64,7 @@ NORMAL = np.array([0.0, 0.0, 1.0])  # into the board
 
 
 @dataclass(frozen=True, eq=False)
-class Corners:
+class CornerTable:
     """The corners of all views in one row.
 
     points (N, 3): on the board, m. pixels (N, 2). view, ids (N,): each corner's view and number.
@@ -77,9 +75,9 @@ class Corners:
     view: NDArray[np.intp]
     ids: NDArray[np.intp]
 
-    def keep(self, mask: Mask) -> Corners:
+    def keep(self, mask: Mask) -> CornerTable:
         """The corners under the mask (N,)."""
-        return Corners(self.points[mask], self.pixels[mask], self.view[mask], self.ids[mask])
+        return CornerTable(self.points[mask], self.pixels[mask], self.view[mask], self.ids[mask])
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +110,7 @@ class Calibration:
     camera: Intrinsics
     estimated: Floats
     poses: Floats
-    corners: Corners
+    corners: CornerTable
     names: tuple[str, ...]
     centre: Floats
     half_diagonal: float
@@ -129,7 +127,7 @@ class Calibration:
         view = np.repeat(np.arange(n), [len(d.ids) for d in detections])
         estimated = selection(result.names)
         left_out = int((~estimated[4:].any(axis=1)).sum())
-        corners = Corners(points[ids], pixels, view, ids)
+        corners = CornerTable(points[ids], pixels, view, ids)
         names = tuple(d.name or f"view {i}" for i, d in enumerate(detections))
         half_diagonal = float(np.linalg.norm(points - centre, axis=1).max())
         values = {BOW: np.zeros(3), LENS: np.zeros(5 + left_out)}
@@ -208,10 +206,10 @@ class Calibration:
         if len(rms) >= 4 and len(self.names) - len(rms) < len(rms) // 4:
             worst = int(self.views[rms.argmax()])
             rows = np.flatnonzero(np.repeat(self.corners.view == worst, 2))
-            yield _free(VIEW, rows, at=worst, tried=len(rms))
+            yield _free(SPOILED_VIEW, rows, at=worst, tried=len(rms))
         wrong = self._wrong_corners()
         if len(wrong):
-            yield _free(CORNERS, np.column_stack([2 * wrong, 2 * wrong + 1]).ravel())
+            yield _free(BAD_CORNERS, np.column_stack([2 * wrong, 2 * wrong + 1]).ravel())
 
     def hypothesis(self, cause: str) -> Hypothesis:
         """A physical cause: one set of columns for all views, or one set a view."""
@@ -246,7 +244,7 @@ class Calibration:
 
     def matters(self, test: Tested) -> bool:
         """Whether a view stands out from the others; the rest is for the findings to say."""
-        if test.cause != VIEW:
+        if test.cause != SPOILED_VIEW:
             return True
         rms = self._rms_by_view()
         others = float(np.median(np.delete(rms, rms.argmax())))
@@ -293,9 +291,9 @@ def _free(cause: str, rows: NDArray[np.intp], at: int = 0, tried: int = 1) -> Hy
     return Hypothesis(cause, np.eye(len(rows)), at, rows, TYPICAL[cause], tried)
 
 
-def search(result: IntrinsicsResult) -> CauseSearch[Calibration]:
+def search_residuals(result: IntrinsicsResult) -> CauseSearch[Calibration]:
     """The causes that the residuals of a calibration speak for, the strongest first."""
-    return search_causes(refit(Calibration.of(result)), CHANCE_LEVEL)
+    return search(refit(Calibration.of(result)), CHANCE_LEVEL)
 
 
 def kept(model: Calibration, detections: Sequence[Detection]) -> Detections:

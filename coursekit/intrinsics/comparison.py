@@ -17,9 +17,8 @@ import numpy as np
 from coursekit.arrays import Floats
 from coursekit.boards import Board, Detection
 from coursekit.checks import want
-from coursekit.geometry import Intrinsics, deproject, project
+from coursekit.geometry import Intrinsics, deproject, moved, project
 from coursekit.intrinsics.derivatives import (
-    moved,
     parameter_vector,
     project_with_derivatives,
     scaled_inverse,

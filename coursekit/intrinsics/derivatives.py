@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from coursekit.arrays import Floats
 from coursekit.geometry import Intrinsics, distort, distortion_jacobian
@@ -91,14 +90,6 @@ def twist_columns(points: Floats, by_point: Floats) -> Floats:
     # d (omega x p) / d omega = -[p]x, and -(row . [p]x) = (p x row)
     rotation = np.cross(points[:, None, :], by_point)
     return np.concatenate([rotation, by_point], axis=-1)
-
-
-def moved(T: Floats, twists: Floats) -> Floats:
-    """exp(xi) T for transforms (n, 4, 4) and twists (n, 6), with R = exp(omega), t = v."""
-    step = np.broadcast_to(np.eye(4), T.shape).copy()
-    step[:, :3, :3] = Rotation.from_rotvec(twists[:, :3]).as_matrix()
-    step[:, :3, 3] = twists[:, 3:]
-    return step @ T
 
 
 # --- least squares ---
@@ -195,8 +186,23 @@ def scaled_inverse(matrix: Floats) -> Floats:
     A direction that the data do not determine at all (to double precision) gets a variance that
     is huge, not an exception: that it is undetermined is what the reader must learn.
     """
-    scale = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-    scale = np.where(scale > 0, scale, 1.0)
-    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
+    scale, values, vectors = _scaled_parts(matrix)
     values = np.maximum(values, len(values) * np.finfo(float).eps * values[-1])
     return (vectors / values) @ vectors.T / np.outer(scale, scale)
+
+
+def scaled_root(covariance: Floats) -> Floats:
+    """A root (p, m) of a covariance (p, p) with very different units: root root^T is it again.
+
+    m < p where some numbers, or combinations of them, are exact.
+    """
+    scale, values, vectors = _scaled_parts(covariance)
+    kept = values > 1e-12
+    return np.asarray(scale[:, None] * vectors[:, kept] * np.sqrt(values[kept]))
+
+
+def _scaled_parts(matrix: Floats) -> tuple[Floats, Floats, Floats]:
+    """Scale (p,) that makes the diagonal 1, and eigenvalues and vectors of what is left."""
+    scale = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    scale = np.where(scale > 0, scale, 1.0)
+    return scale, *np.linalg.eigh(matrix / np.outer(scale, scale))

@@ -35,13 +35,13 @@ from coursekit.results import read_json
 from coursekit.specifications import DATA
 from coursekit.words import Finding, Findings
 
-Steps = list[Accepted[Calibration]]
-Figures = dict[str, Any]
+_Steps = list[Accepted[Calibration]]
+_Figures = dict[str, Any]
 
 POWER_FILE = DATA / "diagnosis_power.json"
 FEW_VIEWS = 10  # 9 camera parameters, and one odd view must not be able to decide them
 FLAT_TILT_DEG = 10.0  # at 10 deg sigma_f is three times, at 5 deg nine times that of 45 deg views
-FLAT_SHARE = 0.9  # of the views; one or two tilted ones are no design
+FLAT_VIEWS_SHARE = 0.9  # of the views; one or two tilted ones are no design
 # The distortion is a polynomial in the radius: between corners it interpolates, outside it is
 # free. Views pushed to the border leave 1 to 10 % of the width or height empty.
 BARE_MARGIN, BARE_SIDES, ONE_BARE_MARGIN = 0.125, 2, 0.25
@@ -60,7 +60,7 @@ MOST_COLUMNS = 30  # that are tried
 DEPTH_TOLERANCE, SCALE_SIGMAS = 0.025, 4.0
 NAMES_SHOWN = 4
 
-TEXTS = DiagnosisTexts.of("intrinsics")
+_TEXTS = DiagnosisTexts.of("intrinsics")
 
 
 def diagnose(
@@ -89,28 +89,28 @@ def diagnose(
         counts = [len(detection.ids) for detection in detections]
         depths = [array(f"depth_m[{i}]", z, (counts[i],)) for i, z in enumerate(depth_m)]
     found, used = _images(detections, board)
-    unseen = [] if depths else [TEXTS.not_tested["squares"]]
+    unseen = [] if depths else [_TEXTS.not_tested["squares"]]
     if all(detections[i].blur is None for i in used):
-        unseen.append(TEXTS.not_tested["blur"])
+        unseen.append(_TEXTS.not_tested["blur"])
     if len(used) < MIN_VIEWS or any(f.name == "wrong_board_size" for f in found):
-        return Findings(found, TEXTS.looked_for, unseen)
+        return Findings(found, _TEXTS.looked_for, unseen)
     views = Detections([detections[i] for i in used])
     if result is None or len(used) < len(detections):
         try:
             result = calibrate(views, board, model=model)
         except CalibrationFailed as error:
-            failed = TEXTS.finding("not_converged", why=error)
+            failed = _TEXTS.finding("not_converged", why=error)
             found += [f for f in (failed, _no_edge_corners(views)) if f]
-            return Findings(found, TEXTS.looked_for, unseen)
+            return Findings(found, _TEXTS.looked_for, unseen)
     flat = _fronto_parallel(result)
     if flat:
-        unseen.append(TEXTS.not_tested["residuals"])
+        unseen.append(_TEXTS.not_tested["residuals"])
     else:
         found += _residuals(result, unseen)
     scale = depth_scale(result, [depths[i] for i in used]) if depths else None
     design = [_blur(views), flat, _no_edge_corners(views), _wrong_squares(result, scale)]
     found += [finding for finding in design if finding]
-    return Findings(found, TEXTS.looked_for, unseen)
+    return Findings(found, _TEXTS.looked_for, unseen)
 
 
 def stored_power() -> dict[str, dict[str, Any]]:
@@ -137,19 +137,19 @@ def _images(detections: Sequence[Detection], board: Board) -> tuple[list[Finding
     if others and sizes:
         width, height = common
         listed = _listed(others)
-        found.append(TEXTS.finding("mixed_sizes", width=width, height=height, others=listed))
+        found.append(_TEXTS.finding("mixed_sizes", width=width, height=height, others=listed))
     used = [i for i, d in enumerate(detections) if d.size == common and len(d.ids) >= MIN_CORNERS]
     layout = _layout([detections[i] for i in used], board)
     refused = [s.reason for s in skipped if "squares" in s.reason]
     if not layout and len(refused) > len(used):  # the detector saw other squares in most images
         figures = {"images": len(refused), "reason": refused[0], "board": board.text}
-        layout = TEXTS.finding("other_squares_seen", **figures)
+        layout = _TEXTS.finding("other_squares_seen", **figures)
     if layout:
         return [*found, layout], used
     if len(used) < FEW_VIEWS:
         given = len(detections) + len(skipped)
         figures = {"used": len(used), "given": given, "corners": MIN_CORNERS, "few": FEW_VIEWS}
-        found.append(TEXTS.finding("few_views", **figures))
+        found.append(_TEXTS.finding("few_views", **figures))
     return found, used
 
 
@@ -172,7 +172,7 @@ def _layout(detections: list[Detection], board: Board) -> Finding | None:
         evidence += "with any pose"
     if best != columns and misfits[best] < LAYOUT_MISFIT:
         evidence += f"; with {best} inner corners in a row they fit"
-    return TEXTS.finding("wrong_board_size", evidence=evidence, board=board.text)
+    return _TEXTS.finding("wrong_board_size", evidence=evidence, board=board.text)
 
 
 def _lattice_misfit(detections: list[Detection], columns: int) -> float:
@@ -200,25 +200,25 @@ def _lattice_misfit(detections: list[Detection], columns: int) -> float:
 
 def _residuals(result: IntrinsicsResult, unseen: list[str]) -> list[Finding]:
     """What the residuals of a fit speak for; what could not be tested is added to `unseen`."""
-    search = causes.search(result)
+    search = causes.search_residuals(result)
     found = []
-    for cause, figures_of in FIGURES.items():
+    for cause, figures_of in _FIGURES.items():
         steps = search.of(cause)
         figures = figures_of(search, steps) if steps else None
         if figures:
-            found.append(TEXTS.finding(cause, steps[0].test.p_value, **figures))
+            found.append(_TEXTS.finding(cause, steps[0].test.p_value, **figures))
     if not result.converged:
         why = "another step of the solver would still move the parameters"
-        found.insert(0, TEXTS.finding("not_converged", why=why))
+        found.insert(0, _TEXTS.finding("not_converged", why=why))
     try:
         apart = _halves(search.model, result, explained=bool(found))
     except (CalibrationFailed, np.linalg.LinAlgError) as error:
-        unseen.append(TEXTS.not_tested["halves"].format(error=error))
+        unseen.append(_TEXTS.not_tested["halves"].format(error=error))
         return found
     return [*found, apart] if apart else found
 
 
-def _spoiled_views(search: CauseSearch[Calibration], steps: Steps) -> Figures | None:
+def _spoiled_views(search: CauseSearch[Calibration], steps: _Steps) -> _Figures | None:
     residuals = steps[-1].after.linear.residuals
     return {
         "names": _listed([search.model.names[step.test.at] for step in steps]),
@@ -227,7 +227,7 @@ def _spoiled_views(search: CauseSearch[Calibration], steps: Steps) -> Figures | 
     }
 
 
-def _bad_corners(search: CauseSearch[Calibration], steps: Steps) -> Figures | None:
+def _bad_corners(search: CauseSearch[Calibration], steps: _Steps) -> _Figures | None:
     found = []
     for step in steps:
         gone = step.before.corners.keep(step.before.corners_of(step.test))
@@ -240,7 +240,7 @@ def _bad_corners(search: CauseSearch[Calibration], steps: Steps) -> Figures | No
     return {"wrong": len(found), "given": given, "listed": _listed(listed)}
 
 
-def _bow(search: CauseSearch[Calibration], steps: Steps) -> Figures | None:
+def _bow(search: CauseSearch[Calibration], steps: _Steps) -> _Figures | None:
     sag, sigma = causes.sag(search.model)
     if sag < NORMAL_BOW_M:
         return None
@@ -249,26 +249,26 @@ def _bow(search: CauseSearch[Calibration], steps: Steps) -> Figures | None:
     return {"sag": 1e3 * sag, "half": 1.96e3 * sigma, **fx}
 
 
-def _focus(search: CauseSearch[Calibration], steps: Steps) -> Figures | None:
+def _focus(search: CauseSearch[Calibration], steps: _Steps) -> _Figures | None:
     drift = search.model.sizes[causes.FOCUS]
     return {"drift": 100 * drift, "normal": 100 * NORMAL_DRIFT} if drift >= NORMAL_DRIFT else None
 
 
-def _shutter(search: CauseSearch[Calibration], steps: Steps) -> Figures | None:
+def _shutter(search: CauseSearch[Calibration], steps: _Steps) -> _Figures | None:
     # The size is that of one of three components of the motion.
     motion = math.sqrt(3.0) * search.model.sizes[causes.SHUTTER]
     return {"motion": 1e3 * motion, "speed": motion / 0.02} if motion >= NORMAL_MOTION_M else None
 
 
-def _lens(search: CauseSearch[Calibration], steps: Steps) -> Figures | None:
+def _lens(search: CauseSearch[Calibration], steps: _Steps) -> _Figures | None:
     size = search.model.sizes[causes.LENS]
     return {"size": size} if size >= NORMAL_LENS_PX else None
 
 
 # The figures of an accepted cause, or None where it is no larger than normal; in order of gravity.
-FIGURES: dict[str, Callable[[CauseSearch[Calibration], Steps], Figures | None]] = {
-    causes.VIEW: _spoiled_views,
-    causes.CORNERS: _bad_corners,
+_FIGURES: dict[str, Callable[[CauseSearch[Calibration], _Steps], _Figures | None]] = {
+    causes.SPOILED_VIEW: _spoiled_views,
+    causes.BAD_CORNERS: _bad_corners,
     causes.BOW: _bow,
     causes.FOCUS: _focus,
     causes.SHUTTER: _shutter,
@@ -290,7 +290,7 @@ def _halves(model: Calibration, result: IntrinsicsResult, explained: bool) -> Fi
     if not unexplained and min(worst, sigma) < LOST_PX:
         return None
     figures = {"worst": worst, "median": np.nanmedian(both.length_px), "sigma": sigma}
-    return TEXTS.finding("halves_disagree", both.p_value, **figures)
+    return _TEXTS.finding("halves_disagree", both.p_value, **figures)
 
 
 def _blur(detections: Sequence[Detection]) -> Finding | None:
@@ -301,7 +301,7 @@ def _blur(detections: Sequence[Detection]) -> Finding | None:
         return None
     names = _listed([detections[i].name or f"view {i}" for i in blurred])
     figures = {"least": lengths[blurred].min(), "most": lengths[blurred].max(), "names": names}
-    return TEXTS.finding("motion_blur", blurred=len(blurred), views=len(lengths), **figures)
+    return _TEXTS.finding("motion_blur", blurred=len(blurred), views=len(lengths), **figures)
 
 
 def blur_lengths_px(detections: Sequence[Detection]) -> Floats:
@@ -330,11 +330,11 @@ def _fronto_parallel(result: IntrinsicsResult) -> Finding | None:
     # same.
     fx = result.intrinsics.fx
     longest = min(1.0, float(np.hypot(*result.intrinsics.size)) / fx)
-    tilt = float(np.quantile(longest * tilts(result).total_deg, FLAT_SHARE))
+    tilt = float(np.quantile(longest * tilts(result).total_deg, FLAT_VIEWS_SHARE))
     if tilt >= FLAT_TILT_DEG:
         return None
     sigma = 100 * result.sigma("fx") / fx
-    return TEXTS.finding("fronto_parallel", share=100 * FLAT_SHARE, tilt=tilt, fx=sigma)
+    return _TEXTS.finding("fronto_parallel", share=100 * FLAT_VIEWS_SHARE, tilt=tilt, fx=sigma)
 
 
 def _no_edge_corners(detections: Sequence[Detection]) -> Finding | None:
@@ -344,7 +344,7 @@ def _no_edge_corners(detections: Sequence[Detection]) -> Finding | None:
         return None
     names = ("left", "top", "right", "bottom")
     empty = {name: 100 * margin for name, margin in zip(names, seen.margins, strict=True)}
-    return TEXTS.finding("no_edge_corners", reach=100 * seen.reach, **empty)
+    return _TEXTS.finding("no_edge_corners", reach=100 * seen.reach, **empty)
 
 
 # --- metres from elsewhere ---
@@ -382,7 +382,7 @@ def _wrong_squares(result: IntrinsicsResult, scale: Scale | None) -> Finding | N
         return None
     stated, half = 1e3 * result.board.square_m, 1.96 * scale.sigma
     figures = {"factor": scale.factor, "half": half, "true": scale.factor * stated}
-    return TEXTS.finding("wrong_square_size", stated=stated, **figures)
+    return _TEXTS.finding("wrong_square_size", stated=stated, **figures)
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -73,7 +73,7 @@ GOOD_SPREAD_DEG = 10.0
 GOOD_VIEWS = 10
 GOOD_PX, USABLE_PX = 0.5, 2.0  # 95 %, in all but the worst 5 % of the image, at the boards' range
 GOOD_FAR_PX, USABLE_FAR_PX = 2.0, 4.0  # the same for a direction (a point infinitely far away)
-DETERMINED = 0.01  # 95 % of the focal length and of the centre, as shares of the focal length
+DETERMINED_SHARE = 0.01  # 95 % of the focal length and of the centre, as shares of the focal length
 
 
 # --- what a fit says ---
@@ -88,12 +88,11 @@ class IntrinsicsResult(Estimate):
     """A fitted camera and what the data say about it.
 
     intrinsics: the estimate. names (p): the parameters that were estimated; "f" stands for
-    fx = fy. T_camera_board (n, 4, 4): the pose of the board in each view. residuals: one
-    (N_i, 2) a view, observed - predicted, px. equations: the Jacobian at the estimate, its poses
-    perturbed from the left in the camera's frame (see `intrinsics.derivatives`). converged: whether
-    another Gauss-Newton step would leave everything where it is, measured in its own sigma.
-    points (N, 3): where the board's corners are taken to be, m. extra: what was estimated besides
-    (the bow of a board); it widens every covariance and is not part of it.
+    fx = fy. T_camera_board (n, 4, 4): the pose of the board in each view. equations: the residuals
+    and their Jacobian at the estimate, poses perturbed from the left in the camera's frame (see
+    `intrinsics.derivatives`). points (N, 3): where the board's corners are taken to be, m. extra:
+    what was estimated besides (the bow of a board); it widens every covariance and is not part of
+    it.
 
     `value`, `sigma` and `interval` take one of `names`; "fx" and "fy" are known where "f" is.
     """
@@ -102,9 +101,7 @@ class IntrinsicsResult(Estimate):
     model: str
     names: tuple[str, ...]
     T_camera_board: Floats
-    residuals: tuple[Floats, ...]
     equations: NormalEquations
-    converged: bool
     board: Board
     points: Floats
     detections: Sequence[Detection]
@@ -113,8 +110,14 @@ class IntrinsicsResult(Estimate):
     # --- how large the residuals are ---
 
     @cached_property
+    def residuals(self) -> tuple[Floats, ...]:
+        """Observed - predicted pixels, one (N_i, 2) a view, px."""
+        flat = self.equations.residuals
+        return tuple(flat[rows].reshape(-1, 2) for rows in self.equations.slices)
+
+    @property
     def _all_residuals(self) -> Floats:
-        return np.concatenate(self.residuals)
+        return self.equations.residuals.reshape(-1, 2)
 
     @property
     def corners(self) -> int:
@@ -150,6 +153,17 @@ class IntrinsicsResult(Estimate):
     def sigma_px(self) -> float:
         """Standard deviation of one corner coordinate, px, from the residuals and `dof`."""
         return math.sqrt(float(np.sum(self._all_residuals**2)) / self.dof)
+
+    @cached_property
+    def converged(self) -> bool:
+        """Whether another Gauss-Newton step would leave everything where it is.
+
+        It would move no combination of parameters by more than ARRIVED_SIGMAS of its own standard
+        deviation, or no corner by more than ARRIVED_PX.
+        """
+        decrease, variance = self.equations.decrease(), float(np.mean(self._all_residuals**2))
+        of_sigma = variance * 2 * self.corners / max(1, self.dof)
+        return decrease < max(ARRIVED_SIGMAS**2 * of_sigma, 2 * self.corners * ARRIVED_PX**2)
 
     # --- what the parameters are known to ---
 
@@ -211,8 +225,7 @@ class IntrinsicsResult(Estimate):
         covariance = self._scaled(self.equations.mean_motion_covariance())
         known = len(self.names) if fixed == "camera" else len(covariance)
         columns, covariance = columns[..., :known], covariance[:known, :known]
-        spread = columns @ covariance @ np.swapaxes(columns, -1, -2)
-        return spread.reshape(*uv.shape, 2)
+        return (columns @ covariance @ np.swapaxes(columns, -1, -2)).reshape(*uv.shape, 2)
 
     def uncertainty_map(
         self, range_m: float, shape: tuple[int, int] = MAP_SHAPE, fixed: Fixed = "world"
@@ -249,7 +262,7 @@ class IntrinsicsResult(Estimate):
         )
         focal = wide * max(self.sigma(f) / self.value(f) for f in ("fx", "fy"))
         centre = wide * max(self.sigma(c) for c in ("cx", "cy"))
-        determined = max(focal, centre / self.value("fx")) < DETERMINED
+        determined = max(focal, centre / self.value("fx")) < DETERMINED_SHARE
         near_mm = 1e3 * near * range_m / self.value("fx")
         says = (
             f"in 95 % of the image a point {range_m:.2f} m away is seen where this camera says to "
@@ -379,7 +392,6 @@ def evaluate(
     extra = extra or {}
     ids = np.concatenate([d.ids for d in detections])
     counts = [len(d.ids) for d in detections]
-    ends = np.cumsum(counts)[:-1]
     R = np.repeat(T_camera_board[:, :3, :3], counts, axis=0)
     at = np.einsum("nij,nj->ni", R, points[ids])
     at += np.repeat(T_camera_board[:, :3, 3], counts, axis=0)
@@ -389,7 +401,7 @@ def evaluate(
     for by_extra in extra.values():
         moves = np.einsum("nij,nj->ni", R, by_extra[ids])
         shared.append(np.einsum("nij,nj->ni", by_point, moves)[..., None])
-    poses = np.split(twist_columns(at, by_point), ends)
+    poses = np.split(twist_columns(at, by_point), np.cumsum(counts)[:-1])
     equations = NormalEquations(
         shared=np.concatenate(shared, axis=-1).reshape(2 * len(ids), -1),
         poses=tuple(block.reshape(-1, 6) for block in poses),
@@ -400,22 +412,11 @@ def evaluate(
         model=model,
         names=names,
         T_camera_board=T_camera_board,
-        residuals=tuple(np.split(residuals, ends)),
         equations=equations,
-        converged=_arrived(equations),
         board=board,
         points=points,
         detections=detections,
         extra=tuple(extra),
-    )
-
-
-def _arrived(equations: NormalEquations) -> bool:
-    """Whether a further step would move nothing by more than ARRIVED_SIGMAS or ARRIVED_PX."""
-    squares, decrease = float(equations.residuals @ equations.residuals), equations.decrease()
-    return bool(
-        decrease < ARRIVED_SIGMAS**2 * squares / max(1, equations.dof)
-        or decrease < ARRIVED_PX**2 * len(equations.residuals)
     )
 
 
@@ -466,8 +467,8 @@ def _solve(
         make_transform(Rotation.from_rotvec(r.ravel()), t.ravel())
         for r, t in zip(rotations, translations, strict=True)
     ])  # fmt: skip
-    seen = zip(poses, points, strict=True)
-    in_front = all((p @ T[2, :3] + T[2, 3] > 0).all() for T, p in seen)
+    depths = [p @ T[2, :3] + T[2, 3] for T, p in zip(poses, points, strict=True)]
+    in_front = all((z > 0).all() for z in depths)
     if min(K[0, 0], K[1, 1]) < LEAST_FOCAL * size[0] or not in_front:
         raise CalibrationFailed(
             f"detections: the solver ended at a camera that cannot be (fx = {K[0, 0]:.3g}, fy = "
@@ -532,24 +533,18 @@ class Coverage:
     """Where in the image corners were seen.
 
     counts (rows, columns): corners in each cell of the image. margins: what is empty at the left,
-    top, right and bottom, as a share of the width or height. distances_px (N,): of all corners
-    from the image's centre. size: (width, height), px.
+    top, right and bottom, as a share of the width or height. reach: how far out the outermost
+    corner lies, 0 in the image's centre and 1 in the image's corner.
     """
 
     counts: NDArray[np.intp]
     margins: tuple[float, float, float, float]
-    distances_px: Floats
-    size: tuple[int, int]
+    reach: float
 
     @property
     def fraction(self) -> float:
         """The share of the cells with at least one corner."""
         return float(np.mean(self.counts > 0))
-
-    @property
-    def reach(self) -> float:
-        """How far out the outermost corner lies: 0 the image's centre, 1 the image's corner."""
-        return float(self.distances_px.max() / (math.hypot(*self.size) / 2))
 
     @property
     def empty_sides(self) -> tuple[str, ...]:
@@ -573,25 +568,19 @@ def coverage(detections: Sequence[Detection], cells: tuple[int, int] = (6, 8)) -
     cells: (rows, columns) in which to count them. Raises ValueError for no detections.
     """
     want(len(detections), "detections", 0, "at least one view")
-    width, height = detections[0].size
+    width, height = size = np.array(detections[0].size)
     pixels = np.concatenate([d.pixels for d in detections])
     # pixel 0 is the centre of the first pixel: the image reaches from -0.5 to size - 0.5
     counts, _, _ = np.histogram2d(
         pixels[:, 1], pixels[:, 0], cells, [(-0.5, height - 0.5), (-0.5, width - 0.5)]
     )
-    low, high = pixels.min(axis=0), pixels.max(axis=0)
-    margins = (
-        (low[0] + 0.5) / width,
-        (low[1] + 0.5) / height,
-        (width - 0.5 - high[0]) / width,
-        (height - 0.5 - high[1]) / height,
-    )
-    centre = np.array([width - 1, height - 1]) / 2
+    left, top = (pixels.min(axis=0) + 0.5) / size
+    right, bottom = (size - 0.5 - pixels.max(axis=0)) / size
+    outermost = np.linalg.norm(pixels - (size - 1) / 2, axis=1).max()
     return Coverage(
-        counts=counts.astype(np.intp),
-        margins=tuple(float(m) for m in margins),  # type: ignore[arg-type]
-        distances_px=np.linalg.norm(pixels - centre, axis=1),
-        size=(width, height),
+        counts.astype(np.intp),
+        (float(left), float(top), float(right), float(bottom)),
+        float(outermost / np.linalg.norm(size / 2)),
     )
 
 

@@ -19,9 +19,9 @@ from coursekit.arm import Arm
 from coursekit.arrays import ArrayLike, Bools, Floats, Integers
 from coursekit.boards import Board
 from coursekit.boards.view import seen
-from coursekit.checks import number, transform, transforms, whole
+from coursekit.checks import choice, number, transform, transforms, whole
 from coursekit.geometry import Intrinsics, invert_transform, make_transform
-from coursekit.hand_eye.poses import Mount, check_mount
+from coursekit.hand_eye.poses import MOUNTS, Mount
 from coursekit.specifications import DATA
 
 SMALLEST_SQUARE_PX = 14.0  # a square's side as seen, below which markers are not read
@@ -101,7 +101,7 @@ class Setup:
     turn_rad: float = np.radians(60)
 
     def __post_init__(self) -> None:
-        check_mount(self.mount)
+        choice("mount", self.mount, MOUNTS)
         object.__setattr__(self, "X", transform("X", self.X))
         object.__setattr__(self, "Y", transform("Y", self.Y))
         number("share", self.share, "more than 0 and at most 1", above=0.0, most=1.0)
@@ -257,5 +257,8 @@ def degenerate_poses(mount: Mount, design: str) -> Floats:
     of up to 30 degrees about the vertical, in order; "small_rotations", of up to 3 degrees about
     any axis. The arm is allowed to go there in the course's own rig of this mount, and sees the
     board.
+
+    >>> degenerate_poses("eye_in_hand", "grid").shape
+    (4, 25, 6)
     """
     return np.array(json.loads(DEGENERATE.read_text("utf-8"))[mount][design])

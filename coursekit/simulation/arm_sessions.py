@@ -29,8 +29,14 @@ from coursekit.boards import Board, BoardNotFound, Detection, Detections, detect
 from coursekit.boards.detector import FEWEST_CORNERS, SESSION
 from coursekit.boards.view import seen
 from coursekit.checks import choice, number, positive, want, whole
-from coursekit.geometry import invert_transform, make_transform, project, transform_points
-from coursekit.hand_eye.poses import Mount, camera_board, check_mount, turned
+from coursekit.geometry import (
+    invert_transform,
+    make_transform,
+    project,
+    transform_points,
+    turned,
+)
+from coursekit.hand_eye.poses import MOUNTS, Mount, camera_board
 from coursekit.hand_eye.session import HandEyeSession
 from coursekit.simulation.arm_poses import (
     Setup,
@@ -146,9 +152,12 @@ def default_setup(mount: Mount) -> Setup:
     "eye_in_hand": a D405 at the maker's mount, a ChArUco board of 9 x 6 squares of 25 mm on the
     table. "eye_to_hand": a D435 over the shoulder, one of 7 x 5 squares of 20 mm in the gripper.
     The lens is that of the unit in data/devices.toml.
+
+    >>> default_setup("eye_to_hand").board.squares
+    (7, 5)
     """
     arm = widowx()
-    if check_mount(mount) == "eye_in_hand":
+    if choice("mount", mount, MOUNTS) == "eye_in_hand":
         lens, board = device("D405").unit.color, TABLE_BOARD
         return Setup(arm, mount, arm.T_gripper_camera, board_on_table(board), lens, board)
     lens, board = device("D435").unit.color, HELD_BOARD
@@ -170,9 +179,10 @@ def hand_eye_session(
     corner. arm_errors: sizes of the arm's hidden errors, None for an arm that has none. The same
     arguments give the same session. Raises ValueError for bad arguments.
 
-    >>> session, truth = hand_eye_session("eye_in_hand", seed=1, n=5)
+    >>> on_a_grid = HandEyeMistakes(design="grid")
+    >>> session, truth = hand_eye_session("eye_in_hand", seed=1, mistakes=on_a_grid)
     >>> session.T_base_gripper.shape, truth.X.shape
-    ((5, 4, 4), (4, 4))
+    ((25, 4, 4), (4, 4))
     """
     number("corner_noise_px", corner_noise_px, "a number, 0 or more", least=0.0)
     truth, q, dq = _poses(mount, seed, n, arm_errors, mistakes or HandEyeMistakes())
@@ -209,6 +219,10 @@ def truth_of(folder: str | os.PathLike[str]) -> HandEyeTruth:
     Nothing of it is in the folder: it is made again from `seed` and `views` in session.json, as
     for `rendered_session(mount, seed, views, ArmErrors())`. Raises ValueError where they are not
     there, as in a session with a real arm.
+
+    >>> truth_of("no such folder")
+    Traceback (most recent call last):
+    ValueError: folder: 'no such folder' has no session.json
     """
     path = Path(folder) / SESSION
     if not path.is_file():
@@ -216,7 +230,11 @@ def truth_of(folder: str | os.PathLike[str]) -> HandEyeTruth:
     card = json.loads(path.read_text("utf-8"))
     if card.get("source") != SIMULATED:
         raise ValueError(f"folder: {path.parent.name} is no simulated session; nobody knows its X")
-    mount, seed, views = check_mount(card["mount"]), int(card["seed"]), int(card["views"])
+    mount, seed, views = (
+        choice("mount", card["mount"], MOUNTS),
+        int(card["seed"]),
+        int(card["views"]),
+    )
     return _poses(mount, seed, views, ArmErrors(), HandEyeMistakes())[0]
 
 
@@ -242,7 +260,7 @@ def _poses(
     mount: Mount, seed: int, n: int, errors: ArmErrors | None, mistakes: HandEyeMistakes
 ) -> tuple[HandEyeTruth, Floats, Floats]:
     """The truth, and the joint angles and velocities (n, 6) that the encoders read."""
-    rig, q = _placed(check_mount(mount), _stream(seed, b"poses"), n, mistakes.design)
+    rig, q = _placed(choice("mount", mount, MOUNTS), _stream(seed, b"poses"), n, mistakes.design)
     offsets, joint = _joint_zero(seed, mistakes)
     arm = SimulatedArm(seed, errors or ArmErrors(0.0, 0.0, 0.0, 0.0))
     dq = np.zeros_like(q)
@@ -265,6 +283,7 @@ def _poses(
 
 @cache
 def _configurations(mount: Mount) -> Floats:
+    """What the careful sessions of a default setup are drawn from, (160, 6) rad: half a second."""
     return random_poses(default_setup(mount), np.random.default_rng(0), CONFIGURATIONS)
 
 
@@ -378,8 +397,8 @@ def _reported(truth: HandEyeTruth, q: Floats, dq: Floats, found: Detections) -> 
         by, n = mistakes.shifted_by, len(session)
         arm = np.arange(max(0, -by), min(n, n - by))
         rows = session.pick(arm)
-        poses = {"T_base_gripper": rows.T_base_gripper, "q": rows.q, "dq": rows.dq}
-        session = replace(session.pick(arm + by), **poses)
+        images = session.pick(arm + by)
+        session = replace(images, T_base_gripper=rows.T_base_gripper, q=rows.q, dq=rows.dq)
     return session
 
 
@@ -396,6 +415,10 @@ def touch_corners(truth: HandEyeTruth, corners: Sequence[int] = (0, 7, 39)) -> F
     truth: of an eye-in-hand session. corners (k,): ids. Returns (k, 3), m, in the base by the
     arm's own forward kinematics; the fingertip is really on the corner.
     Raises ValueError for another mount, and for a corner out of the arm's reach.
+
+    >>> _, truth = hand_eye_session("eye_in_hand", 1, mistakes=HandEyeMistakes(design="grid"))
+    >>> touch_corners(truth, [0, 39]).shape
+    (2, 3)
     """
     want(truth.mount == "eye_in_hand", "truth", truth.mount, "eye_in_hand: a board on the table")
     places = transform_points(truth.setup.Y, truth.setup.board.points[list(corners)])
@@ -423,6 +446,15 @@ def shared_target(
 
     Both cameras are good to 0.2 mm along each axis in their own frames.
     Raises ValueError for sessions of other mounts.
+
+    >>> on_a_grid = HandEyeMistakes(design="grid")
+    >>> _, on_wrist = hand_eye_session("eye_in_hand", 1, mistakes=on_a_grid)
+    >>> _, above = hand_eye_session("eye_to_hand", 1, mistakes=on_a_grid)
+    >>> target = shared_target(on_wrist, above)
+    >>> near = transform_points(target.T_base_gripper @ on_wrist.X, target.in_wrist_camera)
+    >>> far = transform_points(above.X, target.in_shoulder_camera)
+    >>> bool(np.linalg.norm(near - far) < 2e-3)  # two cameras on one arm without errors
+    True
     """
     mounts = (on_wrist.mount, over_shoulder.mount)
     wanted = "an eye_in_hand and an eye_to_hand session"

@@ -90,27 +90,19 @@ def light_up(
             if not math.isfinite(x + y):
                 out[v, u] = 0.0  # no light reaches a pixel beyond the fold of the distortion
                 continue
-            out[v, u] = _pixel(pose, corners, sheet, edges, place, x, y, v, u, pixel)
+            out[v, u] = _pixel(pose, (corners, sheet, edges, place), x, y, v, u, pixel)
 
 
 @njit(cache=True, error_model="numpy")
 def _pixel(
-    pose: Any,
-    corners: Any,
-    sheet: Any,
-    edges: Any,
-    place: Any,
-    x: float,
-    y: float,
-    v: int,
-    u: int,
-    pixel: float,
+    pose: Any, printed_sheet: Any, x: float, y: float, v: int, u: int, pixel: float
 ) -> float:
     """The light on one pixel, whose middle's ray is (x, y, 1).
 
     Over so little, a point of the sheet moves linearly with the place in the pixel and with time:
     X = X + a XA + b XB + t XT, each of a, b and t from -1/2 to 1/2.
     """
+    corners, sheet, edges, place = printed_sheet
     X, Y, XA, YA, XB, YB, XT, YT = _map(corners, v, u, place)
     if not math.isfinite(X + Y):
         return _table(pose, sheet, place, x, y, pixel)
@@ -162,6 +154,7 @@ def _map(
 
 @njit(cache=True, error_model="numpy")
 def _middle(p: Any, q: Any, r: Any, s: Any) -> tuple[float, float]:
+    """The mean of four points of the plane, such as a pixel's corners on the sheet."""
     return 0.25 * (p[0] + q[0] + r[0] + s[0]), 0.25 * (p[1] + q[1] + r[1] + s[1])
 
 
@@ -234,6 +227,13 @@ def render_board(
     of an ordinary one; less light or exposure is not darker but noisier, for the camera's gain
     makes up for it.
     Raises ValueError for a wrong argument, and for a board that does not face the camera.
+
+    >>> T = np.eye(4)
+    >>> T[:3, 3] = -0.06, -0.06, 0.5
+    >>> small = Intrinsics(64, 48, 60.0, 60.0, 31.5, 23.5)
+    >>> picture = render_board(Board("checkerboard", (5, 5), 0.04), T, small, None)
+    >>> picture.shape, picture.dtype.name
+    ((48, 64), 'uint8')
     """
     T_camera_sheet = check_pose(board, T_camera_board) @ board.T_board_sheet
     checks.instance("lens", lens, Intrinsics)
@@ -277,20 +277,18 @@ def check_pose(board: Board, T_camera_board: ArrayLike) -> Floats:
 
 
 def _poses(
-    T_camera_sheet: Floats,
-    middle: Floats,
-    twist: Floats,
-    exposure_s: float,
-    readout_s: float,
-    rows: int,
+    T: Floats, middle: Floats, twist: Floats, exposure_s: float, readout_s: float, rows: int
 ) -> Floats:
-    """Where the camera is in the sheet's frame, (moments, lines, 12): see the module."""
+    """Where the camera is in the sheet's frame, (moments, lines, 12): see the module.
+
+    T (4, 4): sheet frame to camera frame in the middle of the exposure. middle (3,): of the sheet.
+    """
     moments, lines = (2, rows + 1 if readout_s else 1) if twist.any() else (1, 1)
     within = exposure_s * np.array([-0.5, 0.5])[-moments:, None] * (moments - 1)
     time_s = within + readout_s * np.linspace(-0.5, 0.5, lines) * (lines > 1)
     turn = Rotation.from_rotvec(time_s.reshape(-1, 1) * twist[3:]).as_matrix()
-    R = (turn @ T_camera_sheet[:3, :3]).reshape(moments, lines, 3, 3)
-    where = transform_points(T_camera_sheet, middle) + time_s[..., None] * twist[:3]
+    R = (turn @ T[:3, :3]).reshape(moments, lines, 3, 3)
+    where = transform_points(T, middle) + time_s[..., None] * twist[:3]
     place = middle - np.einsum("...ji,...j->...i", R, where)
     return np.concatenate([place, np.swapaxes(R, -1, -2).reshape(moments, lines, 9)], axis=-1)
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from coursekit.arrays import Bools, Floats, Integers
 from coursekit.boards import Board, Detection, Detections
-from coursekit.boards.view import BORDER_PX, in_view, seen
+from coursekit.boards.view import BORDER_PX, seen, slide_into_view
 from coursekit.checks import number, positive, whole
 from coursekit.geometry import Intrinsics, project, transform_points
 
@@ -100,6 +100,12 @@ def corner_session(
     over the image; a checkerboard is always seen whole, a ChArUco board may be cut by the border.
     noise_px: std of one coordinate of a corner. The same arguments give the same bytes.
     Raises ValueError for bad arguments and when the board does not fit the image at any distance.
+
+    >>> lens = Intrinsics(640, 480, 600.0, 600.0, 319.5, 239.5)
+    >>> board = Board("charuco", (9, 6), 0.025)
+    >>> detections, truth = corner_session(board, lens, 1, views=3, effects=Effects(bow_m=1e-3))
+    >>> len(detections), truth.T_camera_board.shape
+    (3, (3, 4, 4))
     """
     whole("views", views)
     number("noise_px", noise_px, "a finite number, 0 or more", least=0.0)
@@ -181,7 +187,7 @@ def _pose_in_view(
         roll = Rotation.from_euler("z", rng.uniform(-np.pi / 4, np.pi / 4))
         R = (Rotation.from_rotvec(tilt * axis) * roll).as_matrix()
         distance_m = rng.uniform(NEAREST_M, FARTHEST_M)
-        T = in_view(
+        T = slide_into_view(
             target, distance_m, R, board.middle, lens, lambda T: _enough(board, lens, T, effects)
         )
         if T is not None:
@@ -245,6 +251,10 @@ def bowed(board: Board, bow_m: float) -> Floats:
 
     The middle stands out by bow_m towards the viewer (z points into the board) and the
     outermost corners stay where they were.
+
+    >>> corners = bowed(Board("checkerboard", (4, 4), 0.02), 0.001)
+    >>> corners[[0, 4], 2].tolist()  # an outermost one and the middle one
+    [0.0, -0.001]
     """
     points = board.points.copy()
     away = points[:, :2] - board.middle[:2]

@@ -155,6 +155,7 @@ def render_color(
 
 @njit(cache=True, error_model="numpy")
 def _between(corners: Any, v: int, u: int, k: int, a: float, b: float) -> float:
+    """Component k of the ray at (a, b) of the way across and down pixel (u, v), bilinear."""
     top = corners[v, u, k] * (1.0 - a) + corners[v, u + 1, k] * a
     bottom = corners[v + 1, u, k] * (1.0 - a) + corners[v + 1, u + 1, k] * a
     return top * (1.0 - b) + bottom * b

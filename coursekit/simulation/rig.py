@@ -40,7 +40,7 @@ from coursekit.simulation import raycast
 from coursekit.simulation.raycast import is_lit, nearest_hit, texture_factor
 from coursekit.simulation.scenes import TEXTURES, Scene, box_table, check_scene, rays
 
-Image = NDArray[np.float32]  # (H, W)
+FloatImage = NDArray[np.float32]  # (H, W)
 
 # --- light, compiled by numba ---
 
@@ -50,23 +50,13 @@ RAYS_PER_SIDE = 2  # 2x2 rays a pixel: 1x1 distorts edges, 3x3 changes nothing t
 
 @njit(cache=True, error_model="numpy", parallel=True)
 def render_eye(
-    boxes: Any,
-    skins: Any,
-    eye: Any,
-    turn: Any,
-    lens: Any,
-    projector: Any,
-    dots: Any,
-    pattern: Any,
-    grain: Any,
-    laser: Any,
-    ambient: Any,
+    boxes: Any, skins: Any, eye: Any, turn: Any, lens: Any, lamp: Any, laser: Any, ambient: Any
 ) -> None:
     """Write the light that reaches each pixel, the mean of 2x2 rays.
 
     boxes (N, 15) and skins (N, 4): see the module. eye (3,): m. turn (3, 3): the eye's frame to the
-    left eye's. lens (4,): fx, fy, cx, cy in px. projector (4,): its place in m and its power, 1 or
-    0. dots and pattern: see `dot_light`. grain (levels, n, n): see `fine_texture`.
+    left eye's. lens (4,): fx, fy, cx, cy in px. lamp: projector (4,), its place in m and its power,
+    1 or 0; dots and pattern, see `dot_light`; grain (levels, n, n), see `fine_texture`.
     laser, ambient (H, W) float32: 1 is a dot's peak on white at 1 m, and white in a unit of room
     light.
     """
@@ -79,9 +69,7 @@ def render_eye(
                 dx = turn[0, 0] * x + turn[0, 1] * y + turn[0, 2]
                 dy = turn[1, 0] * x + turn[1, 1] * y + turn[1, 2]
                 dz = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2]
-                one, other = _shade(
-                    boxes, skins, eye, dx, dy, dz, 1.0 / lens[0], projector, dots, pattern, grain
-                )
+                one, other = _shade(boxes, skins, eye, dx, dy, dz, 1.0 / lens[0], lamp)
                 from_laser += one
                 from_room += other
             laser[v, u] = from_laser / (RAYS_PER_SIDE * RAYS_PER_SIDE)
@@ -90,23 +78,14 @@ def render_eye(
 
 @njit(cache=True, error_model="numpy")
 def _shade(
-    boxes: Any,
-    skins: Any,
-    eye: Any,
-    dx: float,
-    dy: float,
-    dz: float,
-    pixel: float,
-    projector: Any,
-    dots: Any,
-    pattern: Any,
-    grain: Any,
+    boxes: Any, skins: Any, eye: Any, dx: float, dy: float, dz: float, pixel: float, lamp: Any
 ) -> tuple[float, float]:
     """(laser light, room light) from what the ray eye + t (dx, dy, dz) hits; (0, 0) for nothing.
 
     Diffuse light follows Lambert's law; the specular share is a normalised Phong lobe about the
     mirror direction (Phong, CACM 1975; (n + 2) / 2 keeps its energy), and mirrors an even room.
     """
+    projector, dots, pattern, grain = lamp
     t, index, face, p, q = nearest_hit(boxes, eye[0], eye[1], eye[2], dx, dy, dz)
     if index < 0:
         return 0.0, 0.0
@@ -254,12 +233,14 @@ def match_bands(
 
 @njit(cache=True)
 def _add_row(column: Any, a: Any, b: Any) -> None:
+    """Add |a - b| of a new row to the sums down the columns."""
     for x in range(column.size):
         column[x] = np.uint16(column[x] + (max(a[x], b[x]) - min(a[x], b[x])))
 
 
 @njit(cache=True)
 def _move_row(column: Any, a: Any, b: Any, old_a: Any, old_b: Any) -> None:
+    """Add |a - b| of the row that comes in and take away that of the row that goes out."""
     for x in range(column.size):
         column[x] = np.uint16(
             column[x]
@@ -281,6 +262,7 @@ def _sum_windows(column: Any, two: Any, four: Any, cost: Any) -> None:
 
 @njit(cache=True)
 def _keep_least(cost: Any, d: int, least: Any, at: Any) -> None:
+    """Keep the least cost of each pixel so far, and at which disparity it is."""
     code = np.uint16(d)
     for x in range(cost.size):
         better = np.uint16(0) - np.uint16(cost[x] < least[x])  # all bits or none
@@ -339,7 +321,7 @@ def match(
     uniqueness: int = 12,
     texture: float = 12.0,
     left_right: int = 1,
-) -> Image:
+) -> FloatImage:
     """The disparity in px of every pixel of the left image, 0 where there is none.
 
     left, right (H, W) uint8: rectified, row v of one is row v of the other. A pixel at u in the
@@ -370,6 +352,10 @@ def cost_curve(left: ArrayLike, right: ArrayLike, u: int, v: int) -> Floats:
     left, right (H, W) uint8 as for `match`; the cost is the sum of absolute differences of the
     high-pass images over 11x11 px, NaN for a disparity whose window leaves the right image.
     Raises ValueError as `match` does and for a window that leaves the left image.
+
+    >>> scene = np.random.default_rng(0).integers(0, 256, (40, 80)).astype(np.uint8)
+    >>> int(np.nanargmin(cost_curve(scene[:, :60], scene[:, 7:67], 40, 20)))
+    7
     """
     left, right = _pair(left, right)
     height, width = left.shape
@@ -504,7 +490,7 @@ class StereoFrame:
 
     left: Grey
     right: Grey
-    disparity: Image
+    disparity: FloatImage
 
 
 class RigView:
@@ -515,15 +501,8 @@ class RigView:
 
     def __init__(self, rig: Rig, scene: Scene) -> None:
         self.rig, self.scene = rig, scene
-        eyes = _light(
-            scene,
-            rig.left,
-            rig.baseline_m,
-            rig.baseline_error,
-            rig.disparity_offset_px,
-            rig.projector,
-            rig.seed,
-        )
+        where = (rig.left, rig.baseline_m, rig.baseline_error, rig.disparity_offset_px)
+        eyes = _light(scene, *where, rig.projector, rig.seed)
         radiance = [laser + np.float32(rig.ambient * AMBIENT_UNIT) * room for laser, room in eyes]
         self.exposure_ms = _metered(radiance[0]) if rig.exposure == "auto" else rig.exposure
         grey = [np.float32(GREY_PER_MS * self.exposure_ms) * image for image in radiance]
@@ -574,7 +553,7 @@ class RigView:
 
 
 def counts(
-    disparity: Image, fx: float, baseline_m: float, depth_scale_m: float
+    disparity: FloatImage, fx: float, baseline_m: float, depth_scale_m: float
 ) -> NDArray[np.uint16]:
     """Depth fx baseline / disparity (H, W), rounded to counts of depth_scale_m; 0 is invalid."""
     positive("depth_scale_m", depth_scale_m, "a positive number of metres")
@@ -594,7 +573,7 @@ def _light(
     offset_px: float,
     projector: bool,
     seed: int,
-) -> list[tuple[Image, Image]]:
+) -> list[tuple[FloatImage, FloatImage]]:
     """(laser, room) light (H, W) on each eye, of unit brightness, blurred by the lens."""
     boxes = box_table(scene, None)
     skins = np.empty((len(scene), 4))
@@ -603,7 +582,7 @@ def _light(
         skin[3] = TEXTURES.index(box.texture)
     place = np.array([PROJECTOR_AT * baseline_m, 0.0, 0.0, float(projector)])
     lens = np.array([left.fx, left.fy, left.cx, left.cy])
-    dots, pattern = _pattern(left.fx)
+    lamp = (place, *_pattern(left.fx), _grain())
     yaw = math.atan(offset_px / left.fx)
     c, s = math.cos(yaw), math.sin(yaw)
     turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
@@ -612,14 +591,13 @@ def _light(
     eyes = []
     for eye, facing in ((0.0, np.eye(3)), (baseline_m * (1 + baseline_error), turn)):
         laser, room = (np.empty(left.size[::-1], np.float32) for _ in range(2))
-        at = np.array([eye, 0.0, 0.0])
-        render_eye(boxes, skins, at, facing, lens, place, dots, pattern, _grain(), laser, room)
+        render_eye(boxes, skins, np.array([eye, 0.0, 0.0]), facing, lens, lamp, laser, room)
         laser *= 1 + np.float32(SPECKLE) * _speckle(rng, laser.shape)
         eyes.append((_blurred(laser, LENS_SIGMA_PX), _blurred(room, LENS_SIGMA_PX)))
     return eyes
 
 
-def _metered(radiance: Image) -> float:
+def _metered(radiance: FloatImage) -> float:
     """The exposure in ms that makes the dots in the middle bright and hardly saturated."""
     part, percentile = METERED
     rows, columns = (
@@ -629,7 +607,7 @@ def _metered(radiance: Image) -> float:
     return min(LONGEST_MS, BRIGHT_GREY / (GREY_PER_MS * bright)) if bright > 0 else LONGEST_MS
 
 
-def _yaw_slope(image: Image, left: Intrinsics) -> Image:
+def _yaw_slope(image: FloatImage, left: Intrinsics) -> FloatImage:
     """The change of an eye's image (H, W) per pixel of disparity offset that a yaw makes."""
     kernel = np.array([[1, -8, 0, 8, -1]], np.float32) / 12
     along = cv2.filter2D(image, -1, kernel, borderType=cv2.BORDER_REPLICATE)
@@ -658,7 +636,7 @@ def _pattern(fx: float) -> tuple[Floats, Floats]:
 
 
 @lru_cache(maxsize=1)
-def _grain(size: int = 512, levels: int = 6) -> Image:
+def _grain(size: int = 512, levels: int = 6) -> FloatImage:
     """A tile of 1/f texture of unit std (levels, size, size), each level blurred twice as far."""
     rng = np.random.default_rng(3)
     frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(size), np.fft.rfftfreq(size), indexing="ij"))
@@ -671,17 +649,19 @@ def _grain(size: int = 512, levels: int = 6) -> Image:
     return (np.stack(tiles) / tiles[0].std()).astype(np.float32)
 
 
-def _speckle(rng: np.random.Generator, shape: tuple[int, ...]) -> Image:
+def _speckle(rng: np.random.Generator, shape: tuple[int, ...]) -> FloatImage:
+    """Noise (H, W) of unit std whose grains are as wide as the laser's speckle."""
     noise = _blurred(rng.standard_normal(shape, np.float32), SPECKLE_SIGMA_PX)
     return noise / noise.std()
 
 
-def _blurred(image: Image, sigma_px: float) -> Image:
+def _blurred(image: FloatImage, sigma_px: float) -> FloatImage:
+    """An image (H, W) blurred by a Gaussian of this standard deviation."""
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px), np.float32)
 
 
 @lru_cache(maxsize=1)
-def _noise_table() -> Image:
+def _noise_table() -> FloatImage:
     """Normal numbers to be read from a random place for each row: twenty times faster than new
     ones, and two frames share a row's numbers once in a million."""
     return np.random.default_rng(4).standard_normal(NOISE_TABLE, np.float32)

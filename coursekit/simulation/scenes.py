@@ -81,6 +81,9 @@ def tabletop(distance_m: float = 0.45, wall_behind_m: float = 0.50, tilt_deg: fl
     wall, m, at least 0.10. tilt_deg: turns the wall as in `wall_scene`. Returns the four boxes, in
     this order: "wall", "table", "60 mm block", "25 mm cube". Raises ValueError for a distance that
     is not positive.
+
+    >>> [box.name for box in tabletop(0.45)]
+    ['wall', 'table', '60 mm block', '25 mm cube']
     """
     distance = positive("distance_m", distance_m, METRES)
     behind = number("wall_behind_m", wall_behind_m, "at least 0.10 m, behind the cube", least=0.10)

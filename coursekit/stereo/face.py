@@ -8,13 +8,13 @@ pixels on that plane, row by row, give its two upright edges to sub-pixel.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from coursekit.arrays import AnyArray, Bools, Floats, Interval, Window
-from coursekit.checks import instance, positive
+from coursekit.checks import instance, positive, want
 from coursekit.geometry import Intrinsics, deproject
 from coursekit.stereo.law import rounded_variance, unrounded_std
 from coursekit.stereo.windows import (
@@ -51,13 +51,11 @@ class BlockFace:
     the face's normal and the optical axis. edges_px: u of the left and right edge on the middle
     row. width_m: between the edges, as measured, in the face's plane; width_error_m: its standard
     error from the edges' jitter from row to row, the pixel grid and the depth.
-    widths_m, depths_m (N,): width, with its edges found anew, and depth of each frame; width_std_m:
-    std of the first. width_held_std_m: std of the width when the edges are held and only the
-    plane's depth changes. edge_jitter_px: std of an edge from row to row. fattening_px: what
-    each edge is pushed outwards if the depth is right, against the known width, and standard error.
-    flying_fraction: of the valid pixels within 8 px of the edges, those on neither the face nor
-    what is behind it.
-    window: on the face. stats: what `window_stats` says there.
+    widths_m (N,): the width in each frame, with its edges found anew; width_std_m: std of that.
+    width_held_std_m: std of the width when the edges are held and only the plane's depth changes.
+    fattening_px: what each edge is pushed outwards if the depth is right, against the known width,
+    and standard error. flying_fraction: of the valid pixels within 8 px of the edges, those on
+    neither the face nor what is behind it. window: on the face. stats: of `window_stats` there.
     """
 
     depth_m: float
@@ -68,14 +66,12 @@ class BlockFace:
     width_error_m: float
     width_std_m: float
     width_held_std_m: float
-    edge_jitter_px: float
     fattening_px: float
     fattening_error_px: float
     flying_fraction: float
     window: Window
     stats: WindowStats
-    widths_m: Floats = field(default_factory=lambda: np.empty(0))
-    depths_m: Floats = field(default_factory=lambda: np.empty(0))
+    widths_m: Floats
 
     @property
     def depth_std_mm(self) -> float:
@@ -173,22 +169,20 @@ def block_face(
     stack, step = depth_stack(depth, depth_scale_m)
     intrinsics = intrinsics or getattr(first_frame(depth), "depth_intrinsics", None)
     camera = instance("intrinsics", intrinsics, Intrinsics)
-    if stack.shape[1:] != (camera.height, camera.width):
-        raise ValueError(f"depth: got images {stack.shape[1:]}, want the intrinsics' size")
+    size = (camera.height, camera.width)
+    want(stack.shape[1:] == size, "depth", stack.shape[1:], f"images of {size} as the intrinsics")
     if width_m is not None:
         width_m = positive("width_m", width_m)
     patch = _find_face(stack, step, camera, width_m, near)
     planes = _frame_planes(patch)
     edges = _edges(patch)
-    line, jitter, edge_error = _edge_lines(edges)
+    line, edge_error = _edge_lines(edges)
     window = _face_window(patch)
     stats = window_stats(stack, window, step)
     width, level, tilt = patch.measure(line, patch.plane)
-    held = np.array([patch.measure(line, plane)[0] for plane in planes])
-    found = [
-        patch.measure(_edge_lines(edges[:, i : i + 1])[0], plane) for i, plane in enumerate(planes)
-    ]
-    widths, depths = (np.array([value[k] for value in found]) for k in (0, 1))
+    held = [patch.measure(line, plane)[0] for plane in planes]
+    anew = (_edge_lines(edges[:, i : i + 1])[0] for i in range(len(planes)))
+    widths = [patch.measure(lines, plane)[0] for lines, plane in zip(anew, planes, strict=True)]
     per_pixel = width / float(line[1, 0] - line[0, 0])
     left, right = (line[:, 0] + patch.left).tolist()
     return BlockFace(
@@ -200,19 +194,17 @@ def block_face(
         width_error_m=math.hypot(per_pixel * edge_error, width / level * stats.depth_error_m),
         width_std_m=_std(widths),
         width_held_std_m=_std(held),
-        edge_jitter_px=jitter,
         fattening_px=math.nan if width_m is None else (width - width_m) / per_pixel / 2,
         fattening_error_px=math.nan if width_m is None else edge_error / 2,
         flying_fraction=_flying(patch, edges),
         window=window,
         stats=stats,
-        widths_m=widths,
-        depths_m=depths,
+        widths_m=np.array(widths),
     )
 
 
-def _std(values: Floats) -> float:
-    known = values[np.isfinite(values)]
+def _std(values: list[float]) -> float:
+    known = np.array(values)[np.isfinite(values)]
     return float(known.std(ddof=1)) if known.size > 1 else math.nan
 
 
@@ -233,9 +225,7 @@ def _find_face(
     seen = cut(few, around, step)
     seen = seen[np.isfinite(seen)]
     if seen.size == 0:
-        raise ValueError(
-            f"depth: no valid pixel near ({u:.0f}, {v:.0f}), so no face is found there"
-        )
+        raise ValueError(f"depth: no valid pixel near ({u:.0f}, {v:.0f}), so no face there")
     size = width_m or USUAL_WIDTH_M
     z0 = float(np.percentile(seen, 25))  # the block, even where it fills only part of the window
     z0 = float(np.median(seen[np.abs(seen - z0) < NEAR_FACE * size]))
@@ -248,8 +238,7 @@ def _find_face(
         near_mask, round(v) - top, round(u) - left, intrinsics.fx * size / z0, width_m is not None
     )
     plane, tolerance = _face_plane(image, rows, columns, step)
-    z = cut(stack, window, step)
-    return _Patch(intrinsics, z, left, top, rows, columns, plane, tolerance)
+    return _Patch(intrinsics, cut(stack, window, step), left, top, rows, columns, plane, tolerance)
 
 
 def _rows_and_columns(
@@ -273,10 +262,8 @@ def _rows_and_columns(
     bridged = ndimage.binary_closing(np.pad(fits, EDGE_BAND_PX), np.ones(EDGE_BAND_PX))
     start, stop = _run(bridged[EDGE_BAND_PX:-EDGE_BAND_PX], row)
     if stop - start < 8:
-        raise ValueError(
-            f"depth: no block's face there: wanted rows about {expected_px:.0f} px wide, found "
-            f"{typical:.0f} px"
-        )
+        wanted = f"want rows about {expected_px:.0f} px wide, found {typical:.0f} px"
+        raise ValueError(f"depth: no block's face there: {wanted}")
     inset = max(2, round(0.12 * (stop - start)))
     rows = slice(start + inset, stop - inset)
     sure = ends[rows][fits[rows]]
@@ -328,13 +315,12 @@ def _frame_planes(patch: _Patch) -> Floats:
     v, u = np.nonzero(inner)
     design = plane_design(u, v, inner.shape)
     base = 1 / (design @ patch.plane)
-    planes = []
-    for values in patch.z[:, inner]:
+    planes = np.tile(patch.plane, (len(patch.z), 1))
+    for plane, values in zip(planes, patch.z[:, inner], strict=True):
         use = np.abs(values - base) < 2 * patch.tolerance
-        enough = use.sum() >= 12
-        fitted = np.linalg.lstsq(design[use], 1 / values[use], rcond=None)[0] if enough else None
-        planes.append(patch.plane if fitted is None else fitted)
-    return np.array(planes)
+        if use.sum() >= 12:
+            plane[:] = np.linalg.lstsq(design[use], 1 / values[use], rcond=None)[0]
+    return planes
 
 
 def _edges(patch: _Patch) -> Floats:
@@ -362,25 +348,21 @@ def _reach(on_face: Bools) -> Floats:
     return last
 
 
-def _edge_lines(edges: Floats) -> tuple[Floats, float, float]:
-    """Lines through edges (2, N, rows): (u at the middle row, du/dv) each (2, 2); the rows' jitter
-    about them, px; and the standard error of the distance between the two, px."""
-    left, right = (_edge_line(side) for side in edges)
-    return (
-        np.array([left[:2], right[:2]]),
-        (left[2] + right[2]) / 2,
-        math.hypot(left[3], right[3]),
-    )
+def _edge_lines(edges: Floats) -> tuple[Floats, float]:
+    """Lines through edges (2, N, rows): (u at the middle row, du/dv) each (2, 2); and the standard
+    error of the distance between the two, px."""
+    (*left, left_error), (*right, right_error) = map(_edge_line, edges)
+    return np.array([left, right]), math.hypot(left_error, right_error)
 
 
-def _edge_line(edges: Floats) -> tuple[float, float, float, float]:
-    """u at the middle row, du/dv, jitter (px) and standard error (px) of one edge (N, rows)."""
+def _edge_line(edges: Floats) -> tuple[float, float, float]:
+    """u at the middle row, du/dv and standard error (px) of one edge (N, rows)."""
     off_median = np.abs(edges - np.nanmedian(edges))
     good = np.where(off_median <= 2 * HALF_WINDOW_PX, edges, np.nan)  # no matching pushes farther
     mean = valid_mean(good, axis=0)
     known = np.isfinite(mean)
     if known.sum() < 3:
-        return (math.nan,) * 4
+        return (math.nan,) * 3
     v = np.flatnonzero(known) - (len(mean) - 1) / 2
     slope, at = np.polyfit(v, mean[known], 1)
     off = mean[known] - at - slope * v
@@ -390,7 +372,7 @@ def _edge_line(edges: Floats) -> tuple[float, float, float, float]:
     grid = dither**2 + 1 / 12 - float(rounded_variance(dither, 1.0))
     patches = min(effective_frames(off[:, None])[0], len(off) / CORRELATION_PX)
     error = math.sqrt(max(grid, 0.0) + float(np.var(off)) / max(patches, 1.0))
-    return float(at), float(slope), jitter, error
+    return float(at), float(slope), error
 
 
 # --- a window on it, and flying pixels beside it ---
@@ -398,13 +380,10 @@ def _edge_line(edges: Floats) -> tuple[float, float, float, float]:
 
 def _face_window(patch: _Patch) -> Window:
     """A square window in the middle of the face, FACE_WINDOW_PX wide where there is room."""
-    margin = EDGE_BAND_PX // 2
-    room = min(
-        patch.columns.stop - patch.columns.start - 2 * margin, patch.rows.stop - patch.rows.start
-    )
+    rows, columns = patch.rows, patch.columns
+    room = min(columns.stop - columns.start - EDGE_BAND_PX, rows.stop - rows.start)
     size = max(min(FACE_WINDOW_PX, room), 1)
-    u = (patch.columns.start + patch.columns.stop - size) // 2
-    v = (patch.rows.start + patch.rows.stop - size) // 2
+    u, v = ((side.start + side.stop - size) // 2 for side in (columns, rows))
     return patch.left + u, patch.top + v, size, size
 
 

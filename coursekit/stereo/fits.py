@@ -233,13 +233,8 @@ def _noise_points(
     nu = np.broadcast_to(array("dof", dof, z.shape if np.ndim(dof) else ()), z.shape)
     use = s > 0
     want(not ((s < 0) | np.isinf(s)).any(), "stds_m", s, "standard deviations in m")
-    want(
-        use.any(),
-        "stds_m",
-        s,
-        "at least one above 0; a pixel that never changes is rounded away (choose a smaller depth "
-        "unit), and one frame has no std",
-    )
+    wanted = "one above 0, which takes two frames and a depth unit that does not hide the noise"
+    want(use.any(), "stds_m", s, wanted)
     want((nu[use] > 0).all(), "dof", nu, "a positive number for each distance")
     notes = [
         f"{d:g} m is left out: " + ("no pixel ever changed there" if v == 0 else "it has no std")
@@ -444,8 +439,7 @@ def _measured(
     measured = array(name, values, z.shape)
     want((np.isfinite(measured) & (measured > 0)).all(), name, measured, "positive lengths in m")
     other = name.replace("s_m", "_errors_m")
-    if errors is None:
-        raise ValueError(f"{other}: got None, want a positive error for each distance")
+    errors = math.nan if errors is None else errors
     error = array(other, errors, z.shape if np.ndim(errors) else ())
     want((np.isfinite(error) & (error > 0)).all(), other, error, "positive errors in m")
     return measured, np.broadcast_to(error, z.shape)

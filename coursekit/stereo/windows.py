@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from coursekit.words import counted, wrapped
 CORRELATION_PX = 12  # disparities farther apart than the matching window (11 px) are independent
 JUMP_SIGMAS = 8.0  # a sample this far from the rest is a mismatch, not noise
 CHI2_95 = 3.84  # 95 % of chi-squared with one degree of freedom lies below
-SLACK = 0.05  # of 2 log likelihood: a drift that explains no more than this is not assumed
+DRIFT_SLACK = 0.05  # of 2 log likelihood: a drift that explains no more than this is not assumed
 
 
 # --- stacks and windows of them ---
@@ -44,11 +44,9 @@ def depth_stack(depth: Any, depth_scale_m: float | None) -> tuple[AnyArray, floa
     stack = stack[None] if stack.ndim == 2 else stack
     want(stack.ndim == 3, "depth", stack.shape, "(N, H, W)")
     want(stack.dtype.kind in "uf", "depth", stack.dtype, "unsigned counts or floats in m")
-    if depth_scale_m is not None:
-        depth_scale_m = positive("depth_scale_m", depth_scale_m)
-    counts = stack.dtype.kind == "u"
-    want(depth_scale_m or not counts, "depth_scale_m", None, "the metres of a count")
-    return stack, depth_scale_m
+    if depth_scale_m is None and stack.dtype.kind == "f":
+        return stack, None
+    return stack, positive("depth_scale_m", depth_scale_m, "the metres of a count")
 
 
 def cut(stack: AnyArray, window: Window, step: float | None) -> Floats:
@@ -75,8 +73,7 @@ def clip_window(window: Window, stack: AnyArray) -> Window:
     left, top = max(window[0], 0), max(window[1], 0)
     right = min(window[0] + window[2], stack.shape[2])
     bottom = min(window[1] + window[3], stack.shape[1])
-    if right <= left or bottom <= top:
-        raise ValueError(f"near: a window {window} around it is off the image")
+    want(right > left and bottom > top, "near", window, "a window around it that is on the image")
     return left, top, right - left, bottom - top
 
 
@@ -121,7 +118,11 @@ class WindowStats:
     @property
     def pixel_std_interval_m(self) -> Interval:
         """95 % interval of `pixel_std_m`: dof s^2 / sigma^2 is chi-squared with pixel_dof."""
-        return std_interval(self.pixel_std_m, self.pixel_dof)
+        from scipy.stats import chi2
+
+        ends = chi2.ppf([0.975, 0.025], self.pixel_dof) / self.pixel_dof
+        low, high = self.pixel_std_m / np.sqrt(ends)
+        return float(low), float(high)
 
     @property
     def rounding(self) -> str:
@@ -177,18 +178,19 @@ def window_stats(depth: Any, window: Window, depth_scale_m: float | None = None)
     valid = np.isfinite(z)
     n, height, width = z.shape
     z, jumps = _without_jumps(z, step)
-    counts = np.isfinite(z).sum(axis=0)
     mean = valid_mean(z, axis=0)
-    deviation = (z - mean)[:, counts > 1]
+    deviation = (z - mean)[:, np.isfinite(z).sum(axis=0) > 1]
     pixel_std, pixel_dof, drift = _temporal(deviation.reshape(n, -1))
     mean_std, mean_dof = series_std(drift)
+    moves = n > 1 and deviation.size
+    frozen = (np.nanmax(np.abs(deviation), axis=0) < 1e-12).mean() if moves else math.nan
     residual, level = about_plane(mean)
     return WindowStats(
         n_frames=n,
         n_pixels=height * width,
         invalid_fraction=1 - float(valid.mean()),
         jump_fraction=jumps / max(int(valid.sum()), 1),
-        frozen_fraction=_frozen(deviation),
+        frozen_fraction=float(frozen),
         depth_m=level,
         depth_error_m=math.hypot(
             0.0 if n == 1 else mean_std / math.sqrt(effective_frames(drift[:, None])[0]),
@@ -252,13 +254,6 @@ def _temporal(deviation: Floats) -> tuple[float, float, Floats]:
     return math.sqrt(variance), variance**2 / shares, drift
 
 
-def _frozen(deviation: Floats) -> float:
-    """The fraction of pixels (N, P) that have more than one value and never change."""
-    if deviation.shape[0] < 2 or deviation.size == 0:
-        return math.nan
-    return float((np.nanmax(np.abs(deviation), axis=0) < 1e-12).mean())
-
-
 def _spatial_std(z: Floats) -> float:
     """RMS of a stack (N, h, w) about each frame's own plane in 1/Z; see `about_plane`.
 
@@ -274,8 +269,8 @@ def _spatial_std(z: Floats) -> float:
     sure &= known.sum(axis=1) > 3
     right = np.where(known, 1 / np.where(known, flat, 1.0), 0.0) @ design
     plane = np.linalg.solve(normal[sure], right[sure, :, None])[..., 0]
-    rest = [about_plane(frame)[0] for frame in z[~sure]]
-    return rms([flat[sure] - 1 / (plane @ design.T), *rest])
+    others = (about_plane(frame)[0] for frame in z[~sure])
+    return rms([flat[sure] - 1 / (plane @ design.T), *others])
 
 
 def _patch_error(residual: Floats) -> float:
@@ -283,8 +278,7 @@ def _patch_error(residual: Floats) -> float:
     known = residual[np.isfinite(residual)]
     if known.size < 4:
         return math.nan
-    patches = known.size / CORRELATION_PX**2
-    return float(known.std()) / math.sqrt(max(patches, 1.0))
+    return float(known.std()) / math.sqrt(max(known.size / CORRELATION_PX**2, 1.0))
 
 
 # --- how many samples are independent ---
@@ -361,8 +355,8 @@ def effective_frames(series: Floats) -> tuple[float, Interval]:
     maximum likelihood: Whittle, Estimation and information in stationary time series, Arkiv för
     Matematik 2 (1953), 423-434. The frequencies k / N, k > 0, do not see the mean. The number is
     var(one) / var(mean of N) of the fitted model; the interval holds what the profile likelihood
-    does not reject at 5 % (2 log ratio below CHI2_95). Of the models within SLACK of the best the
-    largest number is taken, or most white series would be given a drift.
+    does not reject at 5 % (2 log ratio below CHI2_95). Of the models within DRIFT_SLACK of the best
+    the largest number is taken, or most white series would be given a drift.
     Assumes a stationary, Gaussian series and tau from 1 to N frames: a slower drift is not seen,
     frames that correlate negatively count as independent. The periodograms of P pixels are
     averaged and count as one series, since pixels share the drift. Weak drifts leave the interval
@@ -373,35 +367,26 @@ def effective_frames(series: Floats) -> tuple[float, Interval]:
     power = np.square(np.abs(np.fft.rfft(series, axis=0)[1:])).mean(axis=1)
     if n < 5 or not power.sum() > 0:
         return float(n), (1.0, float(n))
-    models = _drift_models(n)
-    binned = np.add.reduceat(models.weights * power / power.mean(), models.starts)
-    deviance = models.log_spectra + 2 * models.weights.sum() * np.log(models.inverse @ binned)
+    effective, inverse, log_spectra, weights, starts = _drift_models(n)
+    binned = np.add.reduceat(weights * power / power.mean(), starts)
+    deviance = log_spectra + 2 * weights.sum() * np.log(inverse @ binned)
     profile = deviance.min(axis=0)
-    best = int(np.argmax(profile <= profile.min() + SLACK))
+    best = int(np.argmax(profile <= profile.min() + DRIFT_SLACK))
     inside = np.flatnonzero(profile < profile.min() + CHI2_95)
     last = len(profile) - 1  # the interval's ends lie between two numbers: take the outer ones
-    low, high = models.effective[[min(inside[-1] + 1, last), max(inside[0] - 1, 0)]]
-    return float(models.effective[best]), (float(low), float(high))
-
-
-class _DriftModels(NamedTuple):
-    """Models of `effective_frames` for N frames: T correlation times, E numbers of frames.
-
-    effective (E,): from N down. inverse (T, E, B): 1 / spectrum, of unit variance, in B bins of
-    frequencies; the variance has a closed form. log_spectra (T, E): twice the sum of its log, inf
-    where no share of the drift gives this number. weights (K,): of the ordinates; starts (B,):
-    their bins.
-    """
-
-    effective: Floats
-    inverse: Floats
-    log_spectra: Floats
-    weights: Floats
-    starts: Integers
+    low, high = effective[[min(inside[-1] + 1, last), max(inside[0] - 1, 0)]]
+    return float(effective[best]), (float(low), float(high))
 
 
 @lru_cache(maxsize=8)
-def _drift_models(n: int) -> _DriftModels:
+def _drift_models(n: int) -> tuple[Floats, Floats, Floats, Floats, Integers]:
+    """Models of `effective_frames` for N frames: T correlation times, E numbers of frames.
+
+    Returns effective (E,): from N down. inverse (T, E, B): 1 / spectrum, of unit variance, in B
+    bins of frequencies; the variance has a closed form. log_spectra (T, E): twice the sum of its
+    log, inf where no share of the drift gives this number. weights (K,): of the ordinates; starts
+    (B,): their bins.
+    """
     k = np.arange(1, n // 2 + 1)
     weights = np.where(2 * k == n, 0.5, 1.0)  # the highest ordinate has one square, not two
     starts = np.unique(np.geomspace(1, len(k) + 1, 1024).astype(np.int64))[:-1] - 1
@@ -417,7 +402,7 @@ def _drift_models(n: int) -> _DriftModels:
         spectrum = 1 + np.minimum(share, 1.0)[:, None] * (drift - 1)
         inverse.append(1 / spectrum)
         log_spectra.append(np.where(share <= 1, 2 * np.log(spectrum) @ sizes, np.inf))
-    return _DriftModels(effective, np.array(inverse), np.array(log_spectra), weights, starts)
+    return effective, np.array(inverse), np.array(log_spectra), weights, starts
 
 
 # --- averaging ---
@@ -474,9 +459,9 @@ def averaging_curve(series_m: ArrayLike) -> AveragingCurve:
         their mean is 8.0 times quieter than one frame (8.0 if they were independent)
     """
     values = array("series_m", series_m, leading=True)
-    n = len(values) if values.ndim else 0
-    if values.ndim not in (1, 3) or n < 8:
-        raise ValueError(f"series_m: got shape {values.shape}, want (N,) or (N, h, w) with N >= 8")
+    long = values.ndim in (1, 3) and len(values) >= 8
+    want(long, "series_m", values.shape, "(N,) or (N, h, w) with N >= 8")
+    n = len(values)
     if values.ndim == 3:
         values = np.where(values > 0, values, np.nan)
     pixels = values.reshape(n, -1)
@@ -568,12 +553,3 @@ def plane_image(plane: Any, shape: tuple[int, ...]) -> Floats:
 
 def std_error(std: float, dof: float) -> float:
     return std / math.sqrt(2 * dof) if dof > 0 else math.nan
-
-
-def std_interval(std: float, dof: float) -> Interval:
-    from scipy import stats
-
-    if not dof > 0:
-        return math.nan, math.nan
-    high, low = stats.chi2.ppf([0.025, 0.975], dof)
-    return std * math.sqrt(dof / low), std * math.sqrt(dof / high)

@@ -37,6 +37,7 @@ from pebble import ProcessExpired, ProcessPool
 from tqdm.auto import tqdm
 
 from coursekit import results
+from coursekit.checks import positive, want
 from coursekit.submission.format import slug
 from coursekit.submission.recompute import grading_rules
 from coursekit.submission.report import (
@@ -91,6 +92,7 @@ class Bundle:
 
     @property
     def page(self) -> str:
+        """Where the page of its student stands in the report."""
         plain = unicodedata.normalize("NFKD", self.path.stem).encode("ascii", "ignore").decode()
         return f"{STUDENTS}/{slug(plain)}_{self.key[:12]}.html"
 
@@ -113,13 +115,12 @@ class Summary:
 
     def __str__(self) -> str:
         n = self.graded + self.refused + self.failed
-        parts = [f"{self.graded} graded"]
-        if self.refused:
-            parts.append(f"{self.refused} refused")
-        if self.failed:
-            parts.append(f"{self.failed} not graded (time, memory or a crash)")
-        if self.flagged:
-            parts.append(f"{self.flagged} flagged")
+        others = {
+            "refused": self.refused,
+            "not graded (time, memory or a crash)": self.failed,
+            "flagged": self.flagged,
+        }
+        parts = [f"{self.graded} graded", *(f"{k} {what}" for what, k in others.items() if k)]
         lines = [f"{counted(n, 'bundle')} in {self.seconds:.0f} s: {', '.join(parts)}."]
         if self.kept:
             lines.append(f"{self.kept} of them had been graded before and have not changed.")
@@ -158,8 +159,7 @@ def grade_folder(
         free = getattr(os, "sched_getaffinity", None)  # what this process may use
         workers = len(free(0)) if free else os.cpu_count() or 1
     for name, value in (("workers", workers), ("timeout_s", timeout_s), ("memory", memory_bytes)):
-        if not value > 0:
-            raise ValueError(f"{name}: got {value!r}, want more than 0")
+        positive(name, value)
     _check_out(out, overwrite)
     paths, left_out = find_bundles(folder, out)
     for part in (out / STUDENTS, out / ROWS):
@@ -237,8 +237,7 @@ def find_bundles(folder: Path, out: Path) -> tuple[list[Path], tuple[str, ...]]:
     """
     if not folder.is_dir():
         raise ValueError(f"{folder}: there is no such folder; want the one with the bundles in it")
-    if out.resolve() == folder.resolve():
-        raise ValueError(f"out: got {out}, the folder of the bundles; want another one")
+    want(out.resolve() != folder.resolve(), "out", str(out), "another folder than that of bundles")
     found: list[Path] = []
     others: list[Path] = []
     for parent, folders, names in os.walk(folder):
@@ -262,6 +261,7 @@ def find_bundles(folder: Path, out: Path) -> tuple[list[Path], tuple[str, ...]]:
 
 
 def _bundles(folder: Path, paths: Iterable[Path]) -> Iterator[Bundle]:
+    """The files with a name each that can be written anywhere and is there once."""
     seen: Counter[str] = Counter()
     for path in paths:
         raw = path.relative_to(folder).as_posix()
@@ -346,6 +346,7 @@ def work_through(
 
 
 def _scheduled(pool: ProcessPool, work: Work, bundle: Bundle, limits: Limits) -> Future[Graded]:
+    """A bundle given to the pool; its future is broken where the pool is no more."""
     try:
         arguments = (str(bundle.path), bundle.name, bundle.page)
         return pool.schedule(work, arguments, timeout=limits.timeout_s)
@@ -356,6 +357,7 @@ def _scheduled(pool: ProcessPool, work: Work, bundle: Bundle, limits: Limits) ->
 
 
 def _outcome(future: Future[Graded], bundle: Bundle, limits: Limits) -> Graded:
+    """What became of a bundle. Raises BrokenProcessPool when the pool itself is lost."""
     error = future.exception()  # of a worker: even a SystemExit must not be raised here
     if error is None:
         return future.result()
@@ -374,6 +376,7 @@ def _outcome(future: Future[Graded], bundle: Bundle, limits: Limits) -> Graded:
 
 
 def _failed(bundle: Bundle, reason: str, says: str) -> Graded:
+    """The line of a bundle whose grading failed, and no page."""
     return not_graded(bundle.name, reason, says), ""
 
 
@@ -453,26 +456,13 @@ def _warm_up(memory_bytes: int) -> None:
 
 def limit_memory(more_bytes: int) -> None:
     """Let this process have so much more address space than it has now; where there is a way."""
-    try:
-        import resource
-    except ImportError:  # Windows
-        return
-    resting = _address_space()
-    with contextlib.suppress(OSError, ValueError):
+    with contextlib.suppress(ImportError, OSError, ValueError, AttributeError):
+        import resource  # not on Windows
+
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        if resting is not None:
-            _, hard = resource.getrlimit(resource.RLIMIT_AS)
-            want = resting + more_bytes
-            resource.setrlimit(resource.RLIMIT_AS, (want, hard))
-
-
-def _address_space() -> int | None:
-    """The address space of this process in bytes, None where the system does not say."""
-    try:
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-        return pages * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, ValueError, AttributeError):
-        return None
+        most = pages * os.sysconf("SC_PAGE_SIZE") + more_bytes
+        resource.setrlimit(resource.RLIMIT_AS, (most, resource.getrlimit(resource.RLIMIT_AS)[1]))
 
 
 # ---- the report's folder ------------------------------------------------------------------------
@@ -497,6 +487,7 @@ def _check_out(out: Path, overwrite: bool) -> None:
 
 
 def _is_ours(entry: Path) -> bool:
+    """Whether a report writes such a file or folder, with nothing else in it."""
     if entry.is_symlink():
         return False
     if entry.is_dir():
@@ -561,6 +552,7 @@ def _finish(out: Path, bundles: list[Bundle]) -> list[ReportLine]:
 
 
 def _kind(line: ReportLine) -> str:
+    """What the summary counts a line as: graded, refused or failed."""
     if line.points is not None:
         return "graded"
     return "failed" if line.reason in FAILED else "refused"

@@ -57,6 +57,11 @@ def data_flags(submission: Submission, found: Recomputed, prints: Fingerprint) -
 
 
 def _too_clean(camera: CameraFacts, found: Recomputed, limits: dict[str, float]) -> Iterator[Flag]:
+    """Frames that repeat themselves, and noise that no stereo camera has.
+
+    The noise is compared as a disparity, sigma_d = std fx B / Z^2 in px, without rounding.
+    Where the baseline is not known, that of a D435 stands in.
+    """
     several = [m for m in found.at if m.stats.n_frames > 1]
     for m in several:
         different, n = len({frame.tobytes() for frame in m.stack.counts}), m.stats.n_frames
@@ -90,6 +95,11 @@ def _flat(found: Recomputed, limits: dict[str, float]) -> Iterator[Flag]:
 
 
 def _random_numbers(found: Recomputed, limits: dict[str, float]) -> Iterator[Flag]:
+    """Noise that neighbouring pixels do not share, and a mean without a pattern.
+
+    A stereo camera matches windows, so neighbours share their noise, and its error of a place stays
+    in every frame. Stacks whose noise is rounded away, or of a few frames, are not looked at.
+    """
     pairs = [
         _space(m.stack.counts)
         for m in found.at
@@ -146,6 +156,7 @@ def _space(counts: NDArray[np.uint16]) -> tuple[float, float] | None:
 
 
 def _simulated(submission: Submission) -> Iterator[Flag]:
+    """Data of the course's simulated camera that are declared as another one's."""
     camera, reasons = submission.camera, []
     words = f"{camera.name} {camera.serial}".lower()
     if "simul" in words or "seed-" in words:
@@ -162,11 +173,13 @@ def _simulated(submission: Submission) -> Iterator[Flag]:
 
 @lru_cache(maxsize=1)
 def _simulated_devices() -> tuple[tuple[float, ...], ...]:
+    """Width, height, fx, fy, cx and cy (px) of each camera that the course simulates."""
     lenses = [specifications.device(name).unit.depth for name in specifications.device_names()]
     return tuple((k.width, k.height, k.fx, k.fy, k.cx, k.cy) for k in lenses)
 
 
 def _perfect_clock(times: Floats) -> bool:
+    """Whether times (N,), s, are more even than a clock; not where doubles are too coarse."""
     if len(times) < 8 or np.spacing(np.abs(times).max()) > PERFECT_CLOCK_S / 4:
         return False
     even = times[0] + (times[-1] - times[0]) / (len(times) - 1) * np.arange(len(times))
@@ -174,6 +187,7 @@ def _perfect_clock(times: Floats) -> bool:
 
 
 def _times(submission: Submission, limits: dict[str, float]) -> Iterator[Flag]:
+    """Time stamps that go back, that are too fast, or that cannot be together."""
     reasons = []
     for stack in submission.stacks:
         steps, where = np.diff(stack.times_s), f"at {stack.distance_m:.2f} m they"
@@ -188,6 +202,7 @@ def _times(submission: Submission, limits: dict[str, float]) -> Iterator[Flag]:
 
 
 def _times_together(submission: Submission) -> Iterator[str]:
+    """What is wrong with the clocks of two distances side by side, or with the date."""
     stacks = [stack for stack in submission.stacks if len(stack.times_s) > 1]
     for i, one in enumerate(stacks):
         for two in stacks[:i]:
@@ -290,6 +305,11 @@ def fingerprint(submission: Submission) -> Fingerprint:
 
 
 def _stack_print(stack: Stack) -> StackPrint:
+    """What is remembered of a stack; see `StackPrint`.
+
+    Values far from the typical deviation are clipped twice, so that a few changed ones neither
+    move the mean nor stand out. A window of fewer pixels than the grid has blank prints.
+    """
     counts = stack.counts
     n, height, width = counts.shape
     digest = hashlib.blake2b(
@@ -350,6 +370,7 @@ def _averaging(size: int) -> Floats:
 
 
 def _bytes(values: NDArray[Any]) -> NDArray[np.int8]:
+    """Rows (..., 36) scaled so that the largest value of each is 127; rows of zeros stay."""
     largest = np.abs(values).max(axis=-1, keepdims=True)
     return np.rint(127 * values / np.where(largest > 1e-6, largest, np.inf)).astype(np.int8)
 

@@ -31,7 +31,7 @@ from coursekit import results
 from coursekit.arrays import AnyArray, Floats, Interval, NDArray
 from coursekit.checks import shown
 
-FORMAT = 1
+VERSION = 1
 MAX_FILE = 5 * 2**20  # bytes
 MAX_MEMBERS = 32
 MAX_TOTAL = 6 * 2**20  # bytes, of all members together, unpacked
@@ -238,7 +238,7 @@ def bundle_bytes(submission: Submission) -> bytes:
         members[f"depth_{i}.npy"] = array_bytes(stack.counts)
         members[f"times_{i}.npy"] = array_bytes(stack.times_s)
     manifest = {
-        "format": FORMAT,
+        "format": VERSION,
         "exercise": s.exercise,
         "student": s.student,
         "made": s.made,
@@ -301,7 +301,15 @@ def slug(text: str) -> str:
 
 
 def read_bundle(source: bytes | Path) -> Submission:
-    """The submission in a bundle: the file's bytes, or its path. Raises Refused, nothing else."""
+    """The submission in a bundle: the file's bytes, or its path. Raises Refused, nothing else.
+
+    First the zip is looked at, then the manifest with the sizes and hashes of all members, then
+    each JSON member by the schema, then the arrays, and last how all of it fits together.
+
+    >>> read_bundle(b"my homework")
+    Traceback (most recent call last):
+    coursekit.submission.format.Refused: The file is no zip, or cut off; copy or download it again.
+    """
     members = _unzipped(_bytes_of(source) if isinstance(source, Path) else source)
     manifest = _manifest(members)
     facts, claims, conclusion, outcomes = (_document(members, name) for name in DOCUMENTS)
@@ -420,6 +428,7 @@ def _manifest(members: dict[str, bytes]) -> dict[str, Any]:
 
 
 def _want_names(members: Iterable[str], wanted: Iterable[str], by: str) -> None:
+    """Refused unless these names, and no others, are in the bundle; by: where they are listed."""
     for name in sorted({*wanted} ^ {*members}):
         if name in members:
             raise Refused("unlisted_member", f"{name} is in the bundle, but not in {by}")
@@ -440,8 +449,10 @@ def _document(members: dict[str, bytes], name: str) -> dict[str, Any]:
         document = _with_tuples(json.loads(text, **hooks), MAX_NESTED)
     except (ValueError, RecursionError) as error:  # also an integer of thousands of digits
         raise Refused("not_json", f"{name} cannot be read ({error})") from None
-    if name == MANIFEST and isinstance(document, dict) and document.get("format") != FORMAT:
-        wrong = f"The bundle has format {shown(document.get('format'))}, this grader reads {FORMAT}"
+    if name == MANIFEST and isinstance(document, dict) and document.get("format") != VERSION:
+        wrong = (
+            f"The bundle has format {shown(document.get('format'))}, this grader reads {VERSION}"
+        )
         cure = "update the course where you pack or where you grade, whichever is older"
         raise Refused("other_format", wrong, cure)
     try:
@@ -452,6 +463,7 @@ def _document(members: dict[str, bytes], name: str) -> dict[str, Any]:
 
 
 def _without_doubles(items: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON. Raises ValueError where a key is there twice."""
     found = dict(items)
     if len(found) < len(items):
         raise ValueError("the same key is there twice")
@@ -558,6 +570,7 @@ def _is_line(text: str, besides: str = "") -> bool:
 
 
 def _is_moment(text: str) -> bool:
+    """UTC to the second in exactly the one form, and not before the year 2000."""
     try:
         moment = datetime.fromisoformat(text)
     except ValueError:

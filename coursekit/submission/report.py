@@ -41,20 +41,22 @@ FORMULA = tuple("=+-@\t\r\n＝＋－＠")  # what makes a spreadsheet calculate 
 HERE = Path(__file__).parent
 
 # Of a figure, in units of its view (a phone shows it at three quarters of that), and its margins.
-VIEW = {"W": 480, "H": 320, "LEFT": 52, "RIGHT": 14, "TOP": 14, "BOTTOM": 46}
+PLOT = {"W": 480, "H": 320, "LEFT": 52, "RIGHT": 14, "TOP": 14, "BOTTOM": 46}
 LARGEST_MM = 1e6  # beyond this nothing is drawn
 
 
 @cache
 def _template() -> jinja2.Template:
+    """The template of all pages, read once; everything that it shows is escaped."""
     loader = jinja2.FileSystemLoader(HERE)
     pages = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True)
     pages.filters |= {"points": _points, "counted": counted, "px": "{:.1f}".format}
-    pages.globals |= VIEW | {"style": Markup((HERE / "report.css").read_text(encoding="utf-8"))}
+    pages.globals |= PLOT | {"style": Markup((HERE / "report.css").read_text(encoding="utf-8"))}
     return pages.get_template("report.html.jinja")
 
 
 def _page(**values: Any) -> str:
+    """One page; values: what the template shows, with `what` for the kind of page."""
     return _template().render(**values).lstrip()
 
 
@@ -184,10 +186,12 @@ def across(lines: Sequence[ReportLine]) -> list[ReportLine]:
 
 
 def _moment(line: ReportLine) -> float:
+    """When a bundle was made, s since 1970."""
     return datetime.fromisoformat(line.made).timestamp() if line.made else 0.0
 
 
 def _copy_flag(copy: Copy) -> Flag:
+    """The flag of bundles that share something, with the names of some of them."""
     names = ", ".join(copy.keys[:6]) + (f", {len(copy.keys) - 6} more" * (len(copy.keys) > 6))
     return Flag(copy.code, f"{copy.says.rstrip('.')} ({names}).", copy.note)
 
@@ -248,6 +252,7 @@ def _comparison(grade: Grade, submission: Submission) -> Iterator[tuple[str, ...
 def _pair(
     value: float | None, error: float | None = None, digits: str = ".1f", error_digits: str = ".2f"
 ) -> str:
+    """A value and its error in fixed formats, such as "+1.25 ± 0.10"; "-" for what is not there."""
     if value is None:
         return "-"
     text = _fixed(value, digits)
@@ -255,6 +260,7 @@ def _pair(
 
 
 def _ends(ends: Interval | None) -> str:
+    """An interval in px, such as "0.070 to 0.090"; "-" for none."""
     return "-" if ends is None else " to ".join(_fixed(end, ".3f") for end in ends)
 
 
@@ -273,12 +279,12 @@ class _Axes(NamedTuple):
     top: float
 
     def x(self, value: float) -> float:
-        inside = VIEW["W"] - VIEW["LEFT"] - VIEW["RIGHT"]
-        return VIEW["LEFT"] + inside * (value - self.low) / (self.high - self.low)
+        inside = PLOT["W"] - PLOT["LEFT"] - PLOT["RIGHT"]
+        return PLOT["LEFT"] + inside * (value - self.low) / (self.high - self.low)
 
     def y(self, value: float) -> float:
-        inside = VIEW["H"] - VIEW["TOP"] - VIEW["BOTTOM"]
-        return VIEW["H"] - VIEW["BOTTOM"] - inside * value / self.top
+        inside = PLOT["H"] - PLOT["TOP"] - PLOT["BOTTOM"]
+        return PLOT["H"] - PLOT["BOTTOM"] - inside * value / self.top
 
     def split(self, points: Iterable[tuple[float, float]]) -> tuple[list[Any], list[Any]]:
         """The points that fit, in the view's units; and the others, in words."""
@@ -401,7 +407,7 @@ def _histogram(percents: Sequence[float]) -> dict[str, Any]:
     return {
         "bins": bins,
         "most": max([*bins, 1]),
-        "wide": (VIEW["W"] - VIEW["LEFT"] - VIEW["RIGHT"]) / 10,
+        "wide": (PLOT["W"] - PLOT["LEFT"] - PLOT["RIGHT"]) / 10,
         "alt": f"Students by points: {words}." if words else "No graded bundle.",
     }
 
@@ -469,6 +475,7 @@ def paragraphs_page(lines: Sequence[ReportLine]) -> str:
 
 
 def _about(line: ReportLine) -> str:
+    """What stands under a name on the page of paragraphs: its length, and the verdict."""
     facts = [counted(len(line.paragraph.split()), "word")]
     facts += [f"which error dominates: {i.verdict}" for i in line.items if i.topic == "verdict"]
     if any(flag.code == "same_words" for flag in line.flags):
@@ -477,6 +484,7 @@ def _about(line: ReportLine) -> str:
 
 
 def _said(item: Item) -> str:
+    """What a class page calls the way in which an item is not right; nothing where it is."""
     if item.mistake:
         return MISTAKES.get(item.mistake, item.mistake)
     return {"wrong": "wrong, no known reason", "missing": "left out"}.get(item.verdict, "")

@@ -20,7 +20,7 @@ from coursekit.submission.flags import Fingerprint, Flag, data_flags, fingerprin
 from coursekit.submission.format import Plot, Submission, TableRow
 from coursekit.submission.recompute import (
     LABELS,
-    Measured,
+    AtDistance,
     Recomputed,
     grading_rules,
     recompute,
@@ -32,7 +32,12 @@ Judgement = Literal["right", "partial", "wrong", "missing"]
 SAME_DISTANCE_M = 0.005  # a row or a point of the plot belongs to the stack this near
 EXPLAINED_WITHIN = 0.03  # a wrong number is explained by a mistake that gives it to this part
 
-UNITS = {"sigma_d": " px", "sigma_d_interval": " px", "exponent": "", "invalid": " %"}  # else mm
+UNIT_OF = {
+    "sigma_d": " px",
+    "sigma_d_interval": " px",
+    "exponent": "",
+    "invalid": " %",
+}  # else mm
 
 
 @dataclass(frozen=True)
@@ -124,7 +129,11 @@ class _Question(NamedTuple):
 
 
 def grade(submission: Submission) -> Grade:
-    """Compare what a submission claims with what its raw depths say."""
+    """Compare what a submission claims with what its raw depths say.
+
+    Nothing that came with the bundle runs, and the claims are never taken for granted: what is
+    found comes from the raw depths alone. Raises ValueError for a rubric.toml that cannot be.
+    """
     found, prints = recompute(submission), fingerprint(submission)
     flags = data_flags(submission, found, prints)
     return Grade(submission.student, judged(submission, found), flags, found, prints)
@@ -157,6 +166,7 @@ def judged(submission: Submission, found: Recomputed) -> tuple[Item, ...]:
 
 
 def _at_distances(submission: Submission, found: Recomputed) -> Iterator[Item]:
+    """The items at each distance that is asked for, and at others that were measured."""
     points, wanted = grading_rules()["points"], grading_rules()["exercise"]["distances_m"]
     chosen = _chosen(wanted, found.at)
     for z in wanted:
@@ -166,11 +176,11 @@ def _at_distances(submission: Submission, found: Recomputed) -> Iterator[Item]:
             yield from _one_distance(submission, m.distance_m, m, dict.fromkeys(points, 0.0))
 
 
-def _chosen(wanted: Sequence[float], at: Sequence[Measured]) -> dict[float, Measured]:
+def _chosen(wanted: Sequence[float], at: Sequence[AtDistance]) -> dict[float, AtDistance]:
     """For each wanted distance the nearest measured one within the slack, none of them twice."""
     slack = grading_rules()["exercise"]["slack_m"]
     pairs = sorted((abs(m.distance_m - z), z, i) for z in wanted for i, m in enumerate(at))
-    chosen: dict[float, Measured] = {}
+    chosen: dict[float, AtDistance] = {}
     for off, z, i in pairs:
         if off <= slack + 1e-9 and z not in chosen and at[i] not in chosen.values():
             chosen[z] = at[i]
@@ -178,13 +188,15 @@ def _chosen(wanted: Sequence[float], at: Sequence[Measured]) -> dict[float, Meas
 
 
 def _row(submission: Submission, z: float) -> TableRow | None:
+    """The row of the student's table at a distance."""
     near = [r for r in submission.claims.rows if abs(r.distance_m - z) <= SAME_DISTANCE_M]
     return min(near, key=lambda r: abs(r.distance_m - z), default=None)
 
 
 def _one_distance(
-    submission: Submission, z: float, m: Measured | None, points: dict[str, float]
+    submission: Submission, z: float, m: AtDistance | None, points: dict[str, float]
 ) -> Iterator[Item]:
+    """Raw depths and the five numbers of the table at z; m: what was measured there."""
     yield _data(_Question("data", points["data"], f" at {z:.2f} m"), z, m)
     row = None if m is None else _row(submission, m.distance_m)
     for topic, (field, judge) in JUDGES.items():
@@ -198,7 +210,8 @@ def _one_distance(
             yield judge(asked, submission, m, claim)
 
 
-def _data(asked: _Question, z: float, m: Measured | None) -> Item:
+def _data(asked: _Question, z: float, m: AtDistance | None) -> Item:
+    """Whether there are raw depths enough: frames, and a window that is large enough."""
     exercise = grading_rules()["exercise"]
     needed, side = exercise["frames"], exercise["window_px"]
     if m is None:
@@ -220,7 +233,8 @@ def _data(asked: _Question, z: float, m: Measured | None) -> Item:
     return asked.item("partial", says, "incomplete", min(n / needed, 1.0) * (0.5 if small else 1.0))
 
 
-def _bias(asked: _Question, _: Submission, m: Measured, claim: float) -> Item:
+def _bias(asked: _Question, _: Submission, m: AtDistance, claim: float) -> Item:
+    """Mean depth minus the distance by tape, mm; the sign is the commonest mistake."""
     if m.bias is None:
         return _unknown(asked, claim)
     found, step, z = m.bias.value, 1e3 * m.scale_m, 1e3 * m.distance_m
@@ -239,7 +253,11 @@ def _bias(asked: _Question, _: Submission, m: Measured, claim: float) -> Item:
     return _judge(asked, claim, found, tolerance, mistakes)
 
 
-def _bias_se(asked: _Question, submission: Submission, m: Measured, claim: float) -> Item:
+def _bias_se(asked: _Question, submission: Submission, m: AtDistance, claim: float) -> Item:
+    """The standard error of the bias, mm: of the mean depth, as the frames correlate.
+
+    With the tape's error or without it is right; it is itself known to a part only.
+    """
     if m.bias is None or m.bias_se_mm is None or m.bias_se_apart_mm is None:
         return _unknown(asked, claim)
     both, apart, tape = m.bias_se_mm, m.bias_se_apart_mm, 1e3 * submission.tape_sigma_m
@@ -271,7 +289,8 @@ def _bias_se(asked: _Question, submission: Submission, m: Measured, claim: float
     return item
 
 
-def _std(asked: _Question, _: Submission, m: Measured, claim: float) -> Item:
+def _std(asked: _Question, _: Submission, m: AtDistance, claim: float) -> Item:
+    """The std of one pixel over time, mm, the pixels' variances averaged."""
     if m.std is None:
         return _unknown(asked, claim)
     found, n, stats = m.std.value, m.stats.n_frames, m.stats
@@ -303,7 +322,8 @@ def _std(asked: _Question, _: Submission, m: Measured, claim: float) -> Item:
     return _judge(asked, claim, found, tolerance, mistakes)
 
 
-def _std_se(asked: _Question, _: Submission, m: Measured, claim: float) -> Item:
+def _std_se(asked: _Question, _: Submission, m: AtDistance, claim: float) -> Item:
+    """The standard error of that std, mm: std / sqrt(2 dof), dof the effective ones."""
     if m.std is None:
         return _unknown(asked, claim)
     found, std = m.std.se, m.std.value
@@ -324,7 +344,8 @@ def _std_se(asked: _Question, _: Submission, m: Measured, claim: float) -> Item:
     return _judge(asked, claim, found, _error_tolerance("std_se", found), mistakes)
 
 
-def _invalid(asked: _Question, _: Submission, m: Measured, claim: float) -> Item:
+def _invalid(asked: _Question, _: Submission, m: AtDistance, claim: float) -> Item:
+    """The part of all samples (pixels times frames) that have no depth."""
     found, tolerance = m.invalid.value, _tolerance("invalid", m.invalid.se)
 
     def mistakes() -> Iterator[_Mistake]:
@@ -343,7 +364,7 @@ def _invalid(asked: _Question, _: Submission, m: Measured, claim: float) -> Item
     return _judge(asked, claim, found, tolerance, mistakes)
 
 
-JUDGES: dict[str, tuple[str, Callable[[_Question, Submission, Measured, float], Item]]] = {
+JUDGES: dict[str, tuple[str, Callable[[_Question, Submission, AtDistance, float], Item]]] = {
     "bias": ("depth_bias_mm", _bias),
     "bias_se": ("depth_bias_se_mm", _bias_se),
     "std": ("depth_std_mm", _std),
@@ -364,6 +385,7 @@ def _other_units(found: float, tolerance: float, step_mm: float) -> Iterator[_Mi
 
 
 def _plot(asked: _Question, submission: Submission, found: Recomputed) -> Item:
+    """The student's figure: measured stds as in the raw depths or the table, and a prediction."""
     plot = submission.plot
     measured = {m.distance_m: m.std for m in found.at if m.std is not None}
     if plot is None or not plot.distances_m:
@@ -461,6 +483,7 @@ def _prediction(asked: _Question, plot: Plot, shows: str, found_mm: Sequence[flo
 
 
 def _sigma_d(asked: _Question, submission: Submission, found: Recomputed) -> Item:
+    """The std of disparity, px, from sigma_Z = Z^2 sigma_d / (fx B) through all distances."""
     claim, law, camera = submission.claims.sigma_d_px, found.law, submission.camera
     if law is None:
         return _no_law(asked, claim, found)
@@ -493,6 +516,7 @@ def _sigma_d(asked: _Question, submission: Submission, found: Recomputed) -> Ite
 
 
 def _sigma_d_interval(asked: _Question, submission: Submission, found: Recomputed) -> Item:
+    """The 95 % interval of sigma_d, px, widened for the scatter about the law."""
     claim, law = submission.claims.sigma_d_interval_px, found.law
     if law is None:
         return _no_law(asked, None if claim is None else claim[0], found)
@@ -502,6 +526,7 @@ def _sigma_d_interval(asked: _Question, submission: Submission, found: Recompute
 
 
 def _exponent(asked: _Question, submission: Submission, found: Recomputed) -> Item:
+    """The exponent of a free fit: none quoted is right, and one with its interval is, too."""
     claims, free = submission.claims, found.free
     claim, interval = claims.exponent, claims.exponent_interval
     if found.law is None:
@@ -559,7 +584,7 @@ def _judge_interval(
     topic, rule = asked.topic, grading_rules()["tolerance"]
     half = (found[1] - found[0]) / 2
     tolerance = rule["standard_errors"] * rule["error_of_an_error"] * half + _half_digit(topic)
-    unit = UNITS[topic]
+    unit = UNIT_OF[topic]
     one, two = (" to ".join(_digits(topic, end) for end in ends) for ends in (claim, found))
     says = (
         f"{asked.name}: you say {one}{unit}, your raw depths say {two}{unit} "
@@ -644,7 +669,7 @@ def _conclusion(asked: _Question, submission: Submission, found: Recomputed) -> 
 
 
 def _at_mounting(
-    submission: Submission, known: Sequence[Measured], z: float, frames: int
+    submission: Submission, known: Sequence[AtDistance], z: float, frames: int
 ) -> tuple[float, float, float, float]:
     """Bias, its error, noise of the mean of `frames` frames and its error at z, mm.
 
@@ -665,6 +690,7 @@ def _at_mounting(
 
 
 def _paragraph(asked: _Question, submission: Submission) -> Item:
+    """Whether there is a closing paragraph, by its number of words; a person reads it."""
     words = len(submission.conclusion.paragraph.split())
     if words == 0:
         return asked.missing("three sentences on which error dominates, and why")
@@ -709,6 +735,7 @@ def _kept(item: Item, mistake: str, says: str) -> Item:
 
 
 def _unknown(asked: _Question, claim: float) -> Item:
+    """A claim about what the raw depths do not give."""
     said = _shown(asked.topic, claim)
     says = f"{asked.name}: you say {said}, but your raw depths do not give it."
     return asked.item("wrong", says, claimed=claim)
@@ -721,6 +748,7 @@ def _half_digit(topic: str) -> float:
 
 
 def _tolerance(topic: str, se: float) -> float:
+    """How far a claim may be off: standard errors of what is found, and half a printed digit."""
     return float(grading_rules()["tolerance"]["standard_errors"] * se + _half_digit(topic))
 
 
@@ -736,7 +764,8 @@ def _log_se(law: NoiseFit, i: int, widened: bool = True) -> float:
 
 
 def _shown(topic: str, value: float) -> str:
-    return _digits(topic, value) + UNITS.get(topic, " mm")
+    """A value with its unit."""
+    return _digits(topic, value) + UNIT_OF.get(topic, " mm")
 
 
 def _digits(topic: str, value: float) -> str:
@@ -749,4 +778,5 @@ def _digits(topic: str, value: float) -> str:
 
 
 def _accepted(topic: str, tolerance: float) -> str:
+    """The tolerance in words; a fraction is shown in percent."""
     return f"± {100 * tolerance if topic == 'invalid' else tolerance:.2g} is accepted"
