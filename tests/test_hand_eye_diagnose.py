@@ -20,9 +20,8 @@ from coursekit.arm import ArmErrors, pose_difference, widowx
 from coursekit.causes import CauseSearch, likelihood_ratios
 from coursekit.geometry import invert_transform, make_transform
 from coursekit.hand_eye import causes, misread
-from coursekit.hand_eye.causes import Arms, MendedPairs
+from coursekit.hand_eye.causes import Arms, MendedPairs, PosePairs
 from coursekit.hand_eye.diagnosis import diagnose
-from coursekit.hand_eye.pairs import PosePairs
 from coursekit.hand_eye.session import HandEyeSession
 from coursekit.simulation.arm_sessions import HandEyeMistakes as M
 from coursekit.simulation.arm_sessions import HandEyeTruth, hand_eye_session

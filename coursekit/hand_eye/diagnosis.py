@@ -18,9 +18,8 @@ from coursekit.arrays import Floats
 from coursekit.causes import Accepted, CauseSearch, DiagnosisTexts
 from coursekit.checks import want
 from coursekit.hand_eye import causes, misread
-from coursekit.hand_eye.causes import Arms, MendedPairs
+from coursekit.hand_eye.causes import Arms, Fit, MendedPairs, PosePairs
 from coursekit.hand_eye.closed_form import FEWEST_POSES
-from coursekit.hand_eye.pairs import Fit, PosePairs
 from coursekit.hand_eye.poses import camera_board, mean_pose
 from coursekit.hand_eye.session import HandEyeSession
 from coursekit.words import Finding, Findings

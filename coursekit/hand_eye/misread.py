@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from coursekit.arrays import Floats
 from coursekit.geometry import invert_transform
-from coursekit.hand_eye.pairs import LEAST_M, Fit, PosePairs
+from coursekit.hand_eye.causes import LEAST_M, Fit, PosePairs
 from coursekit.hand_eye.poses import Mount, nearest_rotation
 from coursekit.hand_eye.session import HandEyeSession
 
