@@ -11,7 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from coursekit.geometry import invert_transform
-from coursekit.hand_eye.diagnosis import diagnose
+from coursekit.hand_eye import HandEyeSession
+from coursekit.hand_eye.diagnosis import diagnose as diagnose_session
 
 pytestmark = pytest.mark.real
 
@@ -28,6 +29,10 @@ def pairs() -> tuple[np.ndarray, np.ndarray]:
     return samples[:, 0], samples[:, 1]
 
 
+def diagnose(arm: np.ndarray, seen: np.ndarray, mount: str = MOUNT):
+    return diagnose_session(HandEyeSession(mount, arm, seen))
+
+
 def larger(T: np.ndarray, factor: float) -> np.ndarray:
     T = T.copy()
     T[:, :3, 3] *= factor
@@ -35,7 +40,7 @@ def larger(T: np.ndarray, factor: float) -> np.ndarray:
 
 
 def test_as_they_are_nothing_is_found(pairs) -> None:
-    assert diagnose(*pairs, MOUNT).names == ()
+    assert diagnose(*pairs).names == ()
 
 
 def test_millimetres(pairs) -> None:
@@ -45,7 +50,7 @@ def test_millimetres(pairs) -> None:
         (arm, larger(seen, 1e3)),
         (larger(arm, 1e3), larger(seen, 1e3)),
     ):
-        assert diagnose(*given, MOUNT).names == ("millimetres",)
+        assert diagnose(*given).names == ("millimetres",)
 
 
 @pytest.mark.parametrize("kind", ["rotation vectors", "xyz", "XYZ"])
@@ -58,7 +63,7 @@ def test_degrees(pairs, kind: str) -> None:
     else:
         turns = Rotation.from_euler(kind, turns.as_euler(kind, degrees=True))
     given[:, :3, :3] = turns.as_matrix()
-    [finding] = diagnose(given, seen, MOUNT)
+    [finding] = diagnose(given, seen)
     assert finding.name == "degrees"
     assert "4.1 mm" in finding.evidence
 
@@ -66,13 +71,13 @@ def test_degrees(pairs, kind: str) -> None:
 def test_shifted_by_one(pairs) -> None:
     arm, seen = pairs
     for given in ((arm[1:], seen[:-1]), (arm[:-1], seen[1:]), (np.roll(arm, 1, axis=0), seen)):
-        assert diagnose(*given, MOUNT).names == ("off_by_one",)
+        assert diagnose(*given).names == ("off_by_one",)
 
 
 @pytest.mark.parametrize("factor", [1.05, 0.95])
 def test_board_size(pairs, factor: float) -> None:
     arm, seen = pairs
-    [finding] = diagnose(arm, larger(seen, factor), MOUNT)
+    [finding] = diagnose(arm, larger(seen, factor))
     assert finding.name == "wrong_square_size"
     stated = float(finding.evidence.split("the board is ")[1].split()[0])
     assert stated == pytest.approx(1 / factor, abs=0.005)
@@ -80,7 +85,7 @@ def test_board_size(pairs, factor: float) -> None:
 
 def test_the_other_way_round(pairs) -> None:
     arm, seen = pairs
-    inverted = (invert_transform(arm), seen, MOUNT)
+    inverted = (invert_transform(arm), seen)
     for given in (inverted, (arm, invert_transform(seen), MOUNT), (arm, seen, "eye_in_hand")):
         [finding] = diagnose(*given)
         assert finding.name == "inconsistent_convention"
