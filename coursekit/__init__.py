@@ -16,9 +16,9 @@ and `words` serve them all.
 | `stereo` | depth from disparity: its noise, its bias, a block's face | `WindowStats`, `NoiseFit`, `BiasFit` | `geometry` |
 | `boards` | calibration boards: drawn, found, corners refined, is it seen from here | `Board`, `Detection(s)` | `geometry` |
 | `causes` | the search for what else explains residuals; both diagnoses use it | `Hypothesis`, `Tested` | - |
-| `intrinsics` | K and distortion: fitted, how well known, what is wrong with a session | `IntrinsicsResult`, `Findings` | `geometry`, `specifications`, `results`, `boards` |
+| `intrinsics` | K and distortion: fitted, how well known, what is wrong with a session | `IntrinsicsResult`, `Findings` | `geometry`, `specifications`, `results`, `boards`, `causes` |
 | `arm` | the WidowX: kinematics, and how an arm errs | `Arm`, joint angles, (4, 4) poses | `geometry`, `specifications` |
-| `hand_eye` | where the camera is: AX = XB, refined, how good, what is wrong | `HandEyeSession`, `HandEyeResult` | `geometry`, `results`, `boards`, `intrinsics`, `arm` |
+| `hand_eye` | where the camera is: AX = XB, refined, how good, what is wrong | `HandEyeSession`, `HandEyeResult` | `geometry`, `results`, `boards`, `causes`, `intrinsics`, `arm` |
 | `budget` | errors in millimetres at the gripper, added up | `View`, `ErrorTerm`, `ErrorBudget` | `geometry`, `specifications`, `results`, `stereo`, `intrinsics`, `arm`, `hand_eye` |
 | `attribution` | whose fault misses are | (n, 3) misses, `Attribution` | `geometry`, `results`, `arm`, `budget` |
 | `simulation` | scenes, light, infrared, boards and arms that do not exist | `Scene`, `Rig`, sessions with their truth | `geometry`, `specifications`, `boards`, `arm`, `hand_eye` |

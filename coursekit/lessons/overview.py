@@ -34,7 +34,7 @@ EXERCISES: dict[str, Exercise] = {
     )
 }
 DONE = {"right", "core right"}
-WORDS = {"wrong": "not right yet", "raised": "raised an error"}
+STANDING_WORDS = {"wrong": "not right yet", "raised": "raised an error"}
 
 
 def checkpoint(name: str) -> Checkpoint:
@@ -109,7 +109,7 @@ def _state(attempts: list[dict[str, str]]) -> str:
         return "right" if tries == 1 else f"right at try {tries}"
     if "core right" in kinds:
         return "core right"
-    return WORDS.get(kinds[-1], kinds[-1]) if kinds else ""
+    return STANDING_WORDS.get(kinds[-1], kinds[-1]) if kinds else ""
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ from typing import Any, Literal
 from coursekit import results
 
 FILE = "progress.json"
-Kind = Literal["right", "core right", "wrong", "raised", "not attempted"]
+VerdictKind = Literal["right", "core right", "wrong", "raised", "not attempted"]
 
 # Okabe-Ito; the word beside it says the same, so nothing hangs on the colour.
-COLORS = {
+SIDE_COLORS = {
     "right": "#009E73",
     "core right": "#009E73",
     "wrong": "#D55E00",
@@ -33,7 +33,7 @@ class Verdict:
     """
 
     subject: str
-    kind: Kind
+    kind: VerdictKind
     headline: str
     lines: tuple[str, ...] = ()
     named: str | None = None
@@ -44,7 +44,7 @@ class Verdict:
     def _repr_html_(self) -> str:
         body = "".join(f"<div>{_markup(line)}</div>" for line in self.lines)
         return (
-            f'<div style="border-left: 4px solid {COLORS[self.kind]}; padding: 2px 0 2px 12px;'
+            f'<div style="border-left: 4px solid {SIDE_COLORS[self.kind]}; padding: 2px 0 2px 12px;'
             f' line-height: 1.4; max-width: 52em">'
             f"<b>{_markup(self.headline)}</b>{body}</div>"
         )

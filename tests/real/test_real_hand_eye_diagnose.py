@@ -7,11 +7,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from coursekit.geometry import invert_transform
-from coursekit.hand_eye.diagnosis import diagnose
+from coursekit.hand_eye import HandEyeSession
+from coursekit.hand_eye.diagnosis import diagnose as diagnose_session
 
 pytestmark = pytest.mark.real
 
 MOUNT = "eye_to_hand"
+
+
+def diagnose(arm: np.ndarray, seen: np.ndarray, mount: str = MOUNT):
+    return diagnose_session(HandEyeSession(mount, arm, seen))
 
 
 def larger(T: np.ndarray, factor: float) -> np.ndarray:
@@ -21,7 +26,7 @@ def larger(T: np.ndarray, factor: float) -> np.ndarray:
 
 
 def test_as_they_are_nothing_is_found(moveit_poses) -> None:
-    assert diagnose(*moveit_poses, MOUNT).names == ()
+    assert diagnose(*moveit_poses).names == ()
 
 
 def test_millimetres(moveit_poses) -> None:
@@ -31,7 +36,7 @@ def test_millimetres(moveit_poses) -> None:
         (arm, larger(seen, 1e3)),
         (larger(arm, 1e3), larger(seen, 1e3)),
     ):
-        assert diagnose(*given, MOUNT).names == ("millimetres",)
+        assert diagnose(*given).names == ("millimetres",)
 
 
 @pytest.mark.parametrize("kind", ["rotation vectors", "xyz", "XYZ"])
@@ -44,7 +49,7 @@ def test_degrees(moveit_poses, kind: str) -> None:
     else:
         turns = Rotation.from_euler(kind, turns.as_euler(kind, degrees=True))
     given[:, :3, :3] = turns.as_matrix()
-    [finding] = diagnose(given, seen, MOUNT)
+    [finding] = diagnose(given, seen)
     assert finding.name == "degrees"
     assert "4.1 mm" in finding.evidence
 
@@ -52,13 +57,13 @@ def test_degrees(moveit_poses, kind: str) -> None:
 def test_shifted_by_one(moveit_poses) -> None:
     arm, seen = moveit_poses
     for given in ((arm[1:], seen[:-1]), (arm[:-1], seen[1:]), (np.roll(arm, 1, axis=0), seen)):
-        assert diagnose(*given, MOUNT).names == ("off_by_one",)
+        assert diagnose(*given).names == ("off_by_one",)
 
 
 @pytest.mark.parametrize("factor", [1.05, 0.95])
 def test_board_size(moveit_poses, factor: float) -> None:
     arm, seen = moveit_poses
-    [finding] = diagnose(arm, larger(seen, factor), MOUNT)
+    [finding] = diagnose(arm, larger(seen, factor))
     assert finding.name == "wrong_square_size"
     stated = float(finding.evidence.split("the board is ")[1].split()[0])
     assert stated == pytest.approx(1 / factor, abs=0.005)
@@ -66,7 +71,7 @@ def test_board_size(moveit_poses, factor: float) -> None:
 
 def test_the_other_way_round(moveit_poses) -> None:
     arm, seen = moveit_poses
-    inverted = (invert_transform(arm), seen, MOUNT)
+    inverted = (invert_transform(arm), seen)
     for given in (inverted, (arm, invert_transform(seen), MOUNT), (arm, seen, "eye_in_hand")):
         [finding] = diagnose(*given)
         assert finding.name == "inconsistent_convention"
