@@ -15,12 +15,12 @@ import time
 import urllib.request
 
 import pytest
+from playwright.sync_api import expect
 
 import coursekit as ck
 from coursekit.lessons.questions import Choice
 from tools import build_notebooks
 
-sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright")
 pytestmark = pytest.mark.browser
 
 NAMES = [f"{number:02d}_{lesson}" for number, lesson in enumerate(ck.lessons.LESSONS, start=1)]
@@ -30,6 +30,7 @@ SETTINGS = {
     "@jupyterlab/notebook-extension:tracker": {"windowingMode": "none"},  # all cells are in the DOM
 }
 PATIENCE_MS = 1_800_000  # so that a hang ends; no page takes minutes
+expect.set_options(timeout=PATIENCE_MS)
 
 
 @pytest.fixture(scope="module", params=NAMES)
@@ -106,8 +107,8 @@ def page(opened, name):
     opened.get_by_role("menuitem", name="Run", exact=True).click()
     opened.locator("[data-command='runmenu:run-all']").click()
     prompt = opened.locator(".jp-CodeCell .jp-InputArea-prompt").last
-    sync_api.expect(prompt).to_have_text("[*]:")
-    sync_api.expect(prompt).to_have_text(re.compile(r"\[\d+\]:"), timeout=PATIENCE_MS)
+    expect(prompt).to_have_text("[*]:")
+    expect(prompt).to_have_text(re.compile(r"\[\d+\]:"))
     yield opened
     if os.environ.get("CI") != "true":  # nobody looks at them there
         photograph(opened, name)
@@ -153,9 +154,9 @@ def checkpoints(name):
 def test_answers_are_collapsed_on_load(opened, name):
     bars, count = answers(opened, name)
     assert count > 0
-    sync_api.expect(bars).to_have_count(count)
+    expect(bars).to_have_count(count)
     for bar in bars.all():
-        sync_api.expect(bar).to_contain_text("# An answer")
+        expect(bar).to_contain_text("# An answer")
 
 
 def test_run_all_shows_no_error_and_no_answer(page, name):
@@ -181,7 +182,7 @@ def test_every_checkpoint_explains_wrong_and_right_answers(page, name):
         for give, said in attempts(checkpoint):
             give(cell)
             cell.get_by_role("button", name="Commit").click()
-            sync_api.expect(cell.locator(".widget-html-content").last).to_contain_text(plain(said))
+            expect(cell.locator(".widget-html-content").last).to_contain_text(plain(said))
 
 
 def attempts(checkpoint):
