@@ -243,7 +243,7 @@ def test_ctrl_c_is_not_contained():
 def test_a_line_as_it_is_printed():
     assert str(CheckUp("ok", "fine", check="USB")) == "ok       USB          fine"
     long = str(CheckUp("problem", "slow " * 40, "push it " * 30, check="USB")).splitlines()
-    assert all(len(row) <= doctor.WIDTH for row in long)
+    assert all(len(row) <= doctor.LINE_WIDTH for row in long)
     assert any(row.strip().startswith("-> push it") for row in long)
 
 
