@@ -30,13 +30,10 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from coursekit import results
-from coursekit.words import counted
-
 Condition = Literal["ok", "note", "problem"]
 
 OLDEST, NEWEST_TESTED = (3, 11), (3, 13)
-PINS = results.ROOT / "requirements.txt"
+PINS = Path(__file__).resolve().parents[1] / "requirements.txt"
 LOADED = ("numpy", "scipy", "cv2", "numba", "matplotlib", "ipywidgets")
 UDEV_FOLDERS = tuple(map(Path, ("/etc/udev/rules.d", "/usr/lib/udev/rules.d", "/lib/udev/rules.d")))
 LEAST_FREE_BYTES = 100_000_000  # results, recordings, bundles
@@ -101,7 +98,7 @@ def run(camera: str = "auto") -> int:
         print(line, flush=True)
         found[line.verdict] += 1
     if problems := found["problem"]:
-        print(f"\n{counted(problems, 'problem')}: do what stands there, and ask again.")
+        print(f"\n{problems} problem{'s' * (problems > 1)}: do what stands there, and ask again.")
         return 1
     print("\nNothing is in the way. `python3 course.py lab` opens the notebooks.")
     return 0
@@ -275,6 +272,8 @@ def _browser() -> CheckUp:
 
 def _results() -> CheckUp:
     """Whether results can be saved; nothing is left behind."""
+    from coursekit import results
+
     folder = results.folder()
     there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     try:
