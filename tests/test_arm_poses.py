@@ -1,7 +1,5 @@
 """Where things are by default, and joint configurations to calibrate with: careful, degenerate."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Boards: the pattern against OpenCV's own, detection against rendered views of known geometry."""
 
-from __future__ import annotations
-
 import re
 import struct
 import zlib
@@ -12,7 +10,7 @@ import cv2
 import matplotlib as mpl
 import numpy as np
 import pytest
-from common import CHARUCO, CHECKERBOARD, NIGHTLY, each, refusals
+from common import CHARUCO, CHECKERBOARD, NIGHTLY, each, named, refusals
 
 import coursekit.boards.detector
 from coursekit.boards import Board, BoardNotFound, detect, detect_all, save_sheet
@@ -55,12 +53,9 @@ def view(board, T=None, size=(640, 480), blur_px=0.6, motion_px=(0.0, 0.0), pixe
     to_image = board.image_from_board(pixels_per_square)
     to_image[:2, 2] += pixels_per_square
     over = np.array([[OVER, 0, (OVER - 1) / 2], [0, OVER, (OVER - 1) / 2], [0, 0, 1]])
-    grey = cv2.warpPerspective(
-        sheet(board, pixels_per_square),
-        over @ H @ np.linalg.inv(to_image),
-        (width * OVER, height * OVER),
-        borderValue=AROUND,
-    )
+    fine, H_fine = (width * OVER, height * OVER), over @ H @ np.linalg.inv(to_image)
+    print_of = sheet(board, pixels_per_square)
+    grey = cv2.warpPerspective(print_of, H_fine, fine, borderValue=AROUND)
     grey = cv2.GaussianBlur(grey, (0, 0), blur_px * OVER)
     if any(motion_px):
         ways = ((np.arange(12) + 0.5) / 12 - 0.5)[:, None] * OVER * np.array(motion_px)
@@ -100,10 +95,9 @@ def random_poses(board, seed, count, **ranges):
 @pytest.mark.parametrize(("dictionary", "share"), [("DICT_5X5_250", 0.7), ("DICT_6X6_250", 0.5)])
 def test_the_picture_is_opencvs(squares, old, dictionary, share):
     board = Board("charuco", squares, 0.02, 0.02 * share, dictionary, old)
-    bits = int(dictionary[5]) + 2
-    n = 20 * bits  # cells of a marker are whole pixels
-    columns, rows = squares
-    theirs = board.opencv().generateImage((columns * n, rows * n), marginSize=0, borderBits=1)
+    n = 20 * (int(dictionary[5]) + 2)  # cells of a marker are whole pixels
+    size = (squares[0] * n, squares[1] * n)
+    theirs = board.opencv().generateImage(size, marginSize=0, borderBits=1)
     np.testing.assert_array_equal(board.image(n), theirs)
 
 
@@ -121,12 +115,11 @@ def test_points_are_opencvs_and_lie_on_the_corners_of_the_picture():
         n = 40
         image = board.image(n).astype(int)
         uv1 = np.c_[board.points[:, :2], np.ones(len(board.points))] @ board.image_from_board(n).T
-        up = -1 if board.old_origin else 1
         first = np.rint(uv1[:, :2] + 0.5).astype(int)  # the pixel right of and below the corner
         for (u, v), falling in zip(first.tolist(), board.falling, strict=True):
             right, left = slice(u, u + 2), slice(u - 2, u)
             below, above = slice(v, v + 2), slice(v - 2, v)
-            plus_y, minus_y = (below, above)[::up]
+            plus_y, minus_y = (above, below) if board.old_origin else (below, above)
             both = image[plus_y, right].sum() + image[minus_y, left].sum()
             others = image[plus_y, left].sum() + image[minus_y, right].sum()
             assert (both, others) == ((8 * 255, 0) if falling else (0, 8 * 255))
@@ -137,8 +130,7 @@ def test_the_old_origin_is_at_the_bottom_left_with_y_up():
     np.testing.assert_allclose(top_down, [-0.5, 60 - 0.5, 1])
     assert (OLD.image_from_board(10) @ [0, 0.01, 1])[1] < top_down[1]
     assert OLD.image(1)[0, 0] != CHARUCO.image(1)[0, 0]  # an even number of rows
-    odd = Board("charuco", (5, 7), 0.03)
-    old_odd = Board("charuco", (5, 7), 0.03, old_origin=True)
+    odd, old_odd = (replace(board, squares=(5, 7)) for board in (CHARUCO, OLD))
     np.testing.assert_array_equal(odd.image(20), old_odd.image(20))
 
 
@@ -328,10 +320,8 @@ def not_found(image, board):
 
 def test_says_which_checkerboard_it_sees():
     said = not_found(shot(CHECKERBOARD), Board("checkerboard", (9, 6), 0.025))
-    assert said == (
-        "not the 9x6 squares (8x5 inner corners) asked for, but a checkerboard of 10x7 squares: "
-        "you gave inner corners, squares are one more in each direction"
-    )
+    assert said.startswith("not the 9x6 squares (8x5 inner corners) asked for, but a checkerboard")
+    assert said.endswith("you gave inner corners, squares are one more in each direction")
     said = not_found(shot(CHECKERBOARD), Board("checkerboard", (11, 7), 0.025))
     assert said.endswith("but a checkerboard of 10x7 squares: use squares=(10, 7)")
     said = not_found(shot(CHECKERBOARD), CHARUCO)
@@ -361,9 +351,8 @@ def test_a_longer_dictionary_of_the_family_has_the_same_markers():
 
 @BOTH
 def test_says_what_keeps_it_from_seeing(board):
-    assert not_found(np.full((480, 640), 30, np.uint8), board) == (
-        "the picture is blank: nearly all of it has grey levels from 30 to 30"
-    )
+    blank = not_found(np.full((480, 640), 30, np.uint8), board)
+    assert blank == "the picture is blank: nearly all of it has grey levels from 30 to 30"
     assert not_found(np.zeros((20, 640), np.uint8), board).startswith("the picture is 640x20 px")
     blurred = cv2.GaussianBlur(shot(CHECKERBOARD), (0, 0), 12)
     assert "the picture is blurred (its sharpest edges are 2" in not_found(blurred, board)
@@ -392,10 +381,9 @@ def mixed_folder(tmp_path):
     thumbnail = b"\xff\xe1" + struct.pack(">H", 6) + b"\xff\xd8\xff\xd9"
     (tmp_path / "cut.jpg").write_bytes(jpeg[:2] + thumbnail + jpeg[2 : len(jpeg) // 2])
     png = (tmp_path / "view2.png").read_bytes()
-    (tmp_path / "cut.png").write_bytes(png[: len(png) // 2])
-    (tmp_path / "empty.png").write_bytes(b"")
-    (tmp_path / "notes.txt").write_text("view 3 was the good one", encoding="utf-8")
-    (tmp_path / "session.json").write_text("{}", encoding="utf-8")
+    contents = {"cut.png": png[: len(png) // 2], "empty.png": b"", "notes.txt": b"view 3 was good"}
+    for name, content in (contents | {"session.json": b"{}"}).items():
+        (tmp_path / name).write_bytes(content)
     write(tmp_path / "blank.png", np.full_like(charuco_image, 90))
     write(tmp_path / "large.jpg", cv2.resize(charuco_image, (4000, 3000)))
     (tmp_path / "folder.png").mkdir()
@@ -580,9 +568,7 @@ test_what_cannot_be_is_refused = refusals(
     *each(r"squares: got \(9, 3\), want \(columns, rows\) of sq", checkers, "squares", (9, 3)),
     *each(r"squares: got .*, want", charuco, "squares", (9, 2), 9, (9.0, 6)),
     *each(r"square_m: got -0.02, want 0.0005 to 1.0 m \(25 mm is", charuco, "square_m", -0.02),
-    *each("square_m: got nan, want", charuco, "square_m", float("nan")),
-    *each("marker_m: got 0.02, want less than 0.02 m", charuco, "marker_m", 0.02),
-    *each("dictionary: got 'DICT_9X9', want one of", charuco, "dictionary", "DICT_9X9"),
+    *named(charuco, square_m=[float("nan")], marker_m=[0.02], dictionary=["DICT_9X9"]),
     ("want one of 67 markers or more", lambda: charuco((15, 9), dictionary="DICT_4X4_50")),
     *each(r"marker_m, old_origin: got \(0.01, False\), want none", checkers, "marker_m", 0.01),
     *((r"^image: got .* want", lambda image=image: detect(image, CHARUCO)) for image in NO_IMAGES),
@@ -595,8 +581,7 @@ test_what_cannot_be_is_refused = refusals(
     (r"pixels: got .*\(2, 2\), want \(3, 2\)", lambda: Detection(range(3), OTHER_SIZES, (9, 9))),
     *each("path: got 'a.svg', want a name that ends in .pdf or .png", printed, "path", "a.svg"),
     *each("path: got 'none/a.pdf', want a name in a folder that", printed, "path", "none/a.pdf"),
-    *each("paper: got 'A7', want one of A4, A3", printed, "paper", "A7"),
-    *each("dpi: got 10, want a whole number from 72 to 2400", printed, "dpi", 10),
+    *named(printed, paper=["A7"], dpi=[10]),
     *each("360 x 270 mm does not fit on A4: take A2, or .* 20 mm", printed, "board", LARGE),
     *each("take a print shop, or squares of at most 9.9 mm", printed, "board", HUGE),
 )

@@ -1,13 +1,12 @@
 """First order against numerical derivatives and against Monte Carlo through the exact chain."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from common import NIGHTLY
+from common import NIGHTLY, derivative
+from common import WIDE as LENS
 from scipy.spatial.transform import Rotation
 
 import coursekit.budget as eb
@@ -16,10 +15,8 @@ from coursekit.budget.handover import LESSON_CAMERA
 from coursekit.budget.propagation import displacements, jacobian
 from coursekit.geometry import Intrinsics, deproject, invert_transform, transform_points, undistort
 from coursekit.intrinsics.derivatives import PARAMETERS, parameter_vector, scaled_root
+from coursekit.stereo import depth_noise
 
-LENS = Intrinsics(
-    848, 480, 430.0, 432.0, 421.0, 243.0, "brown_conrady", (-0.05, 0.06, -8e-4, 1.4e-3, -0.02)
-)
 ARM_AT = (0.2, 1.3, 1.2, -0.3, 0.1, 0.4)
 SAMPLES = 150_000 if NIGHTLY else 50_000  # a variance to 0.4 or 0.6 % (one standard error)
 CORNERS = [(424.0, 240.0), (0.0, 0.0), (847.0, 240.0), (847.0, 479.0), (424.0, 0.0)]
@@ -40,14 +37,9 @@ def errors(Z: float, turn_deg: float, lens: bool = False) -> eb.Covariances:
     names = PARAMETERS if lens else PARAMETERS[:4]
     X = np.diag(np.square([turn] * 3 + [1.5e-3] * 3))
     X[0, 4] = X[4, 0] = 0.6 * turn * 1.5e-3  # what turns the camera seems to shift it
-    return eb.Covariances(
-        pixel=np.eye(2),
-        depth_sigma_m=Z**2 / (LESSON_CAMERA.fx * 0.05) * 0.08,
-        intrinsics=np.diag(np.square(sigma_K[: len(names)])),
-        names=names,
-        hand_eye=X,
-        arm=fk_covariance(ARM_AT).covariance,
-    )
+    depth, arm = depth_noise(Z, LESSON_CAMERA.fx, 0.05, 0.08), fk_covariance(ARM_AT).covariance
+    K = np.diag(np.square(sigma_K[: len(names)]))
+    return eb.Covariances(np.eye(2), float(depth), K, names, hand_eye=X, arm=arm)
 
 
 def exact(where: eb.Chain, names: tuple[str, ...], e: np.ndarray) -> np.ndarray:
@@ -76,11 +68,8 @@ def exact(where: eb.Chain, names: tuple[str, ...], e: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(("camera", "p"), [(LESSON_CAMERA, 4), (LENS, 9)])
 def test_jacobian_is_the_derivative(mount: str, camera: Intrinsics, p: int) -> None:
     where, names = chain(mount, camera, 0.5, 701.0, 92.0), PARAMETERS[:p]
-    h = 1e-6
-    columns = [
-        (exact(where, names, h * e) - exact(where, names, -h * e)) / (2 * h) for e in np.eye(15 + p)
-    ]
-    assert jacobian(where, names) == pytest.approx(np.array(columns).T, rel=1e-6, abs=1e-8)
+    numerical = derivative(lambda e: exact(where, names, e), 1e-6, 15 + p)
+    assert jacobian(where, names) == pytest.approx(numerical, rel=1e-6, abs=1e-8)
 
 
 @pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
@@ -117,9 +106,8 @@ def test_first_order_over_the_working_volume(mount: str, Z: float) -> None:
 def test_first_order_with_a_lens() -> None:
     """Within 1 % of a million; of fewer, within four standard errors of a variance more."""
     n = 1_000_000 if NIGHTLY else 200_000
-    check = eb.check_first_order(
-        chain("eye_in_hand", LENS, 0.45, 40.0, 30.0), errors(0.45, 1.0, lens=True), n
-    )
+    where = chain("eye_in_hand", LENS, 0.45, 40.0, 30.0)
+    check = eb.check_first_order(where, errors(0.45, 1.0, lens=True), n)
     assert check.n == n
     assert check.worst < 0.01
     assert np.abs(check.first_order - check.monte_carlo).max() < 0.01 * check.first_order.max()
@@ -173,9 +161,8 @@ def test_depth_from_disparity_is_skewed_far_away() -> None:
 def test_the_parts_add() -> None:
     where, all_of_it = chain("eye_in_hand", LENS, 0.5, 701.0, 92.0), errors(0.5, 0.5, lens=True)
     nothing = eb.Covariances(names=PARAMETERS)
-    parts = ["pixel", "depth_sigma_m", "intrinsics", "hand_eye", "arm"]
-    total = sum(
-        eb.propagate(where, replace(nothing, **{part: getattr(all_of_it, part)})) for part in parts
-    )
+    names = ("pixel", "depth_sigma_m", "intrinsics", "hand_eye", "arm")
+    parts = [replace(nothing, **{name: getattr(all_of_it, name)}) for name in names]
+    total = sum(eb.propagate(where, part) for part in parts)
     assert eb.propagate(where, all_of_it) == pytest.approx(total, rel=1e-12)
     assert eb.propagate(where, nothing) == pytest.approx(np.zeros((3, 3)))

@@ -1,7 +1,5 @@
 """The fit: against OpenCV, numerical derivatives, dense algebra, and bad input."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

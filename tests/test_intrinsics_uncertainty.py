@@ -5,8 +5,6 @@ of a count. The fits of many sessions
 start at the true lens: where a fit starts does not change where it ends (test_intrinsics.py).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -16,14 +14,7 @@ from simulated_corners import CHARUCO, CHECKERBOARD, LENS, NIGHTLY, fit
 
 from coursekit import intrinsics
 from coursekit.boards import Board
-from coursekit.geometry import (
-    Intrinsics,
-    deproject,
-    invert_transform,
-    moved,
-    project,
-    transform_points,
-)
+from coursekit.geometry import deproject, invert_transform, moved, project, transform_points
 from coursekit.intrinsics.derivatives import parameter_vector, with_parameters
 from coursekit.intrinsics.fit import evaluate, image_grid
 from coursekit.simulation.corner_sessions import corner_session
@@ -35,7 +26,7 @@ PIXELS = np.array([[320.0, 240.0], [20, 20], [620, 460], [600, 100], [150, 400]]
 RANGES_M = (0.45, 2.0)
 
 
-def points_at(lens: Intrinsics, range_m: float) -> np.ndarray:
+def points_at(lens, range_m: float) -> np.ndarray:
     """What the camera sees at PIXELS, (5, 3), so far from its centre."""
     rays = deproject(PIXELS, np.ones(len(PIXELS)), lens.K, lens.dist)
     return range_m * rays / np.linalg.norm(rays, axis=1, keepdims=True)
@@ -68,9 +59,8 @@ def test_intervals_hold_the_truth_as_often_as_they_say(board: Board) -> None:
             low, high = result.interval(name)
             held[name].append(low <= value <= high)
         for range_m in RANGES_M:
-            for fixed, seen in zip(
-                ("world", "camera"), seen_again(result, truth.T_camera_board, range_m), strict=True
-            ):
+            both = seen_again(result, truth.T_camera_board, range_m)
+            for fixed, seen in zip(("world", "camera"), both, strict=True):
                 covariance = result.projection_covariance(seen, range_m, fixed)
                 sigma = np.sqrt(np.einsum("nii->ni", covariance))
                 held[fixed].append(np.abs(seen - PIXELS) <= result.quantile() * sigma)
@@ -92,9 +82,8 @@ def test_uncertainty_is_the_spread_over_repeated_sessions() -> None:
         seen = seen_again(result, truth.T_camera_board, 0.45)
         world.append(seen[0])
         camera.append(seen[1])
-    model = evaluate(
-        LENS, truth.T_camera_board, clean, CHARUCO, CHARUCO.points, result.names, "brown_conrady"
-    )
+    given = (CHARUCO, CHARUCO.points, result.names, "brown_conrady")
+    model = evaluate(LENS, truth.T_camera_board, clean, *given)
     expected = 0.08 * np.sqrt(np.diag(model.equations.shared_covariance))
     tolerance = 4 / math.sqrt(4 * SESSIONS)  # four sigmas of an empirical deviation
     np.testing.assert_allclose(np.std(values, axis=0) / expected, 1.0, atol=tolerance)
@@ -129,9 +118,8 @@ def test_map_is_projection_sigma_on_a_grid_and_that_the_worst_direction(result) 
 
 
 def test_a_very_distant_point_is_a_direction(result) -> None:
-    np.testing.assert_allclose(
-        result.uncertainty_map(1e7, (4, 4)), result.uncertainty_map(math.inf, (4, 4)), rtol=1e-4
-    )
+    far, nowhere = (result.uncertainty_map(r, (4, 4)) for r in (1e7, math.inf))
+    np.testing.assert_allclose(far, nowhere, rtol=1e-4)
     camera = [result.uncertainty_map(r, (4, 4), "camera") for r in (0.45, math.inf)]
     np.testing.assert_allclose(camera[0], camera[1])  # no range matters where nothing moves
 

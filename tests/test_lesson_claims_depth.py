@@ -1,10 +1,8 @@
 """Rows D1 to D16 of data/claims.csv: stereo depth and its noise.
 
-What simulated depth images show of D7 and D9 is proved in test_active_stereo.py: room light steepens
-the curve, nothing is right under the minimum range. What averaging does: test_stereo.py.
+What simulated depth images show of D7 and D9 (room light steepens the curve, nothing is right under
+the minimum range) is proved in test_active_stereo.py, and what averaging does in test_stereo.py.
 """
-
-from __future__ import annotations
 
 import math
 

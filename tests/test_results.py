@@ -1,14 +1,12 @@
 """The hand-over files: what goes in comes out, and nothing half-written or damaged passes."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from common import each, refusals
+from common import named, refusals
 
 from coursekit import results
 from coursekit.results import Covariance, Quantity
@@ -128,10 +126,8 @@ ASYMMETRIC, INDEFINITE, UNKNOWN = (
 )
 
 test_what_cannot_be_is_refused = refusals(
-    *each("^value: ", quantity, "value", float("nan"), "3", None),
-    *each("^sigma: ", quantity, "sigma", -1.0, float("inf")),
-    *each("^unit: ", quantity, "unit", ""),
-    *each("^kind: ", quantity, "kind", "random"),
-    *each("^lesson: ", lambda lesson: results.save(lesson, CAMERA, {}), "lesson", *NO_NAMES),
-    *each("^matrix: ", covariance, "matrix", np.eye(3), ASYMMETRIC, INDEFINITE, UNKNOWN),
+    *named(quantity, value=[float("nan"), "3", None], sigma=[-1.0, float("inf")]),
+    *named(quantity, unit=[""], kind=["random"]),
+    *named(lambda lesson: results.save(lesson, CAMERA, {}), lesson=NO_NAMES),
+    *named(covariance, matrix=[np.eye(3), ASYMMETRIC, INDEFINITE, UNKNOWN]),
 )

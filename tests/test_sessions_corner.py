@@ -1,23 +1,19 @@
 """Simulated corner-level sessions against OpenCV's projection and against brute force."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
-from common import CHARUCO, CHECKERBOARD, each, refusals
+from common import named, refusals
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
+from simulated_corners import CHARUCO, CHECKERBOARD, LENS
 
 from coursekit.boards import Board
 from coursekit.geometry import Intrinsics
 from coursekit.simulation.corner_sessions import Effects, bowed, corner_session, rolling_shutter
 
-LENS = Intrinsics(
-    640, 480, 612.0, 610.0, 322.0, 238.0, "brown_conrady", (-0.12, 0.08, 0.001, -0.0008, 0.02)
-)
 BOWED, LARGER = bowed(CHECKERBOARD, 1e-3), 1.03 * CHECKERBOARD.points
 
 
@@ -94,9 +90,8 @@ def test_an_effect_leaves_poses_and_noise_of_the_seed_as_they_are() -> None:
     healthy, truth = corner_session(CHARUCO, LENS, seed=5)
     spoiled, same = corner_session(CHARUCO, LENS, seed=5, effects=Effects(spoiled_px=3.0))
     assert (truth.T_camera_board == same.T_camera_board).all()
-    off = [
-        np.linalg.norm(a.pixels - b.pixels, axis=1) for a, b in zip(healthy, spoiled, strict=True)
-    ]
+    pairs = zip(healthy, spoiled, strict=True)
+    off = [np.linalg.norm(a.pixels - b.pixels, axis=1) for a, b in pairs]
     assert same.spoiled_view is not None
     assert np.allclose(off.pop(same.spoiled_view), 3.0)
     assert max(o.max() for o in off) == 0.0
@@ -128,9 +123,10 @@ def test_a_rolling_shutter_sees_each_corner_at_the_time_of_its_row() -> None:
             def at(time: float, point: np.ndarray = point, v: np.ndarray = velocity) -> np.ndarray:
                 return opencv((point + time * v)[None], np.eye(4))[0]
 
-            time = brentq(
-                lambda t, at=at: t - ((at(t)[1] + 0.5) / 480 - 0.5) * 0.02, -0.02, 0.02, xtol=1e-16
-            )
+            def late(time: float, at=at) -> float:
+                return time - ((at(time)[1] + 0.5) / 480 - 0.5) * 0.02
+
+            time = brentq(late, -0.02, 0.02, xtol=1e-16)
             assert np.abs(session[i].pixels[corner] - at(time)).max() < 1e-6
     assert moved > 0.3
 
@@ -158,12 +154,10 @@ def test_single_bad_corners_are_off_by_what_was_asked_for() -> None:
     healthy, _ = corner_session(CHARUCO, LENS, seed=11)
     session, truth = corner_session(CHARUCO, LENS, seed=11, effects=effects)
     assert len(truth.bad_corners) == 4
-    found = {
-        (i, int(corner))
-        for i, (a, b) in enumerate(zip(healthy, session, strict=True))
-        for corner in a.ids[np.linalg.norm(a.pixels - b.pixels, axis=1) > 1]
-    }
-    assert found == set(truth.bad_corners)
+    found = []
+    for i, (a, b) in enumerate(zip(healthy, session, strict=True)):
+        found += [(i, corner) for corner in a.ids[np.abs(a.pixels - b.pixels).max(axis=1) > 1]]
+    assert set(found) == set(truth.bad_corners)
 
 
 def session(board=CHARUCO, **changes):
@@ -173,14 +167,9 @@ def session(board=CHARUCO, **changes):
 FAR, FAST = np.array([[0.0, 0.1, 0.5]]), np.array([0.0, 500.0, 0.0])
 
 test_what_cannot_be_is_refused = refusals(
-    *each("focus_drift: got -0.1", Effects, "focus_drift", -0.1),
-    *each("bow_m", Effects, "bow_m", float("nan")),
-    *each("max_tilt_deg: got 80.0", Effects, "max_tilt_deg", 80.0),
-    *each("inner_only: got 0.4", Effects, "inner_only", 0.4),
-    *each("blur_share", Effects, "blur_share", 1.5),
-    *each("square_scale", Effects, "square_scale", 0.0),
-    *each("views: got 0", session, "views", 0),
-    *each("noise_px: got -1", session, "noise_px", -1),
+    *named(Effects, focus_drift=[-0.1], bow_m=[float("nan")], max_tilt_deg=[80.0]),
+    *named(Effects, inner_only=[0.4], blur_share=[1.5], square_scale=[0.0]),
+    *named(session, views=[0], noise_px=[-1]),
     ("board: 3.000 x 2.100 m does not fit", lambda: session(replace(CHECKERBOARD, square_m=0.3))),
     ("velocity: 500 m/s", lambda: rolling_shutter(FAR, FAST, 0.02, 480, LENS.K, None)),
 )

@@ -1,22 +1,15 @@
 """Rendered scenes against geometry done another way: triangles, planes, counting pixels."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
-from common import each, refusals
+from common import named, refusals
 from scipy.spatial.transform import Rotation
 
-from coursekit.geometry import (
-    Intrinsics,
-    invert_transform,
-    make_transform,
-    project,
-    transform_points,
-)
+from coursekit import geometry
+from coursekit.geometry import Intrinsics, invert_transform, make_transform, project
 from coursekit.simulation import Box, raycast, render, tabletop
 from coursekit.specifications import device, lens
 
@@ -30,7 +23,7 @@ SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 
 def box_triangles(box: Box, T_camera_scene: np.ndarray) -> np.ndarray:
     """The 12 triangles of a box, (12, 3 corners, 3), in the camera frame."""
-    corners = transform_points(T_camera_scene @ box.T_scene_box, SIGNS * box.size_m / 2)
+    corners = geometry.transform_points(T_camera_scene @ box.T_scene_box, SIGNS * box.size_m / 2)
     # of each side the corners are in the order --, -+, +-, ++
     sides = [np.flatnonzero(SIGNS[:, axis] == sign) for axis in range(3) for sign in (-1, 1)]
     return np.concatenate([corners[side[[[0, 1, 2], [3, 1, 2]]]] for side in sides])
@@ -86,11 +79,8 @@ def test_random_rays_agree_with_moeller_trumbore(which):
     v, u = np.divmod(rng.choice(result.depth_m.size, 3000, replace=False), result.depth_m.shape[1])
     small = np.argwhere(result.object_index >= BLOCK)  # they cover few pixels: take some on purpose
     v, u = np.concatenate([np.stack([v, u]), small[rng.integers(len(small), size=500)].T], axis=1)
-    pixels, lens_of = (
-        np.stack([u, v], -1).astype(float),
-        (intrinsics.K, np.array(intrinsics.coeffs)),
-    )
-    xy = cv2.undistortPointsIter(pixels[:, None], *lens_of, None, None, (3, 500, 1e-15))[:, 0]
+    pixels, dist = np.stack([u, v], -1)[:, None].astype(float), np.array(intrinsics.coeffs)
+    xy = cv2.undistortPointsIter(pixels, intrinsics.K, dist, None, None, (3, 500, 1e-15))[:, 0]
     rays = np.column_stack([xy, np.ones(len(xy))])
     depth, index = moeller_trumbore(rays, scene, T_scene_camera)
     assert np.array_equal(index, result.object_index[v, u])
@@ -132,9 +122,9 @@ def test_both_cameras_see_the_whole_of_both_objects():
     for distance in (0.30, 0.45, 0.60):
         scene = tabletop(distance)
         for box in scene[BLOCK:]:
-            corners = transform_points(box.T_scene_box, SIGNS * box.size_m / 2)
+            corners = geometry.transform_points(box.T_scene_box, SIGNS * box.size_m / 2)
             for intrinsics, T in ((UNIT.depth, np.eye(4)), (UNIT.color, UNIT.T_color_depth)):
-                pixels = project(transform_points(T, corners), intrinsics.K)
+                pixels = project(geometry.transform_points(T, corners), intrinsics.K)
                 assert (pixels > 20).all()
                 assert (pixels < np.array(intrinsics.size) - 20).all()
 
@@ -183,9 +173,8 @@ def test_shapes_types_and_repeatability():
 
 def test_colours_tell_the_objects_apart():
     result = render(tabletop(), UNIT.color, invert_transform(UNIT.T_color_depth))
-    wall, table, block, cube = (
-        np.median(result.color[result.object_index == i], axis=0) for i in range(4)
-    )
+    each_object = [result.color[result.object_index == i] for i in range(4)]
+    wall, table, block, cube = (np.median(colors, axis=0) for colors in each_object)
     assert np.ptp(block) < 20  # grey
     assert cube[0] > cube[1] > cube[2] + 80  # orange
     assert table[0] > table[2] + 30  # brown
@@ -247,9 +236,8 @@ def test_a_hit_names_the_face_and_where_on_it():
         start = rng.uniform(-0.3, 0.3, 3)
         start[axis] = sign * 0.9
         start_out, point_out = T[:3, :3] @ start + T[:3, 3], T[:3, :3] @ point + T[:3, 3]
-        t, index, hit_face, p, q = raycast.nearest_hit(
-            row, *start_out, *(point_out - start_out) / 2
-        )
+        half_way = (point_out - start_out) / 2
+        t, index, hit_face, p, q = raycast.nearest_hit(row, *start_out, *half_way)
         assert (index, hit_face) == (0, face)
         assert (t, p, q) == pytest.approx((2, *point[others]), abs=1e-12)
         outwards = start_out - point_out
@@ -290,13 +278,13 @@ STACKED, IN_THE_BLOCK = np.stack([np.eye(4)] * 2), pose((0, 0, 0), (0, 0, 0.48))
 NO_POSES = (np.eye(3), 2 * np.eye(4), STACKED, IN_THE_BLOCK)
 
 test_bad_input_is_named = refusals(
-    *each("^distance_m: ", tabletop, "distance_m", 0, -1, float("nan"), "0.45", True),
-    *each("^wall_behind_m: ", tabletop, "wall_behind_m", 0.05),
-    *each("^scene: ", picture, "scene", tabletop()[0], ("wall",)),
-    *each("^intrinsics: ", picture, "intrinsics", UNIT.depth.K),
-    *each("^T_scene_camera: ", picture, "T_scene_camera", *NO_POSES),
-    *each("^size_m: ", box, "size_m", (1, 0, 1), (1, 1), (1, 1, np.inf)),
-    *each("^T_scene_box: ", box, "T_scene_box", np.diag([1, 1, -1, 1])),
-    *each("^color: ", box, "color", (255, 0, 0), "red"),
-    *each("^texture: ", box, "texture", "marble"),
+    *named(tabletop, distance_m=[0, -1, float("nan"), "0.45", True], wall_behind_m=[0.05]),
+    *named(
+        picture,
+        scene=[tabletop()[0], ("wall",)],
+        intrinsics=[UNIT.depth.K],
+        T_scene_camera=NO_POSES,
+    ),
+    *named(box, size_m=[(1, 0, 1), (1, 1), (1, 1, np.inf)], color=[(255, 0, 0), "red"]),
+    *named(box, T_scene_box=[np.diag([1, 1, -1, 1])], texture=["marble"]),
 )

@@ -1,7 +1,5 @@
 """The tables of cameras and lenses: every figure that ships, and what a wrong name says."""
 
-from __future__ import annotations
-
 import os
 import re
 import tomllib
@@ -13,23 +11,21 @@ import numpy as np
 import pytest
 from common import refusals
 
+from coursekit.geometry import deproject
 from coursekit.results import read_json
 from coursekit.specifications import DATA, Nominal, device, device_names, lens, published_noise
 from coursekit.stereo import depth_noise
 
-DEVICES, LENSES = (
-    tomllib.loads((DATA / file).read_text("utf-8")) for file in ("devices.toml", "lenses.toml")
-)
+TABLES = [DATA / "devices.toml", DATA / "lenses.toml"]
+DEVICES, LENSES = (tomllib.loads(path.read_text("utf-8")) for path in TABLES)
 REAL = os.environ.get("COURSEKIT_REAL_DATA")
 needs_real = pytest.mark.skipif(not REAL, reason="COURSEKIT_REAL_DATA is not set")
 
 
 def test_the_848_crop_follows_the_rule_that_published_units_follow():
     """(f, cx, cy) at 640x480 and 848x480 of two units, librealsense 3474, realsense-ros 2788."""
-    d435, d455 = (
-        (unit.depth.fx, unit.depth.cx, unit.depth.cy)
-        for unit in (device("D435").unit, device("D455").unit)
-    )
+    depths = (device("D435").unit.depth, device("D455").unit.depth)
+    d435, d455 = ((depth.fx, depth.cx, depth.cy) for depth in depths)
     for small, large, tolerance in (
         ((382.918884, 321.015106, 235.879822), (422.806274, 425.120850, 235.450638), 1e-4),
         ((384.207489, 319.480408, 236.351501), (424.229095, 423.426300, 236.046249), 0.08),
@@ -84,20 +80,16 @@ def test_the_d405_sees_colour_with_its_left_imager():
     # 640x480 is the middle of 768x480, which is the 1280x800 imager scaled by 0.6.
     ends = np.array([[0.0, 240.0], [640.0, 240.0]])
     larger = (ends - (320, 240)) / 0.6 + (640, 360)
-    rays = [
-        (points - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-        for points, camera in ((ends, unit.color), (larger, published))
-    ]
-    np.testing.assert_allclose(rays[0], rays[1], atol=1e-6)
+    one, other = (deproject(ends, 1.0, unit.color.K), deproject(larger, 1.0, published.K))
+    np.testing.assert_allclose(one, other, atol=1e-6)
 
 
 def test_units_derived_from_larger_images():
     """The D415's depth from librealsense issue 1430, its colour from issue 5658."""
     depth, color = device("D415").unit.depth, device("D415").unit.color
     assert depth.fx == depth.fy == pytest.approx(940.924011 * 848 / 1280, abs=1e-5)
-    assert (depth.cx, depth.cy) == pytest.approx(
-        (636.445312 * 848 / 1280, (359.391479 - 360) * 848 / 1280 + 240), abs=1e-5
-    )
+    assert depth.cx == pytest.approx(636.445312 * 848 / 1280, abs=1e-5)
+    assert depth.cy == pytest.approx((359.391479 - 360) * 848 / 1280 + 240, abs=1e-5)
     assert (color.fx, color.cy) == pytest.approx((925.769 / 1.5, 376.119 / 1.5), abs=1e-3)
 
 
