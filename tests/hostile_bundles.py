@@ -1,7 +1,8 @@
 """Bundles made to do harm, or damaged: for each kind its bytes, and the reason of its refusal.
 
-`submission()` is a small honest one; most kinds are it with one thing wrong and everything else
-right (hashes and checksums too), so that what refuses them is the check that they are about.
+`ZOE` is a small honest one, a bundle of some 3 kB; most kinds are it with one thing wrong and
+everything else right (hashes and checksums too), so that what refuses them is the check that they
+are about.
 """
 
 from __future__ import annotations
@@ -15,10 +16,9 @@ import pickle
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -57,11 +57,6 @@ ZOE = bundle.Submission(
 )
 
 
-def submission(**changes: Any) -> bundle.Submission:
-    """A small honest one, a bundle of some 3 kB; `changes` by field."""
-    return replace(ZOE, **changes)
-
-
 # --- taking a bundle apart, and packing it again ---
 
 
@@ -71,7 +66,7 @@ def parts(data: bytes) -> Parts:
         return {name: archive.read(name) for name in archive.namelist()}
 
 
-HONEST = bundle.bundle_bytes(submission())
+HONEST = bundle.bundle_bytes(ZOE)
 MEMBERS = parts(HONEST)
 DIRECTORY, END_RECORD = HONEST.index(b"PK\x01\x02"), HONEST.rindex(b"PK\x05\x06")
 
@@ -124,13 +119,7 @@ def with_text(name: str, old: str, new: str) -> bytes:
     return with_member(name, written.replace(old, new, 1).encode())
 
 
-def npy(
-    descr: str = "'<u2'",
-    shape: str = "(3, 4, 5)",
-    fortran: str = "False",
-    content: bytes = bytes(120),
-    version: bytes = b"\x01\x00",
-) -> bytes:
+def npy(descr="'<u2'", shape="(3, 4, 5)", fortran="False", content=bytes(120), version=b"\1\0"):
     """A .npy file with any header."""
     header = f"{{'descr': {descr}, 'fortran_order': {fortran}, 'shape': {shape}, }}\n".encode()
     return b"\x93NUMPY" + version + struct.pack("<H", len(header)) + header + content
@@ -196,12 +185,6 @@ def inserted(at: int, junk: bytes) -> bytes:
     return data[:at] + junk + data[at:]
 
 
-def with_locator() -> bytes:
-    """The honest bundle with a zip64 locator before its end, counted to the directory."""
-    data = HONEST[:END_RECORD] + b"PK\x06\x07" + bytes(16) + HONEST[END_RECORD:]
-    return patched(data, END_RECORD + 20, END, size=END_RECORD + 20 - DIRECTORY)
-
-
 def with_deflated(stream: bytes, size: int, crc: int) -> bytes:
     """A zip whose one member, the manifest, has this deflate stream, size and checksum."""
     fields = (20, 0, 8, 0, 33, crc, len(stream), size, 13)
@@ -252,22 +235,13 @@ def _a_million(seed: int) -> np.ndarray:
 # --- the kinds ---
 
 
-class Hostile(NamedTuple):
-    """One kind: what it is, the reason that its refusal has to give, and its bytes.
+def hostile() -> Kinds:
+    """Every kind, each once: what it is, the reason that its refusal has to give, and its bytes.
 
     Without a reason it is read: what was added to it is nowhere in what comes out.
     """
-
-    name: str
-    reason: str
-    data: bytes
-
-
-def hostile() -> Iterator[Hostile]:
-    """Every kind, each once."""
-    for group in (_files, _zips, _headers, _names, _hashes, _jsons, _values, _arrays):
-        for name, (reason, data) in group().items():
-            yield Hostile(name, reason, data)
+    groups = (_files, _zips, _headers, _names, _hashes, _jsons, _values, _arrays)
+    return {name: kind for group in groups for name, kind in group().items()}
 
 
 def _files() -> Kinds:
@@ -290,6 +264,8 @@ def _files() -> Kinds:
 
 def _zips() -> Kinds:
     second = headers(HONEST, "facts.json")[0]
+    large = HONEST[:END_RECORD] + b"PK\x06\x07" + bytes(16) + HONEST[END_RECORD:]  # zip64's locator
+    large = patched(large, END_RECORD + 20, END, size=END_RECORD + 20 - DIRECTORY)
     twice = zip_bytes({"facts.json": b"{}", "factz.json": b"{}"})  # zipfile would warn
     return {
         "no members": ("missing_member", zip_bytes({})),
@@ -305,7 +281,7 @@ def _zips() -> Kinds:
         "a split zip": ("not_plain", lying_end(disk=1)),
         "a member elsewhere": ("not_plain", lying("facts.json", disk=1)),
         "a large zip": ("not_plain", lying_end(here=0xFFFF, count=0xFFFF)),
-        "a large zip's locator": ("not_a_zip", with_locator()),
+        "a large zip's locator": ("not_a_zip", large),
         "a large member": ("too_large", lying("times_1.npy", packed=0xFFFFFFFF)),
         "streamed": ("not_plain", zipped(MEMBERS, streamed=True)),
         "extra fields": ("not_plain", zipped(MEMBERS, "facts.json", extra=b"\x55\x54\x01\0\0")),
@@ -383,7 +359,7 @@ def _hashes() -> Kinds:
     resized = placed(json.loads(MEMBERS["manifest.json"]), ("members", "depth_0.npy", "bytes"), 9)
     counts, times = _a_million(2), np.arange(244) / 30
     stacks = [Stack(z, (400, 200, 64, 64), counts, times) for z in (0.3, 0.6)]
-    full = parts(bundle.bundle_bytes(submission(stacks=stacks)))  # as much as a bundle may hold
+    full = parts(bundle.bundle_bytes(replace(ZOE, stacks=stacks)))  # as much as a bundle may hold
     full["depth_1.npy"] = full["depth_1.npy"][:-1] + bytes([full["depth_1.npy"][-1] ^ 1])
     return {
         "one raw value changed": ("wrong_hash", unhashed("depth_0.npy", depth)),

@@ -17,19 +17,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
 from coursekit import specifications
+from coursekit.submission import format as bundle
 from coursekit.submission.flags import Fingerprint, data_flags, fingerprint
-from coursekit.submission.format import (
-    CameraFacts,
-    Claims,
-    Conclusion,
-    Outcome,
-    Plot,
-    Stack,
-    Submission,
-    TableRow,
-)
+from coursekit.submission.format import CameraFacts, Outcome, Plot, Stack, Submission, TableRow
 from coursekit.submission.recompute import Recomputed, recompute
-from coursekit.submission.rubric import Grade, Item, judged
+from coursekit.submission.rubric import JUDGES, Grade, Item, judged
 
 DISTANCES = (0.30, 0.45, 0.60)
 MADE = "2026-03-02T10:00:00+00:00"
@@ -40,6 +32,7 @@ PARAGRAPH = (
     "the mean of thirty frames makes the noise smaller still. So the bias dominates: calibrate it."
 )
 SIMULATED = {"source": "simulated", "name": "Simulated D435", "serial": "seed-7"}
+OUTCOMES = {"depth_noise.twice_as_far": Outcome(True, 1), "depth_noise.width": Outcome(False, 2)}
 Counts = NDArray[Any]
 Random = np.random.Generator
 
@@ -55,18 +48,8 @@ def camera(seed: int = 0, **changes: Any) -> CameraFacts:
     return replace(facts, **changes)
 
 
-def depths(
-    random: Random,
-    facts: CameraFacts,
-    distance_m: float,
-    frames: int = 100,
-    size: int = 40,
-    sigma_d: float = 0.065,
-    holes: float = 0.01,
-    scale_error: float = -0.006,
-    offset_px: float = 0.1,
-) -> Counts:
-    """Raw counts (frames, size, size) of a block's face at a distance."""
+def depths(random, facts, z, frames=100, size=40, sigma_d=0.065, holes=0.01, error=(-0.006, 0.1)):
+    """Raw counts (frames, size, size) of a block's face at z metres; error: in scale, and in px."""
     wide, inner = size + 2 * MATCHING_PX, slice(MATCHING_PX, -MATCHING_PX)
     shape = (frames, wide, wide)
     noise = uniform_filter(random.standard_normal(shape, np.float32), (1, MATCHING_PX, MATCHING_PX))
@@ -77,11 +60,11 @@ def depths(
     for i, kick in enumerate(random.standard_normal(frames)):
         drift[i] = (0.989 * drift[i - 1] if i else 0.0) + 0.008 * 0.148 * kick
     v, u = np.indices((size, size)) - (size - 1) / 2
-    plane = distance_m * (1 + 2e-5 * u + 1e-5 * v)
+    plane = z * (1 + 2e-5 * u + 1e-5 * v)
     product = facts.fx * facts.baseline_m
-    true = product / (plane * (1 + scale_error)) + offset_px
-    z = product / (true + pattern + noise + drift[:, None, None])
-    counts = np.rint(z / facts.depth_scale_m)
+    true = product / (plane * (1 + error[0])) + error[1]
+    measured = product / (true + pattern + noise + drift[:, None, None])
+    counts = np.rint(measured / facts.depth_scale_m)
     hole = uniform_filter(random.standard_normal((size, size)), 5) * 5
     often = hole > np.quantile(hole, 1 - 2 * holes) if holes else np.zeros((size, size), bool)
     counts[often & (random.random(counts.shape) < 0.5)] = 0
@@ -96,9 +79,7 @@ def clock(random: Random, start_s: float, frames: int) -> NDArray[np.float64]:
     return start_s + np.cumsum(steps)
 
 
-def stacks_of(
-    random: Random, make: Callable[[float], Counts], distances: tuple[float, ...] = DISTANCES
-) -> tuple[Stack, ...]:
+def stacks_of(random: Random, make: Callable[[float], Counts], distances=DISTANCES):
     """The counts that `make` gives for each distance, measured one a minute."""
     stacks = []
     for i, z in enumerate(distances):
@@ -109,7 +90,7 @@ def stacks_of(
     return tuple(stacks)
 
 
-def claims_of(submission: Submission) -> Claims:
+def claims_of(submission: Submission) -> bundle.Claims:
     """What an honest student claims. Levels, stds and holes by NumPy; errors and fits by the kit.
 
     A level is the mean over the pixels' means, a std that of each pixel with the squares pooled.
@@ -122,7 +103,7 @@ def claims_of(submission: Submission) -> Claims:
         std = round(float(np.sqrt(z.var(axis=0, ddof=1).mean())), 3)
         holes = round(float((m.stack.counts == 0).mean()), 3)
         rows.append(TableRow(m.distance_m, bias, m.bias_se_mm, std, m.std.se, holes))
-    return Claims(tuple(rows), round(found.law.sigma_d_px, 3), found.law.sigma_d_interval_px)
+    return bundle.Claims(tuple(rows), round(found.law.sigma_d_px, 3), found.law.sigma_d_interval_px)
 
 
 def exact(submission: Submission) -> Submission:
@@ -132,32 +113,27 @@ def exact(submission: Submission) -> Submission:
         TableRow(m.distance_m, m.bias.value, m.bias_se_mm, m.std.value, m.std.se, m.invalid.value)
         for m in found.at
     )
-    law, free = found.law, found.free
-    sigma_d, exponent = (
-        (law.sigma_d_px, law.sigma_d_interval_px),
-        (free.exponent, free.exponent_interval),
-    )
-    return replace(submission, claims=Claims(rows, *sigma_d, *exponent))
+    sigma_d = found.law.sigma_d_px, found.law.sigma_d_interval_px
+    exponent = found.free.exponent, found.free.exponent_interval
+    return replace(submission, claims=bundle.Claims(rows, *sigma_d, *exponent))
 
 
-def honest(
-    seed: int = 0, frames: int = 100, of_camera: dict[str, Any] | None = None, **changes: Any
-) -> Submission:
+def honest(seed: int = 0, frames: int = 100, of_camera=(), **changes: Any) -> Submission:
     """A submission that deserves full points; `changes` are fields to replace afterwards."""
-    whole = _honest(seed, frames, tuple(sorted((of_camera or {}).items())))
+    whole = _honest(seed, frames, tuple(sorted(dict(of_camera).items())))
     return replace(whole, **changes) if changes else whole
 
 
 @cache
 def _honest(seed: int, frames: int, of_camera: tuple[tuple[str, Any], ...]) -> Submission:
     random, facts = np.random.default_rng(seed), camera(seed, **dict(of_camera))
-    scale_error, offset_px = float(random.normal(0, 0.006)), float(random.normal(0, 0.1))
+    error = float(random.normal(0, 0.006)), float(random.normal(0, 0.1))
     sigma_d = 0.065 * float(random.uniform(0.7, 1.4))
 
     def make(z: float) -> Counts:
         local = sigma_d * float(random.uniform(0.92, 1.08))
         holes, size = float(random.choice([0.0, 0.005, 0.02])), 33 if z == DISTANCES[2] else 40
-        return depths(random, facts, z, frames, size, local, holes, scale_error, offset_px)
+        return depths(random, facts, z, frames, size, local, holes, error)
 
     return finished(facts, stacks_of(random, make), f"Student {seed}")
 
@@ -178,10 +154,8 @@ def items(submission: Submission, topic: str = "") -> list[Item]:
 
 
 @cache
-def _measured(
-    stacks: tuple[Stack, ...], facts: CameraFacts, tape_sigma_m: float
-) -> tuple[Recomputed, Fingerprint]:
-    whole = honest(stacks=stacks, camera=facts, tape_sigma_m=tape_sigma_m)
+def _measured(stacks, camera, tape_sigma_m) -> tuple[Recomputed, Fingerprint]:
+    whole = honest(stacks=stacks, camera=camera, tape_sigma_m=tape_sigma_m)
     return recompute(whole), fingerprint(whole)
 
 
@@ -195,14 +169,10 @@ def finished(facts: CameraFacts, stacks: tuple[Stack, ...], student: str) -> Sub
         tape_sigma_m=0.0 if facts.source == "simulated" else 0.001,
         caliper_m=0.06,
         stacks=stacks,
-        claims=Claims(),
+        claims=bundle.Claims(),
         plot=None,
-        conclusion=Conclusion(),
-        outcomes={
-            "depth_noise.twice_as_far": Outcome(True, 1),
-            "depth_noise.width": Outcome(False, 2),
-            "depth_noise.depth_noise": Outcome(True, 3),
-        },
+        conclusion=bundle.Conclusion(),
+        outcomes=OUTCOMES,
     )
     found, claims = recompute(empty), claims_of(empty)
     at = tuple(row.distance_m for row in claims.rows)
@@ -210,7 +180,7 @@ def finished(facts: CameraFacts, stacks: tuple[Stack, ...], student: str) -> Sub
     plot = Plot(at, tuple(row.depth_std_mm for row in claims.rows), predicted)
     middle = found.at[len(found.at) // 2]
     dominates = "bias" if abs(middle.bias.value) > middle.noise_of_mean_mm(30) else "noise"
-    conclusion = Conclusion(middle.distance_m, 30, dominates, PARAGRAPH)
+    conclusion = bundle.Conclusion(middle.distance_m, 30, dominates, PARAGRAPH)
     return replace(empty, claims=claims, plot=plot, conclusion=conclusion)
 
 
@@ -252,63 +222,41 @@ def mistaken(seed: int = 0) -> dict[str, tuple[str, Submission]]:
     # Depths in tenths of a millimetre, a bias and holes: mistakes that would hide otherwise show.
     facts, random = camera(seed, depth_scale_m=1e-4), np.random.default_rng(seed)
     sigmas = dict(zip(DISTANCES, (0.060, 0.068, 0.064), strict=True))
-    far = (0.03, -0.012, 0.2)
-    stacks = stacks_of(random, lambda z: depths(random, facts, z, 100, 40, sigmas[z], *far))
-    good = finished(facts, stacks, f"Student {seed}")
+
+    def make(z: float) -> Counts:
+        return depths(random, facts, z, sigma_d=sigmas[z], holes=0.03, error=(-0.012, 0.2))
+
+    good = finished(facts, stacks_of(random, make), f"Student {seed}")
     found = recompute(good)
     m, row, law, free = found.at[1], good.claims.rows[1], found.law, found.free
-    z, bias, std, stats = m.z_mm, row.depth_bias_mm, row.depth_std_mm, m.stats
+    z, bias, std = m.z_mm, row.depth_bias_mm, row.depth_std_mm
     invalid, product = row.invalid_fraction, facts.fx * facts.baseline_m
-    numbers: dict[str, tuple[str, dict[str, float]]] = {  # of the row at 0.45 m
-        "bias": (
-            "depth_bias_mm",
-            {
-                "sign": -bias,
-                "metres": bias / 1000,
-                "counts": bias / (1e3 * facts.depth_scale_m),
-                "level": 1e3 * m.distance_m + bias,
-                "zeros": float(np.nan_to_num(z).mean()) - 450,
-            },
-        ),
-        "bias_se": (
-            "depth_bias_se_mm",
-            {
-                "not_divided": std,
-                "independent": std / z.size**0.5,
-                "tape_only": 0.1,
-                "no_tape": m.bias_se_apart_mm,
-            },
-        ),
-        "std": (
-            "depth_std_mm",
-            {
-                "of_the_mean": float(np.nanmean(z, axis=(1, 2)).std(ddof=1)),
-                "standard_error": std / 10,
-                "variance": std**2,
-                "spatial": 1e3 * stats.spatial_std_m,
-                "mixed": float(np.nanstd(z)),
-            },
-        ),
-        "std_se": (
-            "depth_std_se_mm",
-            {"one_pixel": std / 198**0.5, "close": 1.7 * row.depth_std_se_mm},
-        ),
-        "invalid": (
-            "invalid_fraction",
-            {
-                "percent": 100 * invalid,
-                "complement": 1 - invalid,
-                "ever": float(np.isnan(z).any(axis=0).mean()),
-            },
-        ),
+    numbers = {  # of the row at 0.45 m
+        "sign": ("bias", -bias),
+        "metres": ("bias", bias / 1000),
+        "counts": ("bias", bias / (1e3 * facts.depth_scale_m)),
+        "level": ("bias", 1e3 * m.distance_m + bias),
+        "zeros": ("bias", float(np.nan_to_num(z).mean()) - 450),
+        "not_divided": ("bias_se", std),
+        "independent": ("bias_se", std / z.size**0.5),
+        "tape_only": ("bias_se", 0.1),
+        "no_tape": ("bias_se", m.bias_se_apart_mm),
+        "of_the_mean": ("std", float(np.nanmean(z, axis=(1, 2)).std(ddof=1))),
+        "standard_error": ("std", std / 10),
+        "variance": ("std", std**2),
+        "spatial": ("std", 1e3 * m.stats.spatial_std_m),
+        "mixed": ("std", float(np.nanstd(z))),
+        "one_pixel": ("std_se", std / 198**0.5),
+        "close": ("std_se", 1.7 * row.depth_std_se_mm),
+        "percent": ("invalid", 100 * invalid),
+        "complement": ("invalid", 1 - invalid),
+        "ever": ("invalid", float(np.isnan(z).any(axis=0).mean())),
     }
     tapes = {"tape_only": 0.0001, "no_tape": 0}
-    wrong = {
-        code: (topic, replace(with_row(good, 1, **{field: value}), tape_sigma_m=tape))
-        for topic, (field, values) in numbers.items()
-        for code, value in values.items()
-        for tape in [tapes.get(code, good.tape_sigma_m)]
-    }
+    wrong = {}
+    for code, (topic, value) in numbers.items():
+        changed = with_row(good, 1, **{JUDGES[topic][0]: value})
+        wrong[code] = topic, replace(changed, tape_sigma_m=tapes.get(code, good.tape_sigma_m))
     coarse = honest(seed)
     near = recompute(coarse).at[0]
     each = near.z_mm[:, np.isfinite(near.z_mm).all(axis=0)].std(axis=0, ddof=1)
@@ -377,9 +325,7 @@ def copied(original: Submission, how: str) -> Submission:
     return finished(facts, tuple(stacks), "Copying Student")
 
 
-def _made_up(
-    make: Callable[[Random, CameraFacts, float], Counts], seed: int, **of_camera: Any
-) -> Submission:
+def _made_up(make: Callable[..., Counts], seed: int, **of_camera: Any) -> Submission:
     random, facts = np.random.default_rng(seed), camera(seed, **of_camera)
     return finished(facts, stacks_of(random, lambda z: make(random, facts, z)), "Inventive Student")
 

@@ -46,7 +46,10 @@ def test_record_writes_a_recording_and_says_how_to_play_it(tmp_path, capsys):
         ("record --out a.db3 --frames 3 --camera=", "which: got '', want"),
         ("board --out a.pdf --squares 9x6 --square-mm 40", "paper: a board of 360 x 240 mm does"),
         ("board --out a.pdf --squares 9x1 --square-mm 25", "squares: got (9, 1), want (columns, "),
-        ("board --out a.pdf --squares 9x6 --square-mm -1", "square_m: got -0.001, want a positi"),
+        (
+            "board --out a.pdf --squares 9x6 --square-mm -1",
+            "square_m: got -0.001, want 0.0005 to",
+        ),
     ],
 )
 def test_a_failure_is_one_line_and_exit_code_1(arguments, message, tmp_path, monkeypatch, capsys):
@@ -79,7 +82,7 @@ def test_board_writes_a_sheet_and_says_what_it_is(tmp_path, capsys):
 
 
 BOARD = "board --squares 9 --square-mm 25 --out a.pdf"
-WRONG = ["", "fly", "board", BOARD, "record", "record --out a.db3", "record --frames x"]
+WRONG = ["", "fly", "board", BOARD, "record", "record --out a.db3", "record --frames x", "grade ."]
 
 
 @pytest.mark.parametrize("arguments", WRONG)

@@ -26,24 +26,10 @@ from hostile_bundles import (
 )
 
 from coursekit.submission import format as bundle
-from coursekit.submission.format import (
-    SCHEMA,
-    Claims,
-    Conclusion,
-    Outcome,
-    Plot,
-    Refused,
-    Stack,
-    Submission,
-    TableRow,
-    bundle_bytes,
-    read_bundle,
-    write_bundle,
-    zip_bytes,
-)
+from coursekit.submission.format import Claims, Conclusion, Outcome, Plot, Refused, Stack, TableRow
 
 
-def same(one: Submission, other: Submission) -> bool:
+def same(one: bundle.Submission, other: bundle.Submission) -> bool:
     """Equal in every field, and every array bit for bit."""
     plain = [field.name for field in fields(one) if field.name != "stacks"]
     return all(getattr(one, name) == getattr(other, name) for name in plain) and all(
@@ -58,10 +44,10 @@ def same(one: Submission, other: Submission) -> bool:
 
 
 def test_what_goes_in_comes_out(tmp_path):
-    path = write_bundle(tmp_path / "new" / "studio_1_zoe.zip", ZOE)
+    path = bundle.write_bundle(tmp_path / "new" / "studio_1_zoe.zip", ZOE)
     assert path == tmp_path / "new" / "studio_1_zoe.zip"
     assert [p.name for p in path.parent.iterdir()] == [path.name]  # nothing left over
-    for found in (read_bundle(path), read_bundle(path.read_bytes())):
+    for found in (bundle.read_bundle(path), bundle.read_bundle(path.read_bytes())):
         assert same(found, ZOE)
         assert found.stacks[0].counts.dtype == np.uint16
         assert found.stacks[0].times_s.dtype == np.float64
@@ -99,29 +85,29 @@ UNUSUAL = {
 @pytest.mark.parametrize("kind", UNUSUAL)
 def test_unusual_but_honest(kind):
     given = replace(ZOE, **UNUSUAL[kind])
-    data = bundle_bytes(given)
+    data = bundle.bundle_bytes(given)
     assert len(data) < 600_000
-    assert same(read_bundle(data), given)
+    assert same(bundle.read_bundle(data), given)
 
 
 def test_same_bytes_every_time_however_arrays_lie_in_memory():
-    assert bundle_bytes(ZOE) == bundle_bytes(read_bundle(HONEST)) == HONEST
+    assert bundle.bundle_bytes(ZOE) == bundle.bundle_bytes(bundle.read_bundle(HONEST)) == HONEST
     one, two = ZOE.stacks
     spread = np.repeat(one.times_s, 2)[::2]
     turned = replace(one, counts=np.asfortranarray(one.counts), times_s=spread)
-    assert bundle_bytes(replace(ZOE, stacks=(turned, two))) == HONEST
+    assert bundle.bundle_bytes(replace(ZOE, stacks=(turned, two))) == HONEST
 
 
 # --- writing ---
 
 
 def test_never_overwritten_without_being_told(tmp_path):
-    path = write_bundle(tmp_path / "a.zip", ZOE)
+    path = bundle.write_bundle(tmp_path / "a.zip", ZOE)
     with pytest.raises(FileExistsError, match="overwrite=True"):
-        write_bundle(path, replace(ZOE, student="Max"))
+        bundle.write_bundle(path, replace(ZOE, student="Max"))
     assert path.read_bytes() == HONEST
-    write_bundle(path, replace(ZOE, student="Max"), overwrite=True)
-    assert read_bundle(path).student == "Max"
+    bundle.write_bundle(path, replace(ZOE, student="Max"), overwrite=True)
+    assert bundle.read_bundle(path).student == "Max"
 
 
 def test_as_much_as_a_submission_may_hold_fits():
@@ -146,19 +132,20 @@ def test_as_much_as_a_submission_may_hold_fits():
         conclusion=Conclusion(0.3, 10**6, "noise", word[:1] * 4_999 + "1"),
         outcomes={f"{i:03d}_{'a' * 96}": Outcome(False, 10**6) for i in range(100)},
     )
-    data = bundle_bytes(given)
+    data = bundle.bundle_bytes(given)
     assert 4e6 < len(data) < 5 * 2**20
-    assert same(read_bundle(data), given)
+    assert same(bundle.read_bundle(data), given)
 
 
-def test_interrupted_writing_leaves_nothing(tmp_path, monkeypatch):
+@pytest.mark.parametrize("step", ["write_bytes", "replace"])
+def test_interrupted_writing_leaves_nothing(step, tmp_path, monkeypatch):
     def full(*_):
         raise OSError("No space left on device")
 
-    path = write_bundle(tmp_path / "a.zip", ZOE)
-    monkeypatch.setattr(Path, "replace", full)
+    path = bundle.write_bundle(tmp_path / "a.zip", ZOE)
+    monkeypatch.setattr(Path, step, full)
     with pytest.raises(OSError, match="No space"):
-        write_bundle(path, replace(ZOE, student="Max"), overwrite=True)
+        bundle.write_bundle(path, replace(ZOE, student="Max"), overwrite=True)
     assert path.read_bytes() == HONEST
     assert [p.name for p in tmp_path.iterdir()] == ["a.zip"]
 
@@ -184,17 +171,17 @@ def test_every_raw_value_and_every_number_claimed_counts(name):
     assert len(several) >= 2
     for changed in several:
         with pytest.raises(Refused, match="does not match its own manifest") as refused:
-            read_bundle(unhashed(name, changed))
+            bundle.read_bundle(unhashed(name, changed))
         assert refused.value.reason == "wrong_hash"
     if name.endswith(".npy"):
-        assert not same(read_bundle(with_member(name, changed)), ZOE)
+        assert not same(bundle.read_bundle(with_member(name, changed)), ZOE)
 
 
 def test_the_student_can_be_renamed_by_hand():
     """What FORMAT.md says the manifest does not protect against: it is no signature."""
     manifest = json.loads(MEMBERS["manifest.json"]) | {"student": "Max"}
     renamed = unhashed("manifest.json", json.dumps(manifest).encode())
-    assert read_bundle(renamed).student == "Max"
+    assert bundle.read_bundle(renamed).student == "Max"
 
 
 # --- NumPy's files, of any version ---
@@ -217,7 +204,7 @@ def test_headers_of_all_versions_of_numpy(end, multiple):
     start = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text.encode()
     data = start + ZOE.stacks[0].counts.tobytes()
     np.testing.assert_array_equal(np.load(io.BytesIO(data)), ZOE.stacks[0].counts)
-    assert same(read_bundle(with_member("depth_0.npy", data)), ZOE)
+    assert same(bundle.read_bundle(with_member("depth_0.npy", data)), ZOE)
 
 
 @pytest.mark.parametrize("shape", [(1,), (7,), (3, 4, 5), (1, 1, 1), (100, 40, 40), (2000, 1, 64)])
@@ -237,7 +224,7 @@ def test_what_numpy_saves_is_read():
         for kind, values in (("depth", stack.counts), ("times", stack.times_s)):
             np.save(buffer := io.BytesIO(), values)
             saved[f"{kind}_{i}.npy"] = buffer.getvalue()
-    assert same(read_bundle(zip_bytes(hashed(MEMBERS | saved))), ZOE)
+    assert same(bundle.read_bundle(bundle.zip_bytes(hashed(MEMBERS | saved))), ZOE)
 
 
 # --- the format, as it is described ---
@@ -272,7 +259,7 @@ def test_a_bundle_written_by_hand():
     for name, content in members.items():
         digest = hashlib.sha256(content).hexdigest()
         manifest["members"][name] = {"bytes": len(content), "sha256": digest}
-    found = read_bundle(zipped(members | {"manifest.json": json.dumps(manifest).encode()}))
+    found = bundle.read_bundle(zipped(members | {"manifest.json": json.dumps(manifest).encode()}))
     assert found.student == "Zoë"
     assert found.camera.fx == 425
     assert found.claims == Claims((TableRow(0.3, depth_std_mm=0.5, invalid_fraction=0),))
@@ -286,13 +273,14 @@ def test_the_page_on_the_format_and_the_schema_agree():
     """The page's examples are what the schema wants, with all of its keys, and so are its caps."""
     page = Path(bundle.__file__).with_name("FORMAT.md").read_text(encoding="utf-8")
     examples = list(map(json.loads, re.findall(r"```json\n(.*?)```", page, re.DOTALL)))
-    definitions, properties = SCHEMA["definitions"], SCHEMA["properties"]
+    definitions, properties = bundle.SCHEMA["definitions"], bundle.SCHEMA["properties"]
     assert len(examples) == len(properties) == 5
     for name, example in zip(properties, examples, strict=True):
         for entry in example.get("members", {}).values():
             entry["sha256"] = 64 * "0"  # the page cuts it short
         bundle.check_schema({name: example})
-        assert keys(example) >= keys_of_schema(properties[name])
+        keys = set(re.findall(r'"(\w+)":', json.dumps(example)))
+        assert keys >= keys_of_schema(properties[name])
     for name in MEMBERS:
         assert re.sub("[01]", "0", name) in page
     for cap in ("5 MiB", "32 members", "6 MiB", "100 times", "128 KiB", "8 deep"):
@@ -307,14 +295,6 @@ def test_the_page_on_the_format_and_the_schema_agree():
     assert "| names, the paragraph | {} and {:,} characters |".format(*lengths) in page
     assert "bundle.schema.json" in page
     assert len(page.splitlines()) <= 130
-
-
-def keys(example) -> set[str]:
-    """All keys in JSON."""
-    inner = example.values() if isinstance(example, dict) else example
-    if not isinstance(example, (dict, list)):
-        return set()
-    return set(example if isinstance(example, dict) else ()).union(*map(keys, inner))
 
 
 def keys_of_schema(schema) -> set[str]:
@@ -332,7 +312,7 @@ def keys_of_schema(schema) -> set[str]:
 def test_numbers_of_numpy_are_written_as_plain_ones():
     row = TableRow(np.float32(0.5), depth_std_mm=np.float64(1.5), invalid_fraction=np.int64(0))
     claims = Claims((row,), sigma_d_interval_px=np.array([0.1, 0.2]))
-    found = read_bundle(bundle_bytes(replace(ZOE, claims=claims))).claims
+    found = bundle.read_bundle(bundle.bundle_bytes(replace(ZOE, claims=claims))).claims
     assert found == Claims((TableRow(0.5, None, None, 1.5, None, 0),), None, (0.1, 0.2))
     assert {type(value) for value in asdict(found.rows[0]).values()} == {float, int, type(None)}
 
@@ -370,13 +350,13 @@ CANNOT_BE = [
 @pytest.mark.parametrize(("field", "value", "message"), CANNOT_BE)
 def test_what_no_bundle_can_hold_is_named_when_it_is_packed(field, value, message):
     with pytest.raises(Refused, match=rf"^{message}") as error:
-        bundle_bytes(replace(ZOE, **{field: value}))
+        bundle.bundle_bytes(replace(ZOE, **{field: value}))
     assert len(str(error.value)) < 300
 
 
 def test_refusals_survive_the_way_from_a_worker():
     with pytest.raises(Refused) as caught:
-        read_bundle(b"")
+        bundle.read_bundle(b"")
     again = pickle.loads(pickle.dumps(caught.value))
     assert again.reason == "not_a_zip"
     assert str(again) == "The file is no zip, or cut off; copy or download it again."
@@ -390,4 +370,4 @@ def test_other_tools_may_repack_it():
             place = found.start() + at
             data = data[:place] + b"\x08" + data[place + 1 :]
     assert parts(data) == MEMBERS
-    assert same(read_bundle(data), ZOE)
+    assert same(bundle.read_bundle(data), ZOE)

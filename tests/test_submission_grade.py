@@ -20,16 +20,10 @@ from coursekit.submission.flags import Fingerprint, copies, fingerprint
 from coursekit.submission.format import Claims, Conclusion, Plot, Stack, Submission
 from coursekit.submission.recompute import MISTAKES, RULES, grading_rules, recompute
 from coursekit.submission.report import student_page
-from coursekit.submission.rubric import Item, grade, shortcomings
+from coursekit.submission.rubric import JUDGES, Item, grade, shortcomings
 
 MANY = 8 if os.environ.get("COURSEKIT_NIGHTLY") == "1" else 1
-FIELDS = {
-    "bias": "depth_bias_mm",
-    "bias_se": "depth_bias_se_mm",
-    "std": "depth_std_mm",
-    "std_se": "depth_std_se_mm",
-    "invalid": "invalid_fraction",
-}
+FIELDS = {topic: field for topic, (field, _) in JUDGES.items()}
 GOOD = honest(0)
 EXACT = samples.exact(GOOD)  # every claim in the middle of its tolerance
 MISTAKEN = samples.mistaken(0)

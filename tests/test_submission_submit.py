@@ -204,27 +204,6 @@ def test_what_is_weak_is_said_in_the_graders_words_and_packed_all_the_same(kept,
     assert handed.says == shortcomings(read_bundle(handed.path))
 
 
-def test_a_bundle_is_never_overwritten_without_being_told(kept, own_results):
-    first = submit("Ada").path
-    before = first.read_bytes()
-    again = submit("Ada", **RIGHT)
-    assert again.path is None
-    assert "is there already and stays as it is" in repr(again)
-    assert first.read_bytes() == before
-    assert submit("Ada", **RIGHT, overwrite=True).path == first
-    assert read_bundle(first).conclusion.paragraph == PARAGRAPH
-
-
-def test_a_disk_that_is_full_leaves_nothing_half_written(kept, own_results, monkeypatch):
-    def full(self, content):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(OSError, match="No space left"):
-        submit("Ada")
-    assert [path.name for path in own_results.iterdir()] == [MEASURED]
-
-
 def test_small_differences_of_spelling_are_understood(kept):
     conclusion = read_bundle(submit("Ada", 0.45, " Bias", PARAGRAPH, frames=10.0).path).conclusion
     assert (conclusion.dominates, conclusion.frames) == ("bias", 10)
@@ -237,8 +216,6 @@ def test_a_typing_error_in_the_rubric_is_an_error_here_too(kept, own_results, mo
     monkeypatch.setattr("coursekit.submission.recompute.RULES", broken)
     grading_rules.cache_clear()
     try:
-        with pytest.raises(ValueError, match=r"^rubric\.toml: exercise: is missing$"):
-            submit("Ada")
         assert cli.main(["submit", "--student", "Ada"]) == 1
         assert capsys.readouterr().err == "coursekit: rubric.toml: exercise: is missing\n"
     finally:
@@ -340,9 +317,12 @@ def test_the_command_packs_and_refuses_like_the_function(kept, own_results, caps
     assert "Wrote results/studio_1_Ada.zip, 3 distances" in capsys.readouterr().out
     assert asdict(read_bundle(own_results / "studio_1_Ada.zip").conclusion) == RIGHT
 
-    assert cli.main(arguments) == 1
-    assert "is there already" in capsys.readouterr().err
-    assert cli.main([*arguments, "--overwrite"]) == 0
+    before = (own_results / "studio_1_Ada.zip").read_bytes()
+    assert cli.main(["submit", "--student", "Ada"]) == 1
+    assert "is there already and stays as it is" in capsys.readouterr().err
+    assert (own_results / "studio_1_Ada.zip").read_bytes() == before
+    assert cli.main(["submit", "--student", "Ada", "--overwrite"]) == 0
+    assert read_bundle(own_results / "studio_1_Ada.zip").conclusion == Conclusion()
     assert cli.main([*arguments, "--folder", str(own_results / "x")]) == 0
     assert (own_results / "x" / "studio_1_Ada.zip").exists()
     assert cli.main(["submit", "--student", "A", "--paragraph-file", "nowhere"]) == 1
@@ -367,47 +347,25 @@ def test_a_paragraph_that_is_not_utf_8_is_said_plainly(encoding, code, kept, own
 
 # --- the notebook ---
 
+CELLS = ("setup", "disparity-code", "keep", "sweep", "predict", "studio-capture", "table")
+CELLS += ("quantities", "hand-in-table", "hand-in-keep", "hand-in-submit")
+FILLED_IN = {
+    "table": "face_stds = [f.depth_std_mm for f in faces]",
+    "sweep": "camera.set(depth_scale_m=0.0001)",
+    "predict": "my_prediction_mm = [80 * Z**2 / (fx * B) for Z in (0.30, 0.45, 0.60)]",
+    "hand-in-submit": f"ck.submit('Ada', 0.45, 'bias', {PARAGRAPH!r}, frames=30)",
+}
+
 
 def test_the_studio_cells_of_the_notebook_hand_in_what_they_say(own_results, capsys):
-    """With a dozen frames in place of a hundred; every number of the table is right."""
-    cells = notebook_cells()[1]
-    own = {
-        "table": "face_stds = [f.depth_std_mm for f in faces]",
-        "sweep": "camera.set(depth_scale_m=0.0001)",
-        "predict": "my_prediction_mm = [80 * Z**2 / (fx * B) for Z in (0.30, 0.45, 0.60)]",
-        "hand-in-submit": f"ck.submit('Ada', 0.45, 'bias', {PARAGRAPH!r}, frames=30)",
-    }
-    names: dict[str, object] = {}
-    for cell in (
-        *("setup", "disparity-code", "keep", "sweep", "predict", "studio-capture", "table"),
-        *("quantities", "hand-in-table", "hand-in-keep", "hand-in-submit"),
-    ):
-        source = own.get(cell, cells[cell].source)
-        exec(source.replace("camera.frames(100", "camera.frames(12"), names)
+    """Every number of the table is right; a dozen frames stand for a hundred, but at night."""
+    nightly = os.environ.get("COURSEKIT_NIGHTLY") == "1"
+    notebook = nbformat.read(build_notebooks.NOTEBOOKS / "02_depth_noise.ipynb", as_version=4)
+    sources, names = {cell.id: cell.source for cell in notebook.cells} | FILLED_IN, {}
+    for cell in CELLS:
+        frames = "camera.frames(100" if nightly else "camera.frames(12"
+        exec(sources[cell].replace("camera.frames(100", frames), names)
     found = grade(read_bundle(own_results / "studio_1_Ada.zip"))
-    assert [(i.topic, i.mistake) for i in found.items if i.verdict != "right"] == [
-        ("data", "incomplete")
-    ] * 3
+    wrong = [(item.topic, item.mistake) for item in found.items if item.verdict != "right"]
+    assert wrong == ([] if nightly else [("data", "incomplete")] * 3)
     assert [flag for flag in found.flags if not flag.note] == []
-
-
-@pytest.mark.skipif(os.environ.get("COURSEKIT_NIGHTLY") != "1", reason="executes the notebook")
-def test_a_notebook_with_a_name_hands_in_what_it_says(tmp_path):
-    """The bundle of an executed notebook is graded: every number of the table is right."""
-    notebook, cells = notebook_cells()
-    cells["predict"].source = "my_prediction_mm = 1000 * held.std_m((0.30, 0.45, 0.60))[0]\n"
-    cells["hand-in-submit"].source = f"ck.submit('Ada', 0.45, 'bias', {PARAGRAPH!r}, frames=30)\n"
-    folder = build_notebooks.NOTEBOOKS
-    environment = build_notebooks.kernel_environment(tmp_path)
-    build_notebooks.execute(notebook, "02_depth_noise", folder, environment)
-    found = grade(read_bundle(tmp_path / "results" / "studio_1_Ada.zip"))
-    assert [item.says for item in found.items if item.verdict != "right"] == []
-    assert found.points == 100
-    assert [flag for flag in found.flags if not flag.note] == []
-
-
-def notebook_cells():
-    """Notebook 02, and its cells by their ids."""
-    path = build_notebooks.NOTEBOOKS / "02_depth_noise.ipynb"
-    notebook = nbformat.read(path, as_version=4)
-    return notebook, {cell.id: cell for cell in notebook.cells}
