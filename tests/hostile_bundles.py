@@ -221,12 +221,6 @@ class _Shell:
         return os._exit, (3,)
 
 
-def _pickled_array() -> bytes:
-    buffer = io.BytesIO()
-    np.save(buffer, np.array([_Shell()], dtype=object), allow_pickle=True)
-    return buffer.getvalue()
-
-
 def _a_million(seed: int) -> np.ndarray:
     """Depths of 244 frames of 64 x 64 px, nearly all the same: quickly packed."""
     return np.uint16(300) + (np.random.default_rng(seed).random((244, 64, 64)) < 0.04)
@@ -490,9 +484,10 @@ def _values() -> Kinds:
 
 
 def _arrays() -> Kinds:
+    np.save(pickled := io.BytesIO(), np.array([_Shell()], dtype=object), allow_pickle=True)
     code = "__import__('os').system('id')"
     depth = {
-        "a pickled object array": _pickled_array(),
+        "a pickled object array": pickled.getvalue(),
         "an object array in a record": npy("[('a', '|O')]"),
         "a zip for an array": HONEST,
         "a text for an array": b"1 2 3\n4 5 6\n",

@@ -389,11 +389,11 @@ def simulated_as_live(changed: str, seed: int) -> Submission:
 
 
 TIMES: dict[str, Callable[[Counts, Counts], Counts]] = {  # from those at 0.45 m and at 0.30 m
-    "back": lambda times, _: times - (np.arange(len(times)) >= 50),
-    "fast": lambda times, _: times[0] + (times - times[0]) / 30,
-    "same": lambda times, others: others[: len(times)],
-    "together": lambda times, others: times + others[0] - times[0] + 0.01,
-    "future": lambda times, _: times + 10 * 86_400,
+    "times go back": lambda times, _: times - (np.arange(len(times)) >= 50),
+    "times too fast": lambda times, _: times[0] + (times - times[0]) / 30,
+    "times the same": lambda times, others: others[: len(times)],
+    "times together": lambda times, others: times + others[0] - times[0] + 0.01,
+    "times in future": lambda times, _: times + 10 * 86_400,
 }
 
 
@@ -433,12 +433,8 @@ DISHONEST: dict[str, tuple[str, Callable[[int], Submission]]] = {
     "too clean": ("too_clean", partial(_made_up, _clean, depth_scale_m=1e-5)),
     "repeated frames": ("repeated_frames", _repeated_frames),
     "one stack twice": ("one_stack_twice", _one_stack_twice),
-    "simulated, name": ("simulated_as_live", partial(simulated_as_live, "name")),
-    "simulated, lens": ("simulated_as_live", partial(simulated_as_live, "lens")),
-    "simulated, clock": ("simulated_as_live", partial(simulated_as_live, "clock")),
-    "times go back": ("impossible_times", partial(_impossible_times, "back")),
-    "times too fast": ("impossible_times", partial(_impossible_times, "fast")),
-    "times the same": ("impossible_times", partial(_impossible_times, "same")),
-    "times together": ("impossible_times", partial(_impossible_times, "together")),
-    "times in future": ("impossible_times", partial(_impossible_times, "future")),
 }
+for _how in ("name", "lens", "clock"):
+    DISHONEST[f"simulated, {_how}"] = "simulated_as_live", partial(simulated_as_live, _how)
+for _how in TIMES:
+    DISHONEST[_how] = "impossible_times", partial(_impossible_times, _how)

@@ -13,17 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hostile_bundles import (
-    CAMERA,
-    HONEST,
-    MEMBERS,
-    ZOE,
-    hashed,
-    parts,
-    unhashed,
-    with_member,
-    zipped,
-)
+from hostile_bundles import HONEST, MEMBERS, ZOE, hashed, parts, unhashed, with_member, zipped
 
 from coursekit.submission import format as bundle
 from coursekit.submission.format import Claims, Conclusion, Outcome, Plot, Refused, Stack, TableRow
@@ -68,7 +58,7 @@ UNUSUAL = {
     "nothing answered": {"outcomes": {}},
     "no stacks": {"stacks": ()},
     "no prediction": {"plot": Plot((0.3, 0.45), (0.3, 0.6), None)},
-    "no baseline": {"camera": replace(CAMERA, baseline_m=None, serial="")},
+    "no baseline": {"camera": replace(ZOE.camera, baseline_m=None, serial="")},
     "a formula": {"student": "=1+1"},  # what is a formula or a tag elsewhere is only text here
     "a tag": {"student": "<script>alert(1)</script>"},
     "letters": {"student": "O'Brien; DROP TABLE -- 王小明 مریم"},
@@ -125,7 +115,7 @@ def test_as_much_as_a_submission_may_hold_fits():
         ZOE,
         student=word,
         stacks=stacks,
-        camera=replace(CAMERA, name=word, serial=word, model=word),
+        camera=replace(ZOE.camera, name=word, serial=word, model=word),
         versions=dict.fromkeys(packages, word),
         claims=Claims(tuple(TableRow(**row | {"distance_m": 0.3 + i}) for i in range(12))),
         plot=Plot(numbers, numbers, numbers),
@@ -187,16 +177,16 @@ def test_the_student_can_be_renamed_by_hand():
 # --- NumPy's files, of any version ---
 
 
-@pytest.mark.parametrize(
-    ("end", "multiple"),
-    [
-        pytest.param("), }", 16, id="NumPy 1.0 to 1.13: 16 bytes"),
-        pytest.param("), }", 64, id="NumPy 1.14 to 1.22: 64 bytes"),
-        pytest.param("), }" + 20 * " ", 64, id="NumPy 1.23 on: room to grow"),
-        pytest.param("), }", 1, id="no padding"),
-        pytest.param(",), }", 64, id="a comma behind the last"),
-    ],
-)
+HEADERS = [
+    pytest.param("), }", 16, id="NumPy 1.0 to 1.13: 16 bytes"),
+    pytest.param("), }", 64, id="NumPy 1.14 to 1.22: 64 bytes"),
+    pytest.param("), }" + 20 * " ", 64, id="NumPy 1.23 on: room to grow"),
+    pytest.param("), }", 1, id="no padding"),
+    pytest.param(",), }", 64, id="a comma behind the last"),
+]
+
+
+@pytest.mark.parametrize(("end", "multiple"), HEADERS)
 def test_headers_of_all_versions_of_numpy(end, multiple):
     """The header is padded with blanks to a multiple of so many bytes."""
     text = "{'descr': '<u2', 'fortran_order': False, 'shape': (3, 4, 5" + end

@@ -290,10 +290,10 @@ def test_other_distances_nearby_count_and_further_ones_are_compared_only():
     assert "wrong" in {one.verdict for one in wrong.items if "0.90" in one.name}
 
 
-@pytest.mark.parametrize(
-    ("said", "frames", "verdict"),
-    [("bias", 30, "right"), ("noise", 30, "partial"), ("bias", 1, "right"), (None, 1, "missing")],
-)
+SAID = [("bias", 30, "right"), ("noise", 30, "partial"), ("bias", 1, "right"), (None, 1, "missing")]
+
+
+@pytest.mark.parametrize(("said", "frames", "verdict"), SAID)
 def test_the_conclusion_is_judged_by_the_students_own_depths(said, frames, verdict):
     strong = MISTAKEN["sign"][1]  # a bias of 7 mm
     strong = with_part(strong, "conclusion", dominates=said, frames=frames)
@@ -412,13 +412,9 @@ def test_the_same_by_right_is_a_note(one, two, note):
     assert note in found.says
 
 
-def test_strangers_are_not_copies():
-    assert copies(others()) == []
-
-
-def test_two_measurements_with_one_camera_at_one_place_are_not_copies():
+def test_strangers_and_two_measurements_with_one_camera_at_one_place_are_not_copies():
     """The same pattern, but other noise: two students share a camera."""
-    facts, prints = samples.camera(5), {}
+    facts, prints = samples.camera(5), dict(others())
     pattern = 10 + np.rint(9 * np.random.default_rng(0).normal(0, 2, (40, 40)))
     for seed in (40, 41):
         random = np.random.default_rng(seed)

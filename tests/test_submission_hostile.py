@@ -82,9 +82,10 @@ def test_there_are_as_many_kinds_as_ever_and_every_reason_has_one():
     assert len(codes) > 10
 
 
-@pytest.mark.parametrize(
-    "kind", ["a bundle in a folder", "a Mac's zip of a bundle", "a folder", "streamed"]
-)
+ZIPPED_AGAIN = ["a bundle in a folder", "a Mac's zip of a bundle", "a folder", "streamed"]
+
+
+@pytest.mark.parametrize("kind", ZIPPED_AGAIN)
 def test_who_zips_a_bundle_again_hears_what_to_do(kind):
     with pytest.raises(Refused, match=r"zipped again.*; hand in the \.zip that .* never unpacked"):
         read_bundle(KINDS[kind][1])

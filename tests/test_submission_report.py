@@ -309,16 +309,16 @@ OWN = (
 )
 
 
-@pytest.mark.parametrize(
-    ("one", "two", "said"),
-    [
-        pytest.param(PARAGRAPH, CHANGED, "nearly the same words", id="a few words changed"),
-        pytest.param(PARAGRAPH, LONGER, "nearly the same words", id="sentences added"),
-        pytest.param("", "", "", id="nothing"),
-        pytest.param(SHORT, SHORT, "", id="short"),
-        pytest.param(PARAGRAPH, OWN, "", id="own words"),
-    ],
-)
+PAIRS = [
+    pytest.param(PARAGRAPH, CHANGED, "nearly the same words", id="a few words changed"),
+    pytest.param(PARAGRAPH, LONGER, "nearly the same words", id="sentences added"),
+    pytest.param("", "", "", id="nothing"),
+    pytest.param(SHORT, SHORT, "", id="short"),
+    pytest.param(PARAGRAPH, OWN, "", id="own words"),
+]
+
+
+@pytest.mark.parametrize(("one", "two", "said"), PAIRS)
 def test_changed_words_and_added_sentences_are_noticed_short_and_own_ones_not(one, two, said):
     flags = notes(report.across([said_by("Ann", one), said_by("Bob", two)]), "same_words")
     assert set(flags) == ({"Ann.zip", "Bob.zip"} if said else set())
@@ -387,10 +387,10 @@ def test_the_table_has_a_row_a_bundle_and_points_that_add_up(lines):
     assert rows[3]["flags"] == "no_pattern white_in_space"
 
 
-@pytest.mark.parametrize(
-    "text",
-    ["=1+1", "+1", "-1", "@A1", "\t=1", "\r=1", "\n=1", " =1", "＝1", "=cmd|' /C calc'!A0"],
-)
+FORMULAS = ["=1+1", "+1", "-1", "@A1", "\t=1", "\r=1", "\n=1", " =1", "＝1", "=cmd|' /C calc'!A0"]
+
+
+@pytest.mark.parametrize("text", FORMULAS)
 def test_a_cell_is_never_a_formula(text):
     line = report.ReportLine(text, student=text, points=1.0, of=2.0)
     for row in read(report.grades_csv([line, report.not_graded(text, text, text)])):
