@@ -1,19 +1,18 @@
 """A lens, two boards, and fits to simulated sessions of them that several test modules share."""
 
-import os
 from functools import cache
+
+from common import CHARUCO, CHECKERBOARD, NIGHTLY
 
 from coursekit import intrinsics
 from coursekit.boards import Board
 from coursekit.geometry import Intrinsics
 from coursekit.simulation.corner_sessions import corner_session
 
-NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
+__all__ = ["CHARUCO", "CHECKERBOARD", "LENS", "NIGHTLY", "fit"]
 LENS = Intrinsics(
     640, 480, 612.0, 610.0, 322.0, 238.0, "brown_conrady", (0.08, -0.18, 0.0007, -0.0004, 0.05)
 )
-CHARUCO = Board("charuco", (9, 6), 0.025)
-CHECKERBOARD = Board("checkerboard", (10, 7), 0.025)  # 9 x 6 inner corners
 
 
 @cache

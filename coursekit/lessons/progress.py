@@ -66,7 +66,7 @@ def noted(verdict: Verdict, answer: str = "") -> Verdict:
         return verdict
     attempt = {"kind": verdict.kind, "answer": answer, "date": results.now()}
     try:
-        attempts = read()
+        attempts = read_attempts()
         attempts.setdefault(verdict.subject, []).append(attempt)
         results.write_json(results.folder() / FILE, attempts)
     except OSError as error:
@@ -74,7 +74,7 @@ def noted(verdict: Verdict, answer: str = "") -> Verdict:
     return verdict
 
 
-def read() -> dict[str, list[dict[str, Any]]]:
+def read_attempts() -> dict[str, list[dict[str, Any]]]:
     """All attempts by name, oldest first; a damaged file is set aside, not overwritten.
 
     Each attempt has the keys kind (as in `Verdict`), answer and date.

@@ -249,7 +249,7 @@ def outcomes() -> dict[str, Outcome]:
     """How the checkpoints and exercises of notebook 02 stand that were attempted, by name."""
     return {
         name: Outcome(any(a.get("kind") == "right" for a in attempts), len(attempts))
-        for name, attempts in progress.read().items()
+        for name, attempts in progress.read_attempts().items()
         if name.startswith(LESSON_PREFIX)
     }
 
