@@ -150,6 +150,16 @@ def test_only_what_changed_is_installed_again_in_place(project: Path) -> None:
     assert (code, calls(project), "Fast parts: done" in output) == (0, [], True)
 
 
+def test_what_is_compiled_ahead_is_every_module_with_numba(course: ModuleType) -> None:
+    package = ROOT / "coursekit"
+    compiled = {
+        path.relative_to(package).with_suffix("").as_posix()
+        for path in package.rglob("*.py")
+        if "from numba import" in path.read_text(encoding="utf-8")
+    }
+    assert compiled == set(course.KERNELS)
+
+
 def test_test_adds_its_tools_runs_every_check_and_names_those_that_failed(project: Path) -> None:
     checks = project / "tools/build_notebooks.py"
     checks.write_text("print('checked the notebooks')\n", encoding="utf-8")
