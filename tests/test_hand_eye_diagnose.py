@@ -53,10 +53,14 @@ CLASSES = {
 
 @lru_cache
 def session(seed: int, mistakes: M, **options) -> tuple[HandEyeSession, HandEyeTruth]:
-    """Both mounts, arms with and without errors, and 15 to 30 poses in turn."""
+    """Both mounts, arms with and without errors, and 15 to 30 poses in turn.
+
+    Of a design that hides X there are at most 25.
+    """
     mount = ("eye_in_hand", "eye_to_hand")[seed % 2]
     errors = ArmErrors() if (seed // 2) % 2 else None
-    options = {"n": 15 + seed % 16, "arm_errors": errors} | options
+    most = 30 if mistakes.design == M().design else 25
+    options = {"n": 15 + seed % (most - 14), "arm_errors": errors} | options
     return hand_eye_session(mount, seed, mistakes=mistakes, **options)
 
 
