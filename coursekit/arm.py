@@ -113,11 +113,13 @@ class Arm:
         return self._jacobian(frames, self._tool(frames, tool))
 
     def _jacobian(self, frames: Floats, T: Floats) -> Floats:
+        """`jacobian` of a tool at T (..., 4, 4) from the links' frames (..., 7, 4, 4)."""
         axes = (frames[..., 1:, :3, :3] @ self.axes[:, :, None])[..., 0]
         arms = T[..., None, :3, 3] - frames[..., 1:, :3, 3]
         return np.swapaxes(np.concatenate([axes, np.cross(axes, arms)], axis=-1), -1, -2)
 
     def _tool(self, frames: Floats, tool: Tool) -> Floats:
+        """Where the tool is, (..., 4, 4), from the links' frames (..., 7, 4, 4)."""
         choice("tool", tool, get_args(Tool))
         flange = frames[..., 6, :, :]
         return flange @ self.T_flange_gripper if tool == "gripper" else flange
@@ -211,6 +213,7 @@ class Arm:
         return q.reshape(*shape, 6), reached.reshape(shape)
 
     def _descend(self, targets: Floats, q: Floats) -> tuple[Floats, Mask]:
+        """Gauss-Newton from angles q (n, 6) to poses (n, 4, 4): the angles, and which arrived."""
         q = self._into_limits(q)
         reached, open_ = np.zeros(len(q), bool), np.arange(len(q))
         for _ in range(IK_STEPS):
@@ -227,6 +230,7 @@ class Arm:
         return q, reached
 
     def _into_limits(self, q: Floats) -> Floats:
+        """Angles (n, 6), rad, brought back inside their limits."""
         low, high = self.limits.T
         wrapped = low + (q - low) % (2 * np.pi)  # a joint that can turn all the way goes round
         return np.clip(np.where(high - low > 2 * np.pi - 1e-9, wrapped, q), low, high)
@@ -453,7 +457,11 @@ class SimulatedArm:
     ) -> None:
         self.nominal = nominal or widowx()
         self.errors = errors or ArmErrors()
-        self._truth = _hidden(seed, self.errors, self.nominal)
+        rng, size = np.random.default_rng([seed, zlib.crc32(b"arm")]), self.errors
+        offset = size.offset_rad * rng.standard_normal(6)
+        play = size.play_rad * np.abs(rng.standard_normal(6))
+        link = np.repeat([size.link_rad, size.link_m], 3) * rng.standard_normal((7, 6))
+        self._truth = ArmTruth(offset, play, link, with_link_errors(self.nominal, link))
         self._rng = np.random.default_rng([seed, zlib.crc32(b"moves")])
         self._at = np.array(HOME)
         self._last = self._rng.choice([-1.0, 1.0], 6)  # direction of each joint's last move
@@ -487,15 +495,6 @@ class SimulatedArm:
         loaded = load_side(self.nominal, read)
         side = np.where(loaded != 0, loaded, -directions)
         return read + self._truth.offset_rad + side * self._truth.play_rad
-
-
-def _hidden(seed: int, errors: ArmErrors, nominal: Arm) -> ArmTruth:
-    rng = np.random.default_rng([seed, zlib.crc32(b"arm")])
-    offset = errors.offset_rad * rng.standard_normal(6)
-    play = errors.play_rad * np.abs(rng.standard_normal(6))
-    sizes = np.repeat([errors.link_rad, errors.link_m], 3)
-    link = sizes * rng.standard_normal((7, 6))
-    return ArmTruth(offset, play, link, with_link_errors(nominal, link))
 
 
 def with_link_errors(arm: Arm, link: ArrayLike) -> Arm:

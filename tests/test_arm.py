@@ -8,7 +8,6 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from scipy.linalg import block_diag, expm
-from scipy.spatial.transform import Rotation
 
 from coursekit import arm as arms
 from coursekit.arm import ArmErrors, SimulatedArm, fk_covariance, widowx
@@ -28,7 +27,7 @@ def anywhere() -> np.ndarray:
     return np.random.default_rng(3).uniform(arm.limits[:, 0], arm.limits[:, 1], (500, 6))
 
 
-# --- forward kinematics against three other descriptions ---
+# --- forward kinematics against two other descriptions ---
 
 
 def makers_table(q: np.ndarray) -> np.ndarray:
@@ -69,18 +68,6 @@ def test_forward_is_the_makers_table(anywhere: np.ndarray) -> None:
     between = np.swapaxes(theirs[:, :3, :3], 1, 2) @ ours[:, :3, :3]
     assert np.abs(between - between[0]).max() < 1e-12
     assert np.abs(np.abs(between[0]) - np.eye(3)[np.abs(between[0]).argmax(1)]).max() < 1e-12
-
-
-def test_forward_is_scipys_chain(anywhere: np.ndarray) -> None:
-    arm = widowx()
-    for q, T in zip(anywhere[:50], arm.forward(anywhere[:50]), strict=True):
-        R, t = Rotation.identity(), np.zeros(3)
-        for origin, axis, angle in zip(arm.origins, arm.axes, q, strict=True):
-            t = t + R.apply(origin[:3, 3].copy())  # SciPy takes no read-only array
-            R = R * Rotation.from_matrix(origin[:3, :3]) * Rotation.from_rotvec(angle * axis)
-        t = t + R.apply([0.156062, 0.0, 0.0])
-        assert np.abs(T[:3, 3] - t).max() < 1e-14
-        assert np.abs(T[:3, :3] - R.as_matrix()).max() < 1e-14
 
 
 def test_forward_is_the_product_of_exponentials(anywhere: np.ndarray) -> None:
@@ -129,7 +116,7 @@ def test_batches_are_single_poses(anywhere: np.ndarray) -> None:
 
 def test_inverse_meets_the_pose_or_says_so() -> None:
     arm = widowx()
-    q = arm.random(np.random.default_rng(1), 300)
+    q = arm.random(np.random.default_rng(1), 150)
     q[:, 0] = np.clip(q[:, 0], -1.5, 1.5)
     found, reached = arm.inverse(arm.forward(q))
     assert reached.mean() > 0.85

@@ -1,7 +1,5 @@
 """Notebook 5 takes what notebooks 1 to 4 saved, and names every file that it cannot use."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path
@@ -11,15 +9,8 @@ import numpy as np
 import pytest
 
 from coursekit import results
-from coursekit.budget import (
-    HandOver,
-    beside,
-    hand_over,
-    independent_frames,
-    lesson_budget,
-    wrist_budget,
-)
-from coursekit.budget.handover import NEEDED
+from coursekit.budget import HandOver, beside, hand_over, independent_frames
+from coursekit.budget.handover import NEEDED, lesson_budget, wrist_budget
 from coursekit.results import Covariance, Quantity
 
 YOURS = SimpleNamespace(source="live", name="D435 on the bench")
@@ -30,10 +21,8 @@ TWIST = ("rx", "ry", "rz", "tx", "ty", "tz")
 
 def write(camera: SimpleNamespace, scale: float = 1.0) -> None:
     """What the last cells of the four notebooks save; scale multiplies every error."""
-    pinhole = {
-        f"depth_{n}": Quantity(v, "px", None, "bias")
-        for n, v in zip(K[:4], (430.0, 430.0, 424.0, 240.0), strict=True)
-    }
+    values = zip(K, (430.0, 430.0, 424.0, 240.0), strict=False)
+    pinhole = {f"depth_{name}": Quantity(value, "px", None, "bias") for name, value in values}
     results.save("01_pinhole", camera, pinhole)
     depth = {
         "sigma_d": Quantity(0.07 * scale, "px", 0.003, "noise"),
@@ -47,11 +36,12 @@ def write(camera: SimpleNamespace, scale: float = 1.0) -> None:
     groups = {"intrinsics": Covariance(K, R * np.outer(sigma, sigma))}
     results.save("03_intrinsics", camera, lens, groups)
     turn, shift = np.array([0.05, 0.06, 0.07]) * scale, np.array([0.6, 0.8, 1.0]) * scale
-    mount = {
-        n: Quantity(0.0, "deg" if n[0] == "r" else "mm", s)
-        for n, s in zip(TWIST, (*turn, *shift), strict=True)
-    }
-    results.save("04_hand_eye", camera, mount)
+    results.save("04_hand_eye", camera, mounted((*turn, *shift)))
+
+
+def mounted(sigmas) -> dict[str, Quantity]:
+    units = zip(TWIST, ["deg"] * 3 + ["mm"] * 3, sigmas, strict=True)
+    return {name: Quantity(0.0, unit, sigma) for name, unit, sigma in units}
 
 
 @pytest.fixture
@@ -95,11 +85,8 @@ def test_intrinsics_use_the_correlations(folders: tuple[Path, Path]) -> None:
     view = handed.view().moved(u=824.0, v=640.0)  # 400 px off both ways: fx and fy move together
     M = handed.budget()["intrinsics"].matrix(view)
     covariance = M @ M.T
-    x = np.array([400 / 430, 400 / 430])
-    r2 = x @ x
-    expected = (0.45 / 430) ** 2 * (0.9**2 * 0.95 * x[0] * x[1]) + (0.45 * 0.004 * r2) ** 2 * x[
-        0
-    ] * x[1]
+    x2 = (400 / 430) ** 2
+    expected = x2 * ((0.45 / 430) ** 2 * 0.9**2 * 0.95 + (0.45 * 0.004 * 2 * x2) ** 2)
     assert covariance[0, 1] == pytest.approx(expected, rel=1e-6)  # base -y, -x: the signs cancel
 
 
@@ -115,8 +102,7 @@ def test_what_propagate_takes(folders: tuple[Path, Path]) -> None:
     f_B = 430.0 * handed.view().baseline_m
     assert given.depth_sigma_m == pytest.approx(0.36 * 0.07 / f_B)
     C = np.full((6, 6), 0.5) + 0.5 * np.eye(6)
-    mount = {n: Quantity(0.0, "deg" if n[0] == "r" else "mm", 1.0) for n in TWIST}
-    results.save("04_hand_eye", YOURS, mount, {"X": Covariance(TWIST, C)})
+    results.save("04_hand_eye", YOURS, mounted([1.0] * 6), {"X": Covariance(TWIST, C)})
     kept = np.asarray(hand_over(folders[1]).covariances(handed.view()).hand_eye)
     assert kept[0, 5] == pytest.approx(0.5 * math.radians(1) * 1e-3)
     assert kept[1, 1] == pytest.approx(math.radians(1) ** 2)
@@ -125,39 +111,30 @@ def test_what_propagate_takes(folders: tuple[Path, Path]) -> None:
 def test_nothing_yet(folders: tuple[Path, Path]) -> None:
     handed = hand_over(folders[1])
     for lesson, found in zip(NEEDED, handed, strict=True):
-        assert found.says == (
-            f"{lesson}: results/{lesson}.json is not there yet, notebook {lesson} has not "
-            "saved it; the reference is used."
-        )
+        missing = f"{lesson}: results/{lesson}.json is not there yet, notebook {lesson} has not"
+        assert found.says == f"{missing} saved it; the reference is used."
     assert "The reference budget" in repr(handed.budget())
     assert handed.budget()["depth noise"].source == "reference (Simulated D435, seed 7)"
     assert at_object_mm(handed)["depth bias"] == pytest.approx((1.6, 5.6))
 
 
 @pytest.mark.parametrize(
-    ("damage", "named"),
+    ("old", "new", "named"),
     [
-        (lambda text: text[:80], "not a JSON file"),
-        (lambda text: "", "not a JSON file"),
-        (lambda text: text.replace('"format": 1', '"format": 0'), "another version"),
-        (lambda text: text.replace('"value": 0.0', '"value": null'), "value"),
-        (
-            lambda text: text.replace('"04_hand_eye"', '"03_intrinsics"'),
-            "lesson: got '03_intrinsics', want 04_hand_eye",
-        ),
-        (lambda text: text.replace('"rz"', '"turn"'), "holds no rz with a sigma"),
-        (lambda text: text.replace('"sigma": 0.05', '"sigma": null'), "holds no rx with a sigma"),
+        ("}", "", "not a JSON file"),
+        ('"format": 1', '"format": 0', "another version"),
+        ('"value": 0.0', '"value": null', "value"),
+        ('"04_hand_eye"', '"03_intrinsics"', "lesson: got '03_intrinsics', want 04_hand_eye"),
+        ('"rz"', '"turn"', "holds no rz with a sigma"),
+        ('"sigma": 0.05', '"sigma": null', "holds no rx with a sigma"),
     ],
 )
-def test_a_bad_file_is_named_and_replaced(
-    folders: tuple[Path, Path], damage: object, named: str
-) -> None:
+def test_a_bad_file_is_named_and_replaced(folders, old: str, new: str, named: str) -> None:
     write(YOURS)
     path = folders[0] / "04_hand_eye.json"
     text = path.read_text("utf-8")
-    broken = damage(text)  # type: ignore[operator]
-    assert broken != text
-    path.write_text(broken, encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new), encoding="utf-8")
     handed = hand_over(folders[1])
     says = handed["04_hand_eye"].says
     assert "04_hand_eye.json" in says
@@ -224,17 +201,11 @@ def test_what_notebook_1_and_2_may_have_kept_is_used(folders: tuple[Path, Path])
     """Size and baseline of the camera; the pattern that stays, and how alike two frames are."""
     write(YOURS)
     plain = hand_over(folders[1]).budget()
-    also = results.load("01_pinhole").quantities | {
-        "depth_width": Quantity(640.0, "px"),
-        "depth_height": Quantity(480.0, "px"),
-        "baseline": Quantity(55.0, "mm"),
-    }
+    size = {"depth_width": Quantity(640.0, "px"), "depth_height": Quantity(480.0, "px")}
+    also = results.load("01_pinhole").quantities | size | {"baseline": Quantity(55.0, "mm")}
     results.save("01_pinhole", YOURS, also)
-    depth = results.load("02_depth_noise").quantities | {
-        "fixed_pattern": Quantity(0.05, "px"),
-        "frame_autocorrelation": Quantity(0.3, "1"),
-    }
-    results.save("02_depth_noise", YOURS, depth)
+    stays = {"fixed_pattern": Quantity(0.05, "px"), "frame_autocorrelation": Quantity(0.3, "1")}
+    results.save("02_depth_noise", YOURS, results.load("02_depth_noise").quantities | stays)
     budget = hand_over(folders[1]).budget()
     assert budget.view.intrinsics.size == (640, 480)
     assert budget.view.baseline_m == pytest.approx(0.055)
@@ -242,9 +213,8 @@ def test_what_notebook_1_and_2_may_have_kept_is_used(folders: tuple[Path, Path])
     noise = {row.term.name: row.high_m for row in budget.rows}["depth noise"]
     assert noise == pytest.approx(per_px * math.hypot(0.07, 0.05))
     many = 0.07**2 / independent_frames(400, 0.3) + 0.05**2
-    assert budget.at(frames=400).averaged_m["depth noise"] == pytest.approx(
-        per_px * math.sqrt(many)
-    )
+    averaged = budget.at(frames=400).averaged_m["depth noise"]
+    assert averaged == pytest.approx(per_px * math.sqrt(many))
     assert plain.at(frames=400).averaged_m["depth noise"] < 0.1 * budget.averaged_m["depth noise"]
 
 

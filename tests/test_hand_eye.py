@@ -156,7 +156,7 @@ def test_one_axis_leaves_a_turn_and_a_shift_free():
     """In words; and sliding along the axis or turning about it changes no prediction."""
     session, X, Y = degenerate("one axis")
     T = session.T_base_gripper
-    with pytest.raises(he.NotDetermined, match=r"one axis, \(1.00, .*0.00, .*0.00\)"):
+    with pytest.raises(he.NotDetermined, match=r"one axis, \(1, 0, 0\)"):
         session.solve()
     found = he.observability(T, "eye_in_hand", X, Y)
     assert he.observability(T, "eye_in_hand").free == found.free
@@ -279,7 +279,7 @@ def test_observability_predicts_the_scatter_of_the_refinement():
     sizes = np.repeat([np.radians(0.1), 0.5e-3], 3)
     predicted = he.observability(known.T, "eye_in_hand", known.X, known.Y)
     rng, found = np.random.default_rng(18), []
-    for _ in range(150):
+    for _ in range(100):
         seen = turned(known.exact, sizes * rng.normal(size=(12, 6)))
         found.append(pose_difference(known.X, he.solve(known.with_poses(seen)).X))
     unit = np.repeat([0.3, 1.0], 3)
@@ -313,7 +313,7 @@ def test_the_next_pose_is_the_one_that_a_refit_likes_best(mount):
     assert proposal.index in order[:2]  # the image's own noise is in one and not in the other
     np.testing.assert_array_equal(proposal.q, q[proposal.index])
     assert proposal.then_mm[proposal.index] < proposal.now_mm
-    assert proposal.usable.all()
+    assert np.isfinite(proposal.then_mm).all()
 
 
 @pytest.mark.parametrize("mount", he.MOUNTS)

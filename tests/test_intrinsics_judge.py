@@ -3,35 +3,24 @@
 COURSEKIT_NIGHTLY=1 takes more sessions.
 """
 
-from __future__ import annotations
-
 import math
-import os
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
+from common import refusals
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from scipy.stats import ttest_1samp
+from simulated_corners import CHARUCO, CHECKERBOARD, LENS, NIGHTLY, fit
 
 from coursekit import intrinsics
 from coursekit.boards import Board, Detection, Detections
-from coursekit.geometry import Intrinsics, make_transform, project, transform_points
+from coursekit.geometry import Intrinsics, make_transform
 from coursekit.intrinsics.comparison import difference_px
 from coursekit.intrinsics.fit import image_grid
 from coursekit.simulation.corner_sessions import Effects, bowed, corner_session
-
-NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
-LENS = Intrinsics(
-    640, 480, 612.0, 610.0, 322.0, 238.0, "brown_conrady", (0.08, -0.18, 0.0007, -0.0004, 0.05)
-)
-CHARUCO = Board("charuco", (9, 6), 0.025)
-CHECKERBOARD = Board("checkerboard", (10, 7), 0.025)
-
-
-def fit(board: Board, seed: int, **arguments) -> intrinsics.IntrinsicsResult:
-    return intrinsics.calibrate(corner_session(board, LENS, seed, **arguments)[0], board)
 
 
 @pytest.fixture(scope="module")
@@ -50,15 +39,12 @@ def test_coverage_counts_cells_and_margins() -> None:
     assert seen.margins == pytest.approx((0.1, 0.1, 0.1, 0.3))
     assert seen.reach == pytest.approx(math.hypot(256, 192) / 400)
     assert seen.empty_sides == ("bottom",)
-    with pytest.raises(ValueError, match="detections: got 0, want at least one view"):
-        intrinsics.coverage([])
 
 
 def test_tilts_are_the_angles_the_boards_were_turned_by(good) -> None:
     turns = [(25.0, 0.0), (-10.0, 0.0), (0.0, 30.0), (0.0, -40.0)]
-    poses = np.stack([
-        make_transform(Rotation.from_euler("xy", turn, degrees=True), [0, 0, 0.5]) for turn in turns
-    ])  # fmt: skip
+    rotations = Rotation.from_euler("xy", turns, degrees=True)
+    poses = np.stack([make_transform(R, [0, 0, 0.5]) for R in rotations])
     turned = intrinsics.tilts(replace(good, T_camera_board=poses))
     np.testing.assert_allclose(turned.about_x_deg, [25, -10, 0, 0], atol=1e-9)
     np.testing.assert_allclose(turned.about_y_deg, [0, 0, 30, -40], atol=1e-9)
@@ -76,18 +62,14 @@ SEEDS = range(100, 130) if NIGHTLY else range(100, 103)
 FLAT, INNER = Effects(max_tilt_deg=3.0), Effects(inner_only=0.15)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "head", "words"),
-    [
+@pytest.mark.parametrize("seed", SEEDS)
+def test_verdict_names_what_is_weak(seed) -> None:
+    for session, head, words in (
         ({"effects": FLAT}, "Not good enough: these 28 views do not determine K", "tilt 30 to 45"),
         ({"effects": INNER}, "Not good enough", "no corners in the outer tenth"),
         ({"noise_px": 0.25}, "Usable with care", "corners scatter by 0.2"),
-    ],
-    ids=["flat", "inner", "noisy"],
-)
-def test_verdict_names_what_is_weak(arguments, head, words) -> None:
-    for seed in SEEDS:
-        result = fit(CHARUCO, seed, **arguments)
+    ):
+        result = fit(CHARUCO, seed, **session)
         verdict = result.verdict()
         assert verdict.startswith(head)
         assert words in verdict.replace("\n  ", " ")
@@ -109,7 +91,7 @@ def test_verdict_does_not_judge_by_rms() -> None:
 def test_halves_of_healthy_sessions_differ_as_they_say() -> None:
     """P-values are uniform, and differences are as large as their stated deviations."""
     found = []
-    for seed in range(7000, 7000 + (500 if NIGHTLY else 30)):
+    for seed in range(7000, 7000 + (500 if NIGHTLY else 20)):
         detections, _ = corner_session(CHARUCO, LENS, seed)
         found.append(intrinsics.halves(detections, CHARUCO, range_m=0.6, shape=(5, 5)))
     p_values = np.array([both.p_value for both in found])
@@ -133,8 +115,6 @@ def test_halves_disagree_when_the_lens_was_refocused_between() -> None:
     assert "more than noise explains (p < 0.000001)" in repr(both)
     assert both.first.value("fx") == pytest.approx(612, abs=4)
     assert both.second.value("fx") == pytest.approx(624, abs=4)
-    with pytest.raises(ValueError, match="got 5 views, halves need at least 6"):
-        intrinsics.halves(mixed[:5], CHARUCO)
 
 
 def test_difference_takes_out_a_motion_of_the_frame_and_no_more() -> None:
@@ -145,9 +125,8 @@ def test_difference_takes_out_a_motion_of_the_frame_and_no_more() -> None:
     left = difference_px(LENS, shifted, grid, 0.5)
     assert 0.01 < np.linalg.norm(left, axis=1).max() < 1.0  # of 5
     scaled = replace(LENS, fx=LENS.fx * 1.01, fy=LENS.fy * 1.01)
-    near, far = (
-        np.linalg.norm(difference_px(LENS, scaled, grid, r), axis=1).max() for r in (0.5, math.inf)
-    )
+    off = [difference_px(LENS, scaled, grid, range_m) for range_m in (0.5, math.inf)]
+    near, far = np.linalg.norm(off, axis=2).max(axis=1)
     assert near < 0.5 * far  # at one distance, moving away takes the place of a longer f
     assert far > 3
     bent = replace(LENS, coeffs=(0.06, *LENS.coeffs[1:]))
@@ -170,8 +149,17 @@ def test_comparison_with_the_truth_and_with_another_camera(good) -> None:
     expected = np.linalg.norm(own) * (8 / 620)
     assert other.shift_m[0, 0] == pytest.approx(expected, abs=0.0015)
     assert max(map(len, repr(other).splitlines())) <= 92
-    with pytest.raises(ValueError, match=r"factory: got \(848, 480\), want the fit's size"):
-        intrinsics.compare(good, Intrinsics(848, 480, 600, 600, 424, 240))
+
+
+OTHER = Intrinsics(848, 480, 600, 600, 424, 240)
+test_bad_input_is_named = refusals(
+    ("detections: got 0, want at least one view", lambda: intrinsics.coverage([])),
+    (
+        "got 5 views, halves need at least 6",
+        lambda: intrinsics.halves(fit(CHARUCO, 1).detections[:5], CHARUCO),
+    ),
+    (r"factory: got \(848, 480\), want", lambda: intrinsics.compare(fit(CHARUCO, 1), OTHER)),
+)
 
 
 def test_comparison_of_a_shared_focal_length() -> None:
@@ -179,51 +167,36 @@ def test_comparison_of_a_shared_focal_length() -> None:
     detections, _ = corner_session(CHARUCO, lens, 5)
     result = intrinsics.calibrate(detections, CHARUCO, same_focal=True)
     factory = replace(lens, fx=610.0, fy=616.0)
-    assert intrinsics.compare(result, factory).differences[0] == pytest.approx(
-        result.value("f") - 613
-    )
+    difference = intrinsics.compare(result, factory).differences[0]
+    assert difference == pytest.approx(result.value("f") - 613)
 
 
 # --- the bow ---
 
 
-def biased(name: str, truth: float, results: list[intrinsics.IntrinsicsResult]) -> float:
-    """The mean error in units of its standard error."""
-    errors = np.array([r.value(name) - truth for r in results])
-    return float(errors.mean() / (errors.std(ddof=1) / math.sqrt(len(errors))))
-
-
 @pytest.mark.parametrize("board", [CHARUCO, CHECKERBOARD], ids=lambda board: board.kind)
 def test_a_bow_is_found_and_its_damage_undone(board: Board) -> None:
-    """Claim I1: 1 mm biases fx by about 2 % and k1 by several sigmas, at an RMS of 0.2 px."""
+    """What it does while nobody looks for it is claim I1, by the same fits."""
     count = 100 if NIGHTLY else 10
-    flat, fitted, sag_held, fx_held = [], [], 0, 0
+    fitted, sag_held, fx_held = [], 0, 0
     for seed in range(9000, 9000 + count):
-        detections, _ = corner_session(board, LENS, seed, effects=Effects(bow_m=0.001))
-        result = intrinsics.calibrate(detections, board)
-        bow = intrinsics.fit_bow(result)
+        bow = intrinsics.fit_bow(fit(board, seed, effects=Effects(bow_m=0.001)))
         assert bow.result.converged
         assert bow.p_value < 1e-6
         low, high = bow.interval_m()
         sag_held += low <= 0.001 <= high
         low, high = bow.result.interval("fx")
         fx_held += low <= LENS.fx <= high
-        flat.append(result)
         fitted.append(bow.result)
-    share = np.mean([r.value("fx") / LENS.fx - 1 for r in flat])
-    assert -0.030 < share < -0.015
-    off = np.mean([(r.value("k1") - 0.08) / r.sigma("k1") for r in flat])
-    assert -7 < off < -2
-    assert 0.15 < np.mean([r.rms_px for r in flat]) < 0.25
-    assert abs(biased("fx", LENS.fx, fitted)) < 3.5
-    assert abs(biased("k1", 0.08, fitted)) < 3.5
+    for name, truth in (("fx", LENS.fx), ("k1", LENS.coeffs[0])):  # without a bias
+        assert abs(ttest_1samp([r.value(name) for r in fitted], truth).statistic) < 3.5
     assert min(sag_held, fx_held) >= 0.88 * count - 1
     assert np.mean([r.sigma_px for r in fitted]) == pytest.approx(0.08, rel=0.03)
 
 
 def test_a_flat_board_has_no_bow_and_a_hollow_one_a_negative_sag() -> None:
     p_values = []
-    for seed in range(9500, 9500 + (200 if NIGHTLY else 15)):
+    for seed in range(9000, 9000 + (200 if NIGHTLY else 15)):
         bow = intrinsics.fit_bow(fit(CHARUCO, seed))
         p_values.append(bow.p_value)
         assert abs(bow.sag_m) < 4.5 * bow.sigma_m
@@ -252,15 +225,13 @@ def test_bow_is_what_scipy_finds_over_everything() -> None:
             parts.append((view.pixels - seen).ravel())
         return np.concatenate(parts)
 
-    poses = [
-        [*Rotation.from_matrix(T[:3, :3]).as_rotvec(), *T[:3, 3]] for T in truth.T_camera_board
-    ]
+    T = truth.T_camera_board
+    poses = np.hstack([Rotation.from_matrix(T[:, :3, :3]).as_rotvec(), T[:, :3, 3]])
     start = np.array([600.0, 600, 320, 240, 0, 0, 0, 0, 0, *np.ravel(poses)])
     found = least_squares(residuals, start, x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12)
     for i, name in enumerate(names):
-        assert bow.result.value(name) == pytest.approx(
-            found.x[i], abs=0.02 * bow.result.sigma(name)
-        )
+        tolerance = 0.02 * bow.result.sigma(name)
+        assert bow.result.value(name) == pytest.approx(found.x[i], abs=tolerance)
     sigma = np.sqrt(np.diag(bow.covariance))
     assert np.abs((bow.coefficients - found.x[6:9]) / sigma).max() < 0.02
     free = len(found.fun) - len(found.x)
@@ -272,14 +243,12 @@ def test_bow_is_what_scipy_finds_over_everything() -> None:
 
 def test_bow_agrees_with_opencvs_released_object() -> None:
     """calibrateCameraRO frees every corner of the board: a shape of our three coefficients."""
-    detections, _ = corner_session(CHECKERBOARD, LENS, 2, effects=Effects(bow_m=0.001))
-    result = intrinsics.calibrate(detections, CHECKERBOARD)
+    result = fit(CHECKERBOARD, 9000, effects=Effects(bow_m=0.001))
     bow = intrinsics.fit_bow(result)
-    points = CHECKERBOARD.points.astype(np.float32)
-    _, K, _, _, _, found = cv2.calibrateCameraRO(
-        [points] * len(detections), [d.pixels.astype(np.float32) for d in detections], LENS.size,
-        CHECKERBOARD.corners[0] - 1, None, None, criteria=(3, 200, 1e-12),
-    )  # fmt: skip
+    pixels = [d.pixels.astype(np.float32) for d in result.detections]
+    points = [CHECKERBOARD.points.astype(np.float32)] * len(pixels)
+    how = (LENS.size, CHECKERBOARD.corners[0] - 1, None, None)
+    _, K, *_, found = cv2.calibrateCameraRO(points, pixels, *how, criteria=(3, 200, 1e-12))
     assert K[0, 0] == pytest.approx(bow.result.value("fx"), abs=2 * bow.result.sigma("fx"))
     assert abs(result.value("fx") - K[0, 0]) > 10 * bow.result.sigma("fx")
 
@@ -293,20 +262,3 @@ def test_bow_agrees_with_opencvs_released_object() -> None:
     assert np.std(true) > 0.00025
     assert np.std(ours - true) < 0.00001
     assert np.std(theirs - ours) < 0.00004
-
-
-def test_a_bow_moves_corners_by_less_than_the_lesson_says() -> None:
-    """Claim I1: at most about a pixel, and it is absorbed; not several pixels."""
-    centre = CHECKERBOARD.points.mean(axis=0)
-    for focal, expected in ((600.0, (0.4, 0.9, 1.0)), (900.0, (0.5, 1.3, 1.6))):
-        K = np.array([[focal, 0, 320], [0, focal, 240], [0, 0, 1]])
-        for tilt, wanted in zip((15, 45, 60), expected, strict=True):
-            R = Rotation.from_euler("x", tilt, degrees=True)
-            T = make_transform(R, np.array([0, 0, 0.5]) - R.apply(centre))
-            flat = project(transform_points(T, CHECKERBOARD.points), K)
-            bent = project(transform_points(T, bowed(CHECKERBOARD, 0.001)), K)
-            moved = np.linalg.norm(bent - flat, axis=1).max()
-            assert moved == pytest.approx(wanted, abs=0.07)
-            _, r, t = cv2.solvePnP(CHECKERBOARD.points, bent, K, None)
-            again = cv2.projectPoints(CHECKERBOARD.points, r, t, K, None)[0][:, 0]
-            assert np.linalg.norm(again - bent, axis=1).max() < 0.95

@@ -3,31 +3,20 @@
 The tests of the rows are in test_lesson_claims_*.py, by notebook.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections import Counter
+from importlib import import_module
 from pathlib import Path
 
 import pytest
-import test_lesson_claims_budget
-import test_lesson_claims_depth
-import test_lesson_claims_hand_eye
-import test_lesson_claims_intrinsics
-import test_lesson_claims_pinhole
 from lesson_claims import ROWS, TESTED, read_rows
 
 from coursekit.specifications import DATA
 
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
-MODULES = (
-    test_lesson_claims_pinhole,
-    test_lesson_claims_depth,
-    test_lesson_claims_intrinsics,
-    test_lesson_claims_hand_eye,
-    test_lesson_claims_budget,
-)
+FILES = sorted(Path(__file__).parent.glob("test_lesson_claims_*.py"))
+MODULES = [import_module(path.stem) for path in FILES]
 VERDICTS = ("right", "imprecise", "wrong")
 # 1: id, 2: verdict; 3: the text up to the next entry
 ENTRY = re.compile(r"^### ([A-Z]\d+) · [^\n]+ \((\w+)\)\n(.*?)(?=^##|\Z)", re.MULTILINE | re.DOTALL)
@@ -58,12 +47,8 @@ def test_each_row_has_one_test_which_stands_for_its_verdict() -> None:
 
 
 def test_the_tests_are_where_they_are_collected() -> None:
-    found = {
-        f"{module.__name__}.{name}"
-        for module in MODULES
-        for name in vars(module)
-        if name.startswith("test_")
-    }
+    names = [(module.__name__, name) for module in MODULES for name in vars(module)]
+    found = {f"{module}.{name}" for module, name in names if name.startswith("test_")}
     assert found == {test for *_, test in TESTED}
 
 

@@ -3,8 +3,6 @@
 By NumPy and SciPy alone: `coursekit.budget` has tests of its own, and these figures are for both.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import math
@@ -27,10 +25,8 @@ TOLERANCE_MM = 7.0
 
 @claim("B1", "right")
 def test_b1_the_price_of_a_pixel() -> None:
-    prices = []
-    for z in (AT, 2 * AT):
-        one, other = deproject([[500.0, 240.0], [501.0, 240.0]], z, K)
-        prices.append(1e3 * np.linalg.norm(other - one))
+    pixels = [[500.0, 240.0], [501.0, 240.0]]
+    prices = [1e3 * np.linalg.norm(np.diff(deproject(pixels, z, K), axis=0)) for z in (AT, 2 * AT)]
     ROWS["B1"].says(f"{prices[0]:.3f}; {prices[1]:.3f} mm", f"{prices[0]:.1f}; {prices[1]:.1f} mm")
 
 
@@ -61,12 +57,9 @@ def test_b4_the_noise_rows() -> None:
     ROWS["B4"].says("1.3 mm", f"= {together:.2f} mm")
     assert round(together, 1) == 1.2  # not 1.3
     rng = np.random.default_rng(4)
-    gauss = rng.standard_normal((400_000, 2)) * [1.0, 0.7]
-    assert gauss.sum(axis=1).std() == pytest.approx(together, rel=0.01)
-    bounds = rng.uniform(-1, 1, (400_000, 2)) * [1.0, 0.7]
-    as_bounds = together / math.sqrt(3)
-    assert bounds.sum(axis=1).std() == pytest.approx(as_bounds, rel=0.01)
-    ROWS["B4"].says(f"{as_bounds:.2f} mm. +-1 px")
+    as_bounds = np.std(rng.uniform(-1, 1, (400_000, 2)) @ [1.0, 0.7])
+    assert as_bounds == pytest.approx(together / math.sqrt(3), rel=0.01)
+    ROWS["B4"].says(f"{together / math.sqrt(3):.2f} mm. +-1 px")
     depth = 1e3 * float(stereo.depth_noise(AT, 447.0, 0.05, 0.08))
     pixel = 1e3 * AT / 447.0
     in_all = math.sqrt(2 * pixel**2 + depth**2)
@@ -81,9 +74,8 @@ def test_b4_the_noise_rows() -> None:
 def test_b5_the_bias_rows() -> None:
     low, high = BIAS_MM.sum(axis=0)
     ROWS["B5"].says("row ranges " + ", ".join(f"{a:g}-{b:g}" for a, b in BIAS_MM))
-    ROWS["B5"].says(
-        "8-12 mm", f"add to {low:.1f}-{high:.1f} mm", f"midpoint {(low + high) / 2:.2f}"
-    )
+    ROWS["B5"].says("8-12 mm", f"add to {low:.1f}-{high:.1f} mm")
+    ROWS["B5"].says(f"midpoint {(low + high) / 2:.2f}")
     assert low < 8  # the lesson's range is neither the least
     assert high > 12  # nor the most
     square = np.sqrt((BIAS_MM**2).sum(axis=0))
@@ -134,14 +126,6 @@ def test_b7_the_grippers_opening() -> None:
     ROWS["B7"].says("a 66 mm object")
 
 
-def hotelling_p(misses: np.ndarray) -> float:
-    """That the mean of misses (n, 3) is zero, by Hotelling's T^2."""
-    n, k = misses.shape
-    mean = misses.mean(axis=0)
-    squared = n * mean @ np.linalg.solve(np.cov(misses.T), mean)
-    return float(stats.f.sf(squared * (n - k) / (k * (n - 1)), k, n - k))
-
-
 def power(n: int, alike: bool = False) -> float:
     """Of Hotelling's test at level 0.01 for 3 mm of bias in 2 mm of noise an axis, n trials.
 
@@ -153,29 +137,27 @@ def power(n: int, alike: bool = False) -> float:
 
 @claim("B8", "right")
 def test_b8_calibration_perception_and_the_arm() -> None:
-    rng, sets = np.random.default_rng(8), 1500
-    toward = np.array([1.0, -2.0, 2.0]) / 3
-    found = {}
-    for n, bias in ((10, 0.0), (10, 3.0), (20, 3.0)):
-        draws = bias * toward + 2.0 * rng.standard_normal((sets, n, 3))
-        found[n, bias] = np.mean([hotelling_p(misses) < 0.01 for misses in draws])
-    assert found[10, 0.0] < 0.02  # scatter without a direction is seldom taken for one
-    for n in (10, 20):
-        assert found[n, 3.0] == pytest.approx(power(n), abs=0.04)
+    """Scatter is not taken for a constant, nor a constant for scatter: test_attribution.py."""
+    rng, toward = np.random.default_rng(8), np.array([1.0, -2.0, 2.0])
+    misses = toward + 2.0 * rng.standard_normal((1500, 10, 3))
+    mean, S = (
+        misses.mean(axis=1),
+        np.einsum("sni,snj->sij", *[misses - misses.mean(1)[:, None]] * 2),
+    )
+    squared = 90 * np.einsum("si,si->s", mean, np.linalg.solve(S, mean[..., None])[..., 0])
+    found = np.mean(stats.f.sf(squared * 7 / 27, 3, 7) < 0.01)
+    assert found == pytest.approx(power(10), abs=0.04)
     enough = next(n for n in range(4, 40) if power(n) >= 0.8)
     ROWS["B8"].says(f"in {100 * power(10):.0f} % of sets of 10 trials")
     ROWS["B8"].says(f"{100 * power(20):.0f} % of 20", f"{enough} for 80 %")
     ROWS["B8"].says(f"alike in {100 * power(10, alike=True):.0f} % of 10")
 
     # An arm whose joints are off: the same miss at the same pose, another one at another pose.
-    q = widowx().random(np.random.default_rng(0), 12)
-    arm = SimulatedArm(2, ArmErrors())
-    misses = np.empty((5, 12, 3))
-    for trial in range(5):
-        for i, target in enumerate(q):
-            read = arm.move(target)
-            computed = widowx().forward(read)
-            misses[trial, i] = 1e3 * (arm.true_pose() - computed)[:3, 3]
+    arm, misses = SimulatedArm(2, ArmErrors()), []
+    for target in np.tile(widowx().random(np.random.default_rng(0), 12), (5, 1)):
+        computed = widowx().forward(arm.move(target))
+        misses.append(1e3 * (arm.true_pose() - computed)[:3, 3])
+    misses = np.reshape(misses, (5, 12, 3))
     within = np.sqrt(misses.var(axis=0, ddof=1).mean())
     between = np.sqrt(misses.mean(axis=0).var(axis=0, ddof=1).mean())
     assert within < 0.3 * between  # perception would scatter at one pose, too
@@ -187,37 +169,27 @@ def test_b8_calibration_perception_and_the_arm() -> None:
 @claim("B9", "right")
 def test_b9_the_table_is_a_ledgers_row() -> None:
     """Six terms in one line of CSV, and the sums of B4 and B5 from what is read back."""
-    terms = {
-        "pixel": ("noise", 1.0, 1.0), "depth_noise": ("noise", 0.7, 0.7),
-        "depth_bias": ("bias", *BIAS_MM[0]), "hand_eye_rotation": ("bias", *BIAS_MM[1]),
-        "hand_eye_translation": ("bias", *BIAS_MM[2]), "fk": ("bias", *BIAS_MM[3]),
-    }  # fmt: skip
-    header = [
-        f"{name}_{kind}_{end}_mm" for name, (kind, *_) in terms.items() for end in ("low", "high")
-    ]
+    terms = {"pixel_noise": 1.0, "depth_noise": 0.7}
+    for name, (low, high) in zip(("depth", "rotation", "translation", "fk"), BIAS_MM, strict=True):
+        terms |= {f"{name}_bias_low": low, f"{name}_bias_high": high}
     file = io.StringIO(newline="")
-    writer = csv.writer(file)
-    writer.writerow(header)
-    writer.writerow([value for _, *ends in terms.values() for value in ends])
+    csv.writer(file).writerows([terms.keys(), terms.values()])
     file.seek(0)
     (row,) = csv.DictReader(file)
-
-    def ends(kind: str, end: str) -> list[float]:
-        return [float(value) for key, value in row.items() if key.endswith(f"_{kind}_{end}_mm")]
-
-    assert math.hypot(*ends("noise", "high")) == pytest.approx(1.22, abs=0.005)
-    assert (sum(ends("bias", "low")), sum(ends("bias", "high"))) == pytest.approx((5.0, 15.9))
+    noise, low, high = (
+        [float(value) for key, value in row.items() if key.endswith(end)]
+        for end in ("_noise", "_low", "_high")
+    )
+    assert math.hypot(*noise) == pytest.approx(1.22, abs=0.005)
+    assert (sum(low), sum(high)) == pytest.approx((5.0, 15.9))
     ROWS["B9"].says("CSV")
 
 
 @claim("B10", "imprecise")
 def test_b10_what_a_depth_bias_does_to_the_point() -> None:
-    moved = {}
-    for name, u, v in (("axis", 424, 240), ("edge", 0, 240), ("corner", 0, 0)):
-        near, far = deproject([u, v], [AT, AT + 0.005], K)
-        moved[name] = 1e3 * np.linalg.norm(far - near)
-    assert moved["edge"] > 6 > moved["axis"]  # 2-6 mm does not hold all over the image
-    ROWS["B10"].says(f"{moved['axis']:.1f} mm on the axis", f"{moved['edge']:.1f} mm at the left")
-    ROWS["B10"].says("2-6 mm")
-    ROWS["B10"].says(f"{moved['corner']:.1f} mm in the corner")
-    assert moved["edge"] == pytest.approx(5 * math.hypot(1, leak(0, 240)))
+    ends = [deproject([u, v], [AT, AT + 0.005], K) for u, v in ((424, 240), (0, 240), (0, 0))]
+    axis, edge, corner = (1e3 * np.linalg.norm(far - near) for near, far in ends)
+    assert edge > 6 > axis  # 2-6 mm does not hold all over the image
+    ROWS["B10"].says(f"{axis:.1f} mm on the axis", f"{edge:.1f} mm at the left", "2-6 mm")
+    ROWS["B10"].says(f"{corner:.1f} mm in the corner")
+    assert edge == pytest.approx(5 * math.hypot(1, leak(0, 240)))

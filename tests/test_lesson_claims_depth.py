@@ -1,13 +1,10 @@
 """Rows D1 to D16 of data/claims.csv: stereo depth and its noise.
 
-COURSEKIT_NIGHTLY=1 takes more frames and distances where depth images are simulated.
+What simulated depth images show of D7 and D9 (room light steepens the curve, nothing is right under
+the minimum range) is proved in test_active_stereo.py, and what averaging does in test_stereo.py.
 """
 
-from __future__ import annotations
-
 import math
-import os
-from functools import cache
 
 import numpy as np
 import pytest
@@ -16,10 +13,8 @@ from lesson_claims import ROWS, claim, nominal_fx_px
 from coursekit import plots, stereo
 from coursekit.geometry import deproject
 from coursekit.results import read_json
-from coursekit.simulation import Rig, wall_scene
 from coursekit.specifications import DATA, device
 
-NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 FX, BASELINE, SIGMA_D = 447.0, 0.050, 0.08
 FB = FX * BASELINE
 K = np.array([[FX, 0, 424], [0, FX, 240], [0, 0, 1]])
@@ -86,19 +81,6 @@ def test_d6_a_baseline_error_is_a_depth_error() -> None:
 # --- D7: the matcher's noise is not one number ---
 
 
-@cache
-def wall_noise_m(ambient: float, distance: float, frames: int) -> float:
-    """Std over time of a pixel's depth in the middle of a simulated wall."""
-    unit = D435.unit
-    view = Rig(unit.depth, unit.baseline_m, ambient=ambient).look_at(wall_scene(distance, 7.0))
-    rng = np.random.default_rng(0)
-    disparity = np.stack([view.frame(rng).disparity[180:300, 320:520] for _ in range(frames)])
-    disparity = disparity[:, (disparity > 0).all(axis=0)]
-    still = np.ptp(disparity, axis=0) < 1  # no mismatch in any frame
-    depth = unit.depth.fx * unit.baseline_m / disparity[:, still]
-    return float(np.sqrt(depth.var(axis=0, ddof=1).mean()))
-
-
 @claim("D7", "imprecise")
 def test_d7_the_disparity_noise_is_not_constant() -> None:
     mapping, walls = SERIES["d435_mapping_model"], SERIES["d435_window_mean"]
@@ -125,12 +107,6 @@ def test_d7_the_disparity_noise_is_not_constant() -> None:
     rounded = np.sqrt(stereo.rounded_variance(noise_mm(STUDIO), 1.0))
     ROWS["D7"].says(f"rounding alone can give {exponent(STUDIO, rounded):.1f}")
 
-    frames, ends = (20, (0.6, 1.0, 1.5, 2.0)) if NIGHTLY else (6, (0.6, 2.0))
-    dim, bright = (
-        exponent(ends, [wall_noise_m(ambient, z, frames) for z in ends]) for ambient in (0.01, 0.5)
-    )
-    assert dim == pytest.approx(2.0, abs=0.1)
-    assert bright > dim + 0.2
     ROWS["D7"].says("ambient light steepens")
 
 
@@ -145,22 +121,14 @@ def gain_of_hundred(rho: float) -> float:
 
 @claim("D8", "imprecise")
 def test_d8_what_a_hundred_frames_buy() -> None:
-    rng = np.random.default_rng(8)
-    for rho in (0.0, 0.5):
-        series = rng.standard_normal((4000, 100))
-        for k in range(1, 100):
-            series[:, k] = rho * series[:, k - 1] + math.sqrt(1 - rho**2) * series[:, k]
-        measured = 1 / series.mean(axis=1).std()
-        assert measured == pytest.approx(gain_of_hundred(rho), rel=0.05)
     assert gain_of_hundred(0.0) == pytest.approx(10)
     ROWS["D8"].says(f"AR(1) rho 0.5 gives {gain_of_hundred(0.5):.1f}x")
     ROWS["D8"].says(f"{gain_of_hundred(0.0):.0f}x")
     ROWS["D8"].says(f"gained {SERIES['d435_window_mean']['gain_of_100_frames']}x")
     # a pattern that stays: 0.6 mm in each pixel, the same in all frames
+    rng = np.random.default_rng(8)
     pattern = 0.6e-3 * rng.standard_normal((30, 30))
     stack = 0.5 + pattern + 1e-3 * rng.standard_normal((128, 30, 30))
-    curve = stereo.averaging_curve(stack)
-    assert curve.floor_m == pytest.approx(0.6e-3, rel=0.1)
     left = (stack.mean(axis=0) - 0.5).std()
     assert left > 0.9 * 0.6e-3  # not a tenth of hypot(1, 0.6) mm
     ROWS["D8"].says("does not average at all")
@@ -175,14 +143,6 @@ def test_d9_minimum_range() -> None:
     ROWS["D9"].says(*sheets)
     for text, least in sheets.items():  # a little above what the search allows
         assert least < int(text[:3]) / 1e3 < 1.2 * least
-    unit = D435.unit
-    rig, valid = Rig(unit.depth, unit.baseline_m), {}
-    for z in (0.15, 0.20):
-        d = rig.look_at(wall_scene(z, 0.0)).frame(np.random.default_rng(0)).disparity
-        right = np.abs(d - unit.depth.fx * unit.baseline_m / z) < 0.5
-        valid[z] = right[60:420, 300:780].mean()
-    assert valid[0.15] < 0.01
-    assert valid[0.20] > 0.9
 
 
 # --- D10: three ways to make Z ---
@@ -233,10 +193,8 @@ def width_std_mm(z: float, middle_m: float, own_depths: bool, frames: int = 40_0
 
 @claim("D11", "wrong")
 def test_d11_the_width_does_not_follow_the_depths_curve() -> None:
-    one, own, median = (
-        width_std_mm(0.4, 0.0, False), width_std_mm(0.4, 0.0, True),
-        width_std_mm(0.4, 0.0, True, frames=20_000, n=25),
-    )  # fmt: skip
+    one, own = (width_std_mm(0.4, 0.0, own_depths) for own_depths in (False, True))
+    median = width_std_mm(0.4, 0.0, True, frames=20_000, n=25)
     depth = float(noise_mm(0.4))
     tangent = 0.03 / 0.4  # of each end's angle off the axis
     together, apart = 2 * tangent * depth, math.sqrt(2) * tangent * depth
@@ -294,11 +252,9 @@ def test_d13_degrees_of_freedom_and_standard_errors() -> None:
     bias_error, std_error = 1 / math.sqrt(n), 1 / math.sqrt(2 * (n - 1))
     assert samples.mean(axis=1).std() == pytest.approx(bias_error, rel=0.01)
     assert samples.std(axis=1, ddof=1).std() == pytest.approx(std_error, rel=0.03)
-    stack = 0.5 + 1e-3 * rng.standard_normal((4, 40, 40))
-    stats = stereo.window_stats(stack, (0, 0, 40, 40))
-    assert stats.pixel_std_m == pytest.approx(np.sqrt(stack.var(axis=0, ddof=1).mean()))
     stack = 0.5 + 1e-3 * rng.standard_normal((100, 20, 20))
     stats = stereo.window_stats(stack, (0, 0, 20, 20))
+    assert stats.pixel_std_m == pytest.approx(np.sqrt(stack.var(axis=0, ddof=1).mean()), rel=1e-3)
     assert stats.pixel_std_error_m == pytest.approx(1e-3 / math.sqrt(2 * 99 * 400), rel=0.1)
     ROWS["D13"].says("ddof = 1", "standard error of bias and of std")
 

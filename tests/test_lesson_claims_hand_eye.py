@@ -3,14 +3,12 @@
 COURSEKIT_NIGHTLY=1 takes more trials.
 """
 
-from __future__ import annotations
-
 import math
-import os
 
 import cv2
 import numpy as np
 import pytest
+from common import NIGHTLY, derivative
 from lesson_claims import ROWS, claim
 from scipy.optimize import differential_evolution
 from scipy.spatial.transform import Rotation
@@ -18,10 +16,10 @@ from simulated_hand_eye import BOARD, arm_session, free_session
 
 import coursekit.hand_eye as he
 from coursekit.arm import widowx
-from coursekit.geometry import make_transform, transform_points
+from coursekit.geometry import make_transform
 from coursekit.hand_eye.poses import camera_board
 
-TRIALS = 2000 if os.environ.get("COURSEKIT_NIGHTLY") == "1" else 200
+TRIALS = 2000 if NIGHTLY else 200
 
 
 def rig(turns_rad: np.ndarray, shifts_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -79,9 +77,7 @@ def null_space(T: np.ndarray, C: np.ndarray, X: np.ndarray) -> np.ndarray:
         moved = make_transform(turn @ X[:3, :3], X[:3, 3] + step[3:])
         return (A @ moved - moved @ B).ravel()
 
-    h = 1e-6
-    J = np.stack([(residual(h * e) - residual(-h * e)) / (2 * h) for e in np.eye(6)], axis=1)
-    _, sizes, directions = np.linalg.svd(J, full_matrices=False)
+    _, sizes, directions = np.linalg.svd(derivative(residual, 1e-6, 6), full_matrices=False)
     return directions[sizes < 1e-6 * sizes[0]]
 
 
@@ -111,30 +107,24 @@ def test_h3_two_axes_are_needed() -> None:
     np.testing.assert_allclose(he.HandEyeSession("eye_in_hand", T, C).solve().X, X, atol=1e-8)
 
     X, T, C = rig(math.radians(0.5) * rng.uniform(-1, 1, (12, 3)), rng.uniform(-0.2, 0.2, (12, 3)))
-    R, _ = cv2.calibrateHandEye(
-        T[:, :3, :3], T[:, :3, 3], C[:, :3, :3], C[:, :3, 3], method=cv2.CALIB_HAND_EYE_TSAI
-    )
+    parts = (M[:, :3, columns] for M in (T, C) for columns in (np.s_[:3], 3))
+    R, _ = cv2.calibrateHandEye(*parts, method=cv2.CALIB_HAND_EYE_TSAI)
     np.testing.assert_array_equal(R, np.eye(3))
     with pytest.raises(he.SolverFailed, match="tsai: OpenCV returned the identity"):
         he.HandEyeSession("eye_in_hand", T, C).solve("tsai")
-    ROWS["H3"].says(
-        "t_X is free along it", "fixed only where", "Tsai solver silently returns the identity"
-    )
+    ROWS["H3"].says("t_X is free along it", "fixed only where")
+    ROWS["H3"].says("Tsai solver silently returns the identity")
 
 
 @claim("H4", "right")
 def test_h4_poses_and_range() -> None:
-    claimed = {(3, 40): (0.13, 0.8), (2, 40): (0.17, 0.95), (2, 30): (0.22, 1.3),
-               (3, 10): (0.50, 3.0), (2, 10): (0.65, 4.4)}  # fmt: skip
+    claimed = {(3, 40): (0.13, 0.8), (2, 40): (0.17, 0.95), (2, 30): (0.22, 1.3)}
+    claimed |= {(3, 10): (0.50, 3.0), (2, 10): (0.65, 4.4)}
     ROWS["H4"].says("0.13 deg / 0.8 mm", "0.17 / 0.95", "0.22 / 1.3", "0.5-0.65 deg / 3.0-4.4 mm")
     ROWS["H4"].says("A and B from each pose and the next")
-    every, following = (
-        {
-            (p.axes, p.range_deg): p
-            for p in he.error_study(ranges_deg=(10, 30, 40), trials=TRIALS, pairs=pairs)
-        }
-        for pairs in ("all", "consecutive")
-    )
+    how = {"ranges_deg": (10, 30, 40), "trials": TRIALS}
+    studies = [he.error_study(**how, pairs=pairs) for pairs in ("all", "consecutive")]
+    every, following = ({(p.axes, p.range_deg): p for p in study} for study in studies)
     for key, (deg, mm) in claimed.items():
         assert following[key].rotation_deg == pytest.approx(deg, rel=0.1)
         assert 0.85 * every[key].translation_mm < mm < 1.05 * following[key].translation_mm
@@ -174,10 +164,8 @@ def test_h6_held_out_poses_in_pixels_and_millimetres() -> None:
     assert narrow.rms_mm > 3 * good.rms_mm
     # Millimetres by hand: the board as predicted against the board as the truth has it
     predicted = camera_board(test.T, fit.X, fit.Y, "eye_in_hand")
-    gaps = [
-        transform_points(p, BOARD.points) - transform_points(t, BOARD.points)
-        for p, t in zip(predicted, test.exact, strict=True)
-    ]
+    off = predicted - test.exact
+    gaps = [T[:3, :3] @ point + T[:3, 3] for T in off for point in BOARD.points]
     own_mm = 1e3 * np.sqrt(np.mean(np.sum(np.square(gaps), axis=-1)))
     assert 0.3 < own_mm / good.rms_mm < 1.1  # the rest is the noise of the held-out images
     ROWS["H6"].says("in mm at the board")
@@ -190,11 +178,12 @@ def test_h7_reach() -> None:
 
     def farthest(length) -> float:
         """joint_0 turns the whole and joint_5 the fingers about themselves: neither matters."""
-        found = differential_evolution(
-            lambda q: -length(arm.forward(np.pad(q.T, [(0, 0), (1, 1)]))[:, :3, 3] - axis_at),
-            arm.limits[1:5], rng=0, tol=1e-10, maxiter=200, vectorized=True, updating="deferred",
-        )  # fmt: skip
-        return -float(found.fun)
+
+        def nearness(q):
+            return -length(arm.forward(np.pad(q.T, [(0, 0), (1, 1)]))[:, :3, 3] - axis_at)
+
+        how = {"rng": 0, "tol": 1e-10, "maxiter": 200, "vectorized": True, "updating": "deferred"}
+        return -float(differential_evolution(nearness, arm.limits[1:5], **how).fun)
 
     radius = farthest(lambda p: np.hypot(p[:, 0], p[:, 1]))
     reach = farthest(lambda p: np.linalg.norm(p, axis=1))

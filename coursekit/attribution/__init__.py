@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from coursekit.attribution.ledger import Entry, Ledger
 from coursekit.attribution.simulate import SimulatedMisses, four_sets, simulate_misses
-from coursekit.attribution.verdict import Attribution, Conclusion, attribute
+from coursekit.attribution.verdict import Attribution, Blame, attribute
 
 __all__ = [
     "Attribution",
-    "Conclusion",
+    "Blame",
     "Entry",
     "Ledger",
     "SimulatedMisses",

@@ -129,20 +129,14 @@ class Ledger:
         except UnicodeDecodeError as error:
             raise ValueError(f"{self.path.name}: is not UTF-8 text ({error.reason})") from error
         reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-        entries = []
         try:
-            for index, row in enumerate(reader):
-                if index:
-                    entries.append(_entry(row))
-                elif tuple(row) != LEDGER_HEADER:
-                    raise ValueError(f"the header is {','.join(row)[:80]!r}, not a ledger's")
+            header = tuple(next(reader, ("nothing",)))
+            if header != LEDGER_HEADER:
+                raise ValueError(f"the header is {','.join(header)[:80]!r}, not a ledger's")
+            return tuple(map(_entry, reader))
         except (ValueError, csv.Error) as error:
-            raise ValueError(
-                f"{self.path.name}, line {reader.line_num}: {error}. Mend it or move it away."
-            ) from error
-        if reader.line_num == 0:
-            raise ValueError(f"{self.path.name}: is empty. Move it away.")
-        return tuple(entries)
+            where = f"{self.path.name}, line {max(reader.line_num, 1)}"
+            raise ValueError(f"{where}: {error}. Mend it or move it away.") from error
 
     def __repr__(self) -> str:
         rows = self.read()

@@ -51,7 +51,7 @@ POSE_CAUSES = {  # which columns of `pose_columns` each has
 }
 # The same place: 1 cm and 3 degrees, which poses are called still by elsewhere. Slipped joints that
 # shift a grasp by 4 mm shift it by 0.3 mm rms more or less so near by, under any depth noise.
-SAME_PLACE_M, SAME_PLACE_RAD = STILL * REACH_M, STILL
+ONE_PLACE_M, ONE_PLACE_RAD = STILL * REACH_M, STILL
 FEWEST_PLACES, FEWEST_REPEATS = 3, 2
 REPEATED_SHARE = 0.5  # of the trials in repeated places, from which a set is one with repeats
 
@@ -118,7 +118,7 @@ def box_freedom(S: Floats, n: int) -> float:
     return float(np.trace(S)) ** 2 / squares
 
 
-def power(
+def power_of_test(
     size_m: float, S: Floats, axes: float, n: int, columns: int, beside: int, level: float
 ) -> float:
     """The share of sets of n trials in which a part of the misses of size_m, m rms, is found.
@@ -286,7 +286,5 @@ def find_places(T_base_gripper: Floats) -> Integers:
     from scipy.spatial.distance import pdist
 
     turns = T_base_gripper[:, :3, :3].reshape(-1, 9) / np.sqrt(2)  # apart by the angle, if small
-    apart = np.maximum(
-        pdist(T_base_gripper[:, :3, 3]) / SAME_PLACE_M, pdist(turns) / SAME_PLACE_RAD
-    )
+    apart = np.maximum(pdist(T_base_gripper[:, :3, 3]) / ONE_PLACE_M, pdist(turns) / ONE_PLACE_RAD)
     return np.asarray(fcluster(linkage(apart, "complete"), 1.0, "distance")) - 1

@@ -11,13 +11,13 @@ import numpy as np
 from coursekit import checks
 from coursekit.arm import widowx
 from coursekit.arrays import Floats
-from coursekit.attribution.verdict import Conclusion
+from coursekit.attribution.verdict import Blame
 from coursekit.budget.view import GRIPPER_DOWN
 from coursekit.geometry import make_transform
 
 # The length of the constant that all trials share, the std of the scatter on one axis, and the rms
 # over the table of what follows the pose
-SIZES_M: dict[Conclusion, tuple[float, float, float]] = {
+SIZES_M: dict[Blame, tuple[float, float, float]] = {
     "calibration": (0.003, 0.002, 0.0),
     "perception": (0.0, 0.002, 0.0),
     "pose_dependent": (0.0, 0.002, 0.004),  # the lesson's arm is wrong by 2 to 4 mm
@@ -41,12 +41,12 @@ class SimulatedMisses:
     misses: Floats
     T_base_gripper: Floats
     q: Floats
-    kind: Conclusion
+    kind: Blame
     constant_m: Floats
     by_pose_m: Floats
 
 
-def simulate_misses(kind: Conclusion, n: int, seed: int) -> SimulatedMisses:
+def simulate_misses(kind: Blame, n: int, seed: int) -> SimulatedMisses:
     """n grasps from above, all over the table in front of a WidowX AI, that miss for one reason.
 
     kind: "calibration" (a constant of 3 mm in a random direction of the base), "perception"

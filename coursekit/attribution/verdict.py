@@ -23,13 +23,13 @@ from coursekit.attribution.significance import MeanTest, PlaceTest, PoseTest
 from coursekit.checks import want
 from coursekit.words import wrapped
 
-Conclusion = Literal["calibration", "perception", "pose_dependent", "cannot_tell_yet"]
+Blame = Literal["calibration", "perception", "pose_dependent", "cannot_tell_yet"]
 
 TEST_LEVEL = 0.01  # of each test
 ENOUGH_POWER = 0.9  # with which "there is none" may be said
 FEWEST_TRIALS, MOST_TRIALS = 5, 500  # fewer decide nothing; nobody grasps more often to find out
 MATTERS_M = 0.003
-FAR_M = 0.5  # a miss that long was given in millimetres
+TOO_LONG_M = 0.5  # a miss that long was given in millimetres
 FEW_DIGITS = 1e-4  # of a rotation: poses are often written with five
 COVERAGE = 0.95
 # A mean is blamed on the calibration only if a part of the same size that follows the pose would
@@ -45,7 +45,7 @@ FAR_APART_M = 0.1
 # and those after him). Otherwise the mean must stand out among the means of the places too.
 POOLING_LEVEL = 0.25
 DOUBT_LEVEL = 0.05  # of the mean, below which "perception" is not said
-REMEDY: dict[Conclusion, str] = {
+REMEDY: dict[Blame, str] = {
     "calibration": "repeat the hand-eye calibration, which also takes up what the arm is wrong by "
     "everywhere, or measure the constant and subtract it; more frames will not help",
     "perception": "look at the detector, the depth and its averaging; a new calibration will not "
@@ -88,7 +88,7 @@ class Cause:
     def power(self, size_m: float, n: int, level: float = TEST_LEVEL) -> float:
         """How surely it would be found in n trials, if it were of this size, m rms."""
         counted, level = round(n * self.counted / self.n), level * self.share
-        return significance.power(
+        return significance.power_of_test(
             size_m, self.S, self.axes, counted, self.columns, self.beside, level
         )
 
@@ -98,14 +98,14 @@ class Cause:
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class MissEvidence:
     """What n trials say of each cause.
 
     constant: all trials share it. by_pose: it follows the pose, by the regression. by_place: the
-    places differ, by their repeats; of_places: the means of the places share it. mean,
-    pose, places: the tests themselves. None where poses or repeats are missing. spread: how much of
-    its size an error of the arm changes by over these poses, 0 (one place) to 1 (all over the
-    table); None if they are not known.
+    places differ, by their repeats; of_places: the means of the places share it. mean, pose,
+    places: the tests themselves. None where poses or repeats are missing. spread: how much of its
+    size an error of the arm changes by over these poses, 0 (one place) to 1 (all over the table);
+    None if they are not known.
     """
 
     n: int
@@ -119,7 +119,7 @@ class Evidence:
     of_places: Cause | None
 
     @classmethod
-    def of(cls, misses: Floats, T_base_gripper: Floats | None) -> Evidence:
+    def of(cls, misses: Floats, T_base_gripper: Floats | None) -> MissEvidence:
         """All tests of misses (n, 3), m, at poses (n, 4, 4)."""
         n, S, mean = len(misses), np.cov(misses.T), significance.mean_test(misses)
         pose, places, spread = None, None, None
@@ -127,10 +127,11 @@ class Evidence:
             pose = significance.pose_test(misses, significance.pose_columns(T_base_gripper))
             places = significance.place_test(misses, T_base_gripper, TEST_LEVEL)
             apart = float(np.sqrt(T_base_gripper[:, :3, 3].var(axis=0).sum()))
-            near = apart <= significance.SAME_PLACE_M
+            near = apart <= significance.ONE_PLACE_M
             spread = 0.0 if near else min(1.0, apart / FAR_APART_M)
         share = 1.0 if pose is None or places is None else 0.5  # two tests of the pose
         p_pose, numbers = (1.0, 7) if pose is None else (pose.p_value, pose.columns)
+        # p-value, scatter and its axes, numbers of its own and beside, share of the level, how many
         constant = Cause(mean.p_value, S, mean.axes, 3, 0, significance.POOLED_SHARE, n, n)
         by_pose = Cause(p_pose, S, mean.axes, numbers, 3, share, n, n)
         by_place, of_places = None, None
@@ -172,13 +173,13 @@ class Decision(NamedTuple):
     """verdict, says: why. more_trials: that would settle it, 0 if it is, None beyond 500. remedy:
     what to do."""
 
-    verdict: Conclusion
+    verdict: Blame
     says: str
     more_trials: int | None
     remedy: str
 
 
-def decide(seen: Evidence, length_m: float, matters_m: float) -> Decision:
+def decide(seen: MissEvidence, length_m: float, matters_m: float) -> Decision:
     """The verdict on trials whose mean has length_m, where matters_m is worth finding.
 
     The first line that holds; "would show" is a power of 0.9:
@@ -216,7 +217,7 @@ def decide(seen: Evidence, length_m: float, matters_m: float) -> Decision:
     return Decision("perception", says, 0, REMEDY["perception"])
 
 
-def _pose_dependent(seen: Evidence) -> Decision:
+def _pose_dependent(seen: MissEvidence) -> Decision:
     """By the places where their repeats show it, else by the regression."""
     says, remedy = "the miss changes with the pose of the gripper", REMEDY["pose_dependent"]
     places = seen.places
@@ -230,7 +231,7 @@ def _pose_dependent(seen: Evidence) -> Decision:
     return Decision("pose_dependent", says, 0, remedy)
 
 
-def _constant(seen: Evidence, length_m: float) -> Decision:
+def _constant(seen: MissEvidence, length_m: float) -> Decision:
     """Of a mean that is not zero. The first line that holds:
 
     ==================================================================  ===============
@@ -293,14 +294,14 @@ class Attribution:
     have found what it looks for. matters_m: the size that is worth finding.
     """
 
-    verdict: Conclusion
+    verdict: Blame
     says: str
     more_trials: int | None
     remedy: str
     mean_m: Floats
     interval_m: Floats
     scatter_m: Floats
-    evidence: Evidence
+    evidence: MissEvidence
     matters_m: float
 
     def lines(self) -> list[str]:
@@ -396,13 +397,15 @@ def attribute(
     n = len(rows)
     want(n >= 2, "misses", rows, "2 trials or more")
     longest = float(np.linalg.norm(rows, axis=1).max())
-    shorter = f"less than {FAR_M} m (are these millimetres?)"
-    want(longest < FAR_M, "misses", f"{longest:.1f} m", shorter)
-    checks.number("matters_m", matters_m, "a length in m, such as 0.003", above=0.0, most=FAR_M)
+    shorter = f"less than {TOO_LONG_M} m (are these millimetres?)"
+    want(longest < TOO_LONG_M, "misses", f"{longest:.1f} m", shorter)
+    checks.number(
+        "matters_m", matters_m, "a length in m, such as 0.003", above=0.0, most=TOO_LONG_M
+    )
     if poses is not None:
         poses = checks.transforms("poses", poses, FEW_DIGITS)
         want(poses.shape == (n, 4, 4), "poses", poses, f"one (4, 4) for each of {n} trials")
-    seen = Evidence.of(rows, poses)
+    seen = MissEvidence.of(rows, poses)
     center, scatter = rows.mean(axis=0), rows.std(axis=0, ddof=1)
     half = float(t.ppf((1 + COVERAGE) / 2, n - 1)) * scatter / np.sqrt(n)
     interval = np.column_stack([center - half, center + half])

@@ -3,8 +3,8 @@
     seen = projected into the image, so far inside its border, on this side of the lens's fold
 
 Past its fold a distortion bends rays back into the image: a corner there has a pixel, but none that
-belongs to its ray. `seen` answers corner by corner; `in_view` slides a board from where it was
-aimed at towards the middle of the image until enough of it is seen.
+belongs to its ray. `seen` answers corner by corner; `slide_into_view` slides a board from where it
+was aimed at towards the middle of the image until enough of it is seen.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def seen(
     inside = points @ np.swapaxes(R, -1, -2) + t
     pixels = project(inside, lens.K, lens.dist)
     last = np.array(lens.size) - 1 - border_px
-    found = ((pixels >= border_px) & (pixels <= last)).all(axis=-1)
+    found = np.asarray(((pixels >= border_px) & (pixels <= last)).all(axis=-1))
     if lens.dist is not None:
         with np.errstate(divide="ignore", invalid="ignore"):
             slope = np.hypot(inside[..., 0], inside[..., 1]) / inside[..., 2]
@@ -45,7 +45,7 @@ def seen(
     return found
 
 
-def in_view(
+def slide_into_view(
     aim_px: Floats,
     distance_m: float,
     R: Floats,
@@ -63,7 +63,7 @@ def in_view(
     >>> lens = Intrinsics(640, 480, 600.0, 600.0, 319.5, 239.5)
     >>> corner = np.zeros((1, 3))
     >>> whole = lambda T: bool(seen(corner, T, lens, border_px=100).all())
-    >>> T = in_view(np.array([0.0, 240.0]), 0.5, np.eye(3), np.zeros(3), lens, whole)
+    >>> T = slide_into_view(np.array([0.0, 240.0]), 0.5, np.eye(3), np.zeros(3), lens, whole)
     >>> project(T[:3, 3], lens.K).round().tolist()
     [112.0, 240.0]
     """

@@ -35,7 +35,6 @@ from coursekit.budget.propagation import (
     Chain,
     Covariances,
     check_first_order,
-    jacobian,
     monte_carlo,
     propagate,
 )
@@ -65,7 +64,6 @@ __all__ = [
     "check_first_order",
     "hand_over",
     "independent_frames",
-    "jacobian",
     "lesson_budget",
     "lesson_view",
     "looking_down",

@@ -23,7 +23,7 @@ from coursekit.budget.view import GRIPPER_DOWN, View
 from coursekit.checks import want
 from coursekit.geometry import Intrinsics
 from coursekit.intrinsics.derivatives import PARAMETERS, scaled_root
-from coursekit.results import Covariance, Kind, Quantity, Result
+from coursekit.results import Covariance, ErrorKind, Quantity, Result
 from coursekit.specifications import DATA, device
 from coursekit.stereo.law import depth_slope
 
@@ -44,7 +44,7 @@ NEEDED: dict[str, tuple[str, ...]] = {  # by notebook; "a|b": either
 BY_SIGMA = ("03_intrinsics", "04_hand_eye")  # their sigmas are the rows; without they say nothing
 TOGETHER = ("01_pinhole", "03_intrinsics", "04_hand_eye")  # all of it from one place, or none
 COVARIANCE_OF = {"03_intrinsics": "intrinsics", "04_hand_eye": "X"}  # its name in the file
-DEPTH_SIZE = (848, 480)  # of the depth image, where notebook 1 did not keep it
+USUAL_DEPTH_SIZE = (848, 480)  # of the depth image, where notebook 1 did not keep it
 
 
 # --- the lesson's table ---
@@ -59,7 +59,7 @@ def lesson_terms(stated: bool) -> tuple[ErrorTerm, ...]:
     """The lesson's six rows; stated: with its own rounded millimetres at the object."""
 
     def row(
-        name: str, kind: Kind, low: float, high: float, along: Along, *at_mm: float
+        name: str, kind: ErrorKind, low: float, high: float, along: Along, *at_mm: float
     ) -> ErrorTerm:
         at = (1e-3 * at_mm[0], 1e-3 * at_mm[-1]) if stated else None
         return ErrorTerm(name, kind, low, high, along, LESSON, stated_m=at)
@@ -178,8 +178,8 @@ class HandOver:
         Its baseline is what that camera reports, and the D435's where it reports none.
         """
         fx, fy, cx, cy = (self.quantity("01_pinhole", name).value for name in NEEDED["01_pinhole"])
-        width = round(self._also("01_pinhole", "depth_width", DEPTH_SIZE[0]))
-        height = round(self._also("01_pinhole", "depth_height", DEPTH_SIZE[1]))
+        width = round(self._also("01_pinhole", "depth_width", USUAL_DEPTH_SIZE[0]))
+        height = round(self._also("01_pinhole", "depth_height", USUAL_DEPTH_SIZE[1]))
         usual_mm = 1e3 * device("D435").unit.baseline_m
         baseline_m = 1e-3 * self._also("01_pinhole", "baseline", usual_mm)
         return View(Intrinsics(width, height, fx, fy, cx, cy), LESSON_DISTANCE_M, baseline_m)

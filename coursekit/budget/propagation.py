@@ -23,7 +23,7 @@ from coursekit.geometry import cross_matrix
 from coursekit.hand_eye.poses import Mount
 from coursekit.intrinsics.derivatives import PARAMETERS, scaled_root
 
-PINHOLE, LENS = PARAMETERS[:4], PARAMETERS[4:]
+PINHOLE_PARAMETERS, LENS_PARAMETERS = PARAMETERS[:4], PARAMETERS[4:]
 CHUNK = 65_536  # samples at a time: what one step needs stays in the cache
 UNDISTORTION_STEPS = 6  # from the nominal point, whose neighbours are all that is asked for
 UNDISTORTION_TOLERANCE = 1e-7  # of the last step: the next, its square, is lost in rounding
@@ -85,7 +85,7 @@ class Covariances:
     pixel: ArrayLike | None = None
     depth_sigma_m: float = 0.0
     intrinsics: ArrayLike | None = None
-    names: tuple[str, ...] = PINHOLE
+    names: tuple[str, ...] = PINHOLE_PARAMETERS
     hand_eye: ArrayLike | None = None
     arm: ArrayLike | None = None
 
@@ -109,7 +109,7 @@ class Covariances:
         return np.asarray(joint, dtype=np.float64)
 
 
-def jacobian(chain: Chain, names: tuple[str, ...] = PINHOLE) -> Floats:
+def jacobian(chain: Chain, names: tuple[str, ...] = PINHOLE_PARAMETERS) -> Floats:
     """d p_base / d(u, v, Z, K, twist of X, twist of the arm), (3, 15 + p), m a unit.
 
     names (p): the parameters of K and the lens that count, in their order.
@@ -252,8 +252,8 @@ def _seen(view: View, names: tuple[str, ...], pixel: Floats, changes: Floats) ->
         values[name] = values[name] + change
     x = (view.pixel[0] + pixel[0] - values["cx"]) / values["fx"]
     y = (view.pixel[1] + pixel[1] - values["cy"]) / values["fy"]
-    if camera.dist is not None or set(names) & set(LENS):
-        x, y = _ideal(x, y, view.ray, [values[name] for name in LENS])
+    if camera.dist is not None or set(names) & set(LENS_PARAMETERS):
+        x, y = _ideal(x, y, view.ray, [values[name] for name in LENS_PARAMETERS])
     return np.stack([x, y, np.ones_like(x)])
 
 

@@ -13,6 +13,7 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import product
 from typing import Literal
 
 import cv2
@@ -24,9 +25,9 @@ from coursekit.checks import choice, positive, want, whole
 from coursekit.geometry import invert_transform, pose_difference, turned
 from coursekit.hand_eye.poses import (
     MOUNTS,
-    POSITION_M,
-    ROTATION_RAD,
+    SCATTER,
     Mount,
+    axis_text,
     carrier_stand,
     check_poses,
     mean_pose,
@@ -96,7 +97,12 @@ def rotation_by_axes(A: Floats, B: Floats) -> Floats:
 
 
 def translation_half(A: Floats, B: Floats, R_X: Floats) -> Floats:
-    """t_X (..., 3) in m of (R_A - 1) t_X = R_X t_B - t_A, by least squares over p pairs."""
+    """t_X (..., 3) in m of (R_A - 1) t_X = R_X t_B - t_A, by least squares over p pairs.
+
+    A, B (..., p, 4, 4) and R_X (..., 3, 3), which comes first: an error of R_X acts on t_B, so the
+    board's distance decides how much of it ends up in t_X. Raises LinAlgError where the rotations
+    of A have fewer than two axes and the normal matrix is singular.
+    """
     rows = A[..., :3, :3] - np.eye(3)
     right = B[..., :3, 3] @ np.swapaxes(R_X, -1, -2) - A[..., :3, 3]
     normal = np.einsum("...pki,...pkj->...ij", rows, rows)
@@ -132,11 +138,9 @@ def _too_few_axes(a: Floats, spread: Floats) -> str:
             "T_base_gripper: the poses do not turn against each other (R_A = 1), so t_X drops out "
             "of (R_A - 1) t_X = R_X t_B - t_A: translation is free in all directions"
         )
-    axis = np.linalg.svd(a)[2][0]
-    axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
-    text = "({:.2f}, {:.2f}, {:.2f})".format(*(axis + 0.0))
+    axis = axis_text(np.linalg.svd(a)[2][0])
     return (
-        f"T_base_gripper: all poses turn about one axis, {text} in the frame that carries the "
+        f"T_base_gripper: all poses turn about one axis, {axis} in the frame that carries the "
         "camera: rotation about it and translation along it are free; turn about a second axis"
     )
 
@@ -275,15 +279,12 @@ def error_study(
     whole("trials", trials)
     positive("ranges_deg", min(ranges_deg))
     points = []
-    for n in poses:
+    for n, about, range_deg in product(poses, axes, ranges_deg):
         i, j = np.triu_indices(n, 1) if pairs == "all" else (np.arange(n - 1), np.arange(1, n))
-        for about in axes:
-            for range_deg in ranges_deg:
-                rng = np.random.default_rng([0, n, about])
-                off = _errors(*_rigs(rng, trials, n, range_deg, about), rng, i, j)
-                turn, shift = np.median(np.linalg.norm(off.reshape(-1, 2, 3), axis=2), axis=0)
-                found = math.degrees(turn), 1e3 * float(shift)
-                points.append(StudyPoint(n, range_deg, about, *found))
+        rng = np.random.default_rng([0, n, about])
+        off = _errors(*_rigs(rng, trials, n, range_deg, about), rng, i, j)
+        turn, shift = np.median(np.linalg.norm(off.reshape(-1, 2, 3), axis=2), axis=0)
+        points.append(StudyPoint(n, range_deg, about, math.degrees(turn), 1e3 * float(shift)))
     return tuple(points)
 
 
@@ -291,9 +292,8 @@ def _errors(
     T: Floats, X: Floats, Y: Floats, rng: np.random.Generator, i: Integers, j: Integers
 ) -> Floats:
     """Twists (trials, 6) from the true X to the one found from noisy poses, pairs i and j."""
-    noise = np.repeat([ROTATION_RAD, POSITION_M], 3)
     seen = invert_transform(X)[:, None] @ invert_transform(T) @ Y[:, None]
-    seen, T = (turned(poses, noise * rng.normal(size=(*T.shape[:2], 6))) for poses in (seen, T))
+    seen, T = (turned(poses, SCATTER * rng.normal(size=(*T.shape[:2], 6))) for poses in (seen, T))
     M = invert_transform(T)
     A, B = M[:, j] @ invert_transform(M[:, i]), seen[:, j] @ invert_transform(seen[:, i])
     found = np.tile(np.eye(4), (len(T), 1, 1))

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,20 +17,13 @@ from coursekit.boards import Board, Detection
 from coursekit.boards.view import seen
 from coursekit.checks import want
 from coursekit.geometry import Intrinsics
-from coursekit.hand_eye.poses import (
-    IN_METRES,
-    POSITION_M,
-    ROTATION_RAD,
-    by_X_and_Y,
-    camera_board,
-    check_poses,
-)
+from coursekit.hand_eye.poses import IN_METRES, SCATTER, by_X_and_Y, camera_board, check_poses
 from coursekit.hand_eye.refinement import arm_poses_with
 from coursekit.hand_eye.session import HandEyeResult, HandEyeSession
 from coursekit.hand_eye.views import PixelViews, board_gap, rms_length, view_residuals
 
 CORNER_PX = 0.1  # corner noise where no images have told
-ROOM_PX = 10.0  # that a proposed view leaves between the board and the image's border
+VIEW_ROOM_PX = 10.0  # that a proposed view leaves between the board and the image's border
 LEAST_FACING = 0.5  # cosine between the board's normal and the line of sight: 60 deg
 NEARER_THAN_EVER, FARTHER_THAN_EVER = 0.6, 1.5  # times the nearest and farthest view so far
 DRAW_RAD, DRAWN, PROPOSALS = 0.35, 4000, 400  # std about known joints; how many, how many stay
@@ -95,7 +88,8 @@ def held_out(
 
     T_base_gripper (m, 4, 4), m, and seen as in a session; board and intrinsics are the result's
     unless given. q (m, 6), rad, or fk for these poses apply what the fit has learnt of the arm's
-    own errors; without them the arm is taken at its word. Raises ValueError as a session does.
+    own errors; without them the arm is taken at its word. Compare its rms_px with the result's own:
+    where it is much larger, X fits the noise of its poses. Raises ValueError as a session does.
     """
     given, fit = result.session, result.refined
     board, intrinsics = board or given.board, intrinsics or given.intrinsics
@@ -103,7 +97,7 @@ def held_out(
     poses = other.T_base_gripper
     offsets = fit is not None and fit.problem.arm is not None and other.q is not None
     if fit is not None and (fk is not None or offsets):
-        poses = arm_poses_with(fit, poses, other.q, fk)
+        poses = arm_poses_with(fit, replace(fit.problem, T_base_gripper=poses, q=other.q, fk=fk))
     expected = camera_board(poses, result.X, result.Y, result.mount)
     residuals = None
     if other.detections is not None:
@@ -130,21 +124,16 @@ class NextPose:
     now_mm: float
     then_mm: Floats
 
-    @property
-    def usable(self) -> Mask:
-        """Which candidates are within the limits and see the board, (m,)."""
-        return np.isfinite(self.then_mm)
-
     def __repr__(self) -> str:
         place = "({:.0f}, {:.0f}, {:.0f}) mm".format(*(1e3 * self.T_base_gripper[:3, 3] + 0.0))
-        joints = ""
+        usable, joints = np.isfinite(self.then_mm).sum(), ""
         if self.q is not None:
             angles = ", ".join(f"{angle:.1f}" for angle in np.degrees(self.q) + 0.0)
             joints = f",\n  joints ({angles}) deg"
         return (
             f"next: gripper at {place}{joints}\n"
             f"X in its worst direction: {self.now_mm:.2f} mm now, "
-            f"{self.then_mm[self.index]:.2f} mm with it ({int(self.usable.sum())} candidates)"
+            f"{self.then_mm[self.index]:.2f} mm with it ({usable} candidates)"
         )
 
 
@@ -210,7 +199,7 @@ def _in_view(result: HandEyeResult, T_base_gripper: Floats) -> Mask:
     facing_so_far, away_so_far = _facing(result.T_camera_board, board)
     side = np.sign(np.median(facing_so_far))  # z may point into the board or out of it
     return (
-        seen(board.points, C, intrinsics, ROOM_PX).all(axis=1)
+        seen(board.points, C, intrinsics, VIEW_ROOM_PX).all(axis=1)
         & (side * facing > LEAST_FACING)
         & (away > NEARER_THAN_EVER * away_so_far.min())
         & (away < FARTHER_THAN_EVER * away_so_far.max())
@@ -235,8 +224,7 @@ def _information(result: HandEyeResult, poses: Floats) -> Floats:
     points, pixels = np.tile(board.points, (len(C), 1)), np.zeros((len(C) * count, 2))
     views = PixelViews(points, pixels, starts, intrinsics, noise_px)
     of_image = np.linalg.inv(views.linear(C, 1.0)[2][:, :6, :6])
-    scatter = np.repeat([ROTATION_RAD, POSITION_M], 3)
-    weight = np.linalg.inv(of_image + np.diag(scatter**2))
+    weight = np.linalg.inv(of_image + np.diag(SCATTER**2))
     columns = by_X_and_Y(poses, result.X, result.Y, result.mount)
     return np.swapaxes(columns, 1, 2) @ weight @ columns
 

@@ -40,7 +40,8 @@ FRAMES = {
     "eye_to_hand": ("T_base_camera", "T_gripper_board"),
 }
 WRITTEN_TOLERANCE = 1e-4  # of R R^T: poses are often written with five digits
-ROTATION_RAD, POSITION_M = np.radians(0.1), 0.5e-3  # what a pair of pose and image scatters by
+# What a pair of pose and image scatters by about and along each axis, (omega, v), rad and m.
+SCATTER = np.repeat([np.radians(0.1), 0.5e-3], 3)
 LEVER_M = 0.3  # a rotation of X counts by what it does this far in front of the camera
 IN_METRES = np.array([LEVER_M, LEVER_M, LEVER_M, 1.0, 1.0, 1.0])  # times (omega, v)
 FREE_M = 0.03  # a direction known no better than this is free: nobody would mount a camera so
@@ -185,7 +186,7 @@ def observability(
     M = carrier_stand(poses, mount)
     X = np.eye(4) if X is None else transform("X", X)
     Y = _nearest_stand(M, X) if Y is None else transform("Y", Y)
-    by_both = by_X_and_Y(poses, X, Y, mount) / np.repeat([ROTATION_RAD, POSITION_M], 3)[:, None]
+    by_both = by_X_and_Y(poses, X, Y, mount) / SCATTER[:, None]
     by_X, by_Y = np.hsplit(by_both.reshape(-1, 12), 2)
     q, _ = np.linalg.qr(by_Y)
     seen_of_X = by_X - q @ (q.T @ by_X)  # what Y can imitate taken out
@@ -229,11 +230,16 @@ def _named(axes: Floats) -> str:
     if len(axes) == 3:
         return "all axes"
     if len(axes) == 2:
-        return f"all axes across {_vector(np.cross(axes[0], axes[1]))}"
-    return f"the common axis {_vector(axes[0])}"
+        return f"all axes across {axis_text(np.cross(axes[0], axes[1]))}"
+    return f"the common axis {axis_text(axes[0])}"
 
 
-def _vector(axis: Floats) -> str:
+def axis_text(axis: Floats) -> str:
+    """The direction (3,) of an axis, whichever way it points: "(0, 0.6, 0.8)".
+
+    >>> axis_text(np.array([0.0, -3.0, -4.0]))
+    '(0, 0.6, 0.8)'
+    """
     axis = axis / np.linalg.norm(axis) * np.sign(axis[np.argmax(np.abs(axis))])
     parts = [0.0 if abs(part) < 0.005 else part for part in axis]
     return "(" + ", ".join(f"{part:.2f}".rstrip("0").rstrip(".") for part in parts) + ")"

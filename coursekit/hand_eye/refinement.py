@@ -17,7 +17,7 @@ Source: Triggs et al., "Bundle adjustment: a modern synthesis" (2000), sections 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -289,8 +289,8 @@ class Refined:
 
     covariance (g, g): of the shared unknowns `problem.names`. squares: the sum in sigmas that were
     assumed; where no priors fix their scale the covariance is larger by what the residuals say.
-    converged: whether another step would change anything. levels: for poses, how much their
-    "rotation_rad" and "position_m" scatter along one axis.
+    converged: whether another step would change anything. levels (2,): how much measured
+    poses scatter about and along each axis, rad and m; None for pixels.
     """
 
     problem: Problem
@@ -298,7 +298,7 @@ class Refined:
     covariance: Floats
     squares: float
     converged: bool
-    levels: dict[str, float] = field(default_factory=dict)
+    levels: Floats | None = None
 
 
 def refine_pixels(problem: Problem, X: Floats, Y: Floats) -> Refined:
@@ -355,18 +355,17 @@ def refine_poses(problem: Problem, X: Floats, Y: Floats) -> Refined:
         before, levels = levels, np.maximum(np.sqrt(squares / half_dof), [1e-9, 1e-9])
         if np.allclose(before, levels, rtol=1e-3):
             break
-    return replace(
-        refined, levels={"rotation_rad": float(levels[0]), "position_m": float(levels[1])}
-    )
+    return replace(refined, levels=levels)
 
 
-def arm_poses_with(
-    refined: Refined, T_base_gripper: Floats, q: Floats | None, fk: FkErrors | None
-) -> Floats:
-    """Poses of the same arm (m, 4, 4), put right by what was learnt of its shared errors."""
-    other = replace(refined.problem, T_base_gripper=T_base_gripper, q=q, fk=fk)
+def arm_poses_with(refined: Refined, other: Problem) -> Floats:
+    """The arm poses (m, 4, 4) of another problem, put right by what was learnt of the arm.
+
+    other: with poses of the same arm; its q where joint offsets were estimated, and its fk where
+    the arm's shared errors were. What a pose has for itself (gear play) is not known there.
+    """
     reported = other.reported(refined.state)
-    if fk is None:
+    if other.fk is None:
         return reported
     state = replace(refined.state, own=np.zeros((len(reported), 6)))
     return turned(reported, other.arm_twists(state))

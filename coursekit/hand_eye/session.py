@@ -36,14 +36,8 @@ from coursekit.arrays import ArrayLike, Floats, Integers
 from coursekit.boards import Board, Detection, Detections, detect_all
 from coursekit.boards.board import Skipped
 from coursekit.boards.detector import SESSION
-from coursekit.checks import array, choice, transform, want
-from coursekit.geometry import (
-    Intrinsics,
-    cross_matrix,
-    invert_transform,
-    make_transform,
-    pose_difference,
-)
+from coursekit.checks import array, choice, instance, transform, want
+from coursekit.geometry import Intrinsics, invert_transform, make_transform, pose_difference
 from coursekit.hand_eye import refinement, views
 from coursekit.hand_eye.closed_form import CLOSED_FORMS, FEWEST_POSES, closed_form
 from coursekit.hand_eye.poses import (
@@ -282,8 +276,7 @@ def _card(folder: Path) -> dict[str, Any]:
         card = json.loads(path.read_text("utf-8"))
     except ValueError as error:
         raise ValueError(f"folder: {SESSION} is no JSON ({error})") from error
-    want(isinstance(card, dict), "folder", f"{SESSION} with a {type(card).__name__}", "an object")
-    return card
+    return instance(SESSION, card, dict)
 
 
 def _from_card(card: dict[str, Any], key: str) -> Any:
@@ -564,10 +557,7 @@ class HandEyeResult(Estimate):
         """
         if self.refined is None:
             return self.session.T_base_gripper
-        problem = self.refined.problem
-        return refinement.arm_poses_with(
-            self.refined, problem.T_base_gripper, problem.q, problem.fk
-        )
+        return refinement.arm_poses_with(self.refined, self.refined.problem)
 
     @cached_property
     def T_camera_board(self) -> Floats:
@@ -592,9 +582,8 @@ class HandEyeResult(Estimate):
         square over the corners, or at the origin where no board is known. Along the line of sight
         an image knows least, so this is larger than the residuals in px would say.
         """
-        return views.board_gap(self.measured, self.T_camera_board, self.session.board, self.scale)[
-            0
-        ]
+        board = self.session.board
+        return views.board_gap(self.measured, self.T_camera_board, board, self.scale)[0]
 
     @property
     def rms_mm(self) -> float:
@@ -745,7 +734,8 @@ class HandEyeResult(Estimate):
     @property
     def reach_sigma_mm(self) -> float:
         """Standard deviation, mm, worst direction, of where X puts a point `LEVER_M` ahead."""
-        by_twist = np.hstack([-cross_matrix(self.X[:3, 2] * LEVER_M), np.eye(3)])
+        by_turn = np.cross(np.eye(3), self.X[:3, 2] * LEVER_M).T  # omega moves it by omega x lever
+        by_twist = np.hstack([by_turn, np.eye(3)])
         spread = by_twist @ self.covariance[:6, :6] @ by_twist.T
         return 1e3 * float(np.sqrt(np.linalg.eigvalsh(spread)[-1]))
 

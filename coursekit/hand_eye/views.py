@@ -45,17 +45,13 @@ class PixelViews:
 
     @classmethod
     def of(
-        cls,
-        detections: Sequence[Detection],
-        board: Board,
-        intrinsics: Intrinsics,
-        sigma_px: float = 1.0,
+        cls, detections: Sequence[Detection], board: Board, lens: Intrinsics, sigma_px: float = 1.0
     ) -> PixelViews:
         """The corners of detections, one view after the other."""
         starts = np.cumsum([0, *(len(seen.ids) for seen in detections[:-1])])
         ids = np.concatenate([seen.ids for seen in detections])
         pixels = np.concatenate([seen.pixels for seen in detections])
-        return cls(board.points[ids], pixels, starts, intrinsics, sigma_px)
+        return cls(board.points[ids], pixels, starts, lens, sigma_px)
 
     @property
     def observations(self) -> int:
@@ -203,15 +199,12 @@ def board_poses(
     for index, seen in enumerate(detections):
         best, *worse = sorted(np.flatnonzero(owners == index), key=squares.__getitem__)
         variance = squares[best] / max(1, 2 * len(seen.ids) - 6)
-        rivals = [
-            poses[one]
-            for one in worse
-            if squares[one] - squares[best] < TOLD_APART * variance
-            and np.linalg.norm(pose_difference(poses[best], poses[one])[:3]) > ONE_POSE_RAD
-        ]
+        rivals = [poses[i] for i in worse if squares[i] < squares[best] + TOLD_APART * variance]
+        turns = [np.linalg.norm(pose_difference(poses[best], T)[:3]) for T in rivals]
+        other = rivals[0] if rivals and turns[0] > ONE_POSE_RAD else None
         covariance = variance * scaled_inverse(information[best, :6, :6])
         rms = float(np.sqrt(squares[best] / len(seen.ids)))
-        found.append(BoardPose(poses[best], covariance, rms, rivals[0] if rivals else None))
+        found.append(BoardPose(poses[best], covariance, rms, other))
     return found
 
 

@@ -73,7 +73,7 @@ GOOD_SPREAD_DEG = 10.0
 GOOD_VIEWS = 10
 GOOD_PX, USABLE_PX = 0.5, 2.0  # 95 %, in all but the worst 5 % of the image, at the boards' range
 GOOD_FAR_PX, USABLE_FAR_PX = 2.0, 4.0  # the same for a direction (a point infinitely far away)
-DETERMINED = 0.01  # 95 % of the focal length and of the centre, as shares of the focal length
+DETERMINED_SHARE = 0.01  # 95 % of the focal length and of the centre, as shares of the focal length
 
 
 # --- what a fit says ---
@@ -94,7 +94,8 @@ class IntrinsicsResult(Estimate):
     what was estimated besides (the bow of a board); it widens every covariance and is not part of
     it.
 
-    `value`, `sigma` and `interval` take one of `names`; "fx" and "fy" are known where "f" is.
+    `value`, `sigma` and `Estimate.interval` take one of `names`; "fx" and "fy" are known where "f"
+    is.
     """
 
     intrinsics: Intrinsics
@@ -262,7 +263,7 @@ class IntrinsicsResult(Estimate):
         )
         focal = wide * max(self.sigma(f) / self.value(f) for f in ("fx", "fy"))
         centre = wide * max(self.sigma(c) for c in ("cx", "cy"))
-        determined = max(focal, centre / self.value("fx")) < DETERMINED
+        determined = max(focal, centre / self.value("fx")) < DETERMINED_SHARE
         near_mm = 1e3 * near * range_m / self.value("fx")
         says = (
             f"in 95 % of the image a point {range_m:.2f} m away is seen where this camera says to "

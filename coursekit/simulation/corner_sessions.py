@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from coursekit.arrays import Bools, Floats, Integers
 from coursekit.boards import Board, Detection, Detections
-from coursekit.boards.view import BORDER_PX, in_view, seen
+from coursekit.boards.view import BORDER_PX, seen, slide_into_view
 from coursekit.checks import number, positive, whole
 from coursekit.geometry import Intrinsics, project, transform_points
 
@@ -187,7 +187,7 @@ def _pose_in_view(
         roll = Rotation.from_euler("z", rng.uniform(-np.pi / 4, np.pi / 4))
         R = (Rotation.from_rotvec(tilt * axis) * roll).as_matrix()
         distance_m = rng.uniform(NEAREST_M, FARTHEST_M)
-        T = in_view(
+        T = slide_into_view(
             target, distance_m, R, board.middle, lens, lambda T: _enough(board, lens, T, effects)
         )
         if T is not None:

@@ -40,7 +40,7 @@ from coursekit.simulation import raycast
 from coursekit.simulation.raycast import is_lit, nearest_hit, texture_factor
 from coursekit.simulation.scenes import TEXTURES, Scene, box_table, check_scene, rays
 
-Image = NDArray[np.float32]  # (H, W)
+FloatImage = NDArray[np.float32]  # (H, W)
 
 # --- light, compiled by numba ---
 
@@ -321,7 +321,7 @@ def match(
     uniqueness: int = 12,
     texture: float = 12.0,
     left_right: int = 1,
-) -> Image:
+) -> FloatImage:
     """The disparity in px of every pixel of the left image, 0 where there is none.
 
     left, right (H, W) uint8: rectified, row v of one is row v of the other. A pixel at u in the
@@ -490,7 +490,7 @@ class StereoFrame:
 
     left: Grey
     right: Grey
-    disparity: Image
+    disparity: FloatImage
 
 
 class RigView:
@@ -553,7 +553,7 @@ class RigView:
 
 
 def counts(
-    disparity: Image, fx: float, baseline_m: float, depth_scale_m: float
+    disparity: FloatImage, fx: float, baseline_m: float, depth_scale_m: float
 ) -> NDArray[np.uint16]:
     """Depth fx baseline / disparity (H, W), rounded to counts of depth_scale_m; 0 is invalid."""
     positive("depth_scale_m", depth_scale_m, "a positive number of metres")
@@ -573,7 +573,7 @@ def _light(
     offset_px: float,
     projector: bool,
     seed: int,
-) -> list[tuple[Image, Image]]:
+) -> list[tuple[FloatImage, FloatImage]]:
     """(laser, room) light (H, W) on each eye, of unit brightness, blurred by the lens."""
     boxes = box_table(scene, None)
     skins = np.empty((len(scene), 4))
@@ -597,7 +597,7 @@ def _light(
     return eyes
 
 
-def _metered(radiance: Image) -> float:
+def _metered(radiance: FloatImage) -> float:
     """The exposure in ms that makes the dots in the middle bright and hardly saturated."""
     part, percentile = METERED
     rows, columns = (
@@ -607,7 +607,7 @@ def _metered(radiance: Image) -> float:
     return min(LONGEST_MS, BRIGHT_GREY / (GREY_PER_MS * bright)) if bright > 0 else LONGEST_MS
 
 
-def _yaw_slope(image: Image, left: Intrinsics) -> Image:
+def _yaw_slope(image: FloatImage, left: Intrinsics) -> FloatImage:
     """The change of an eye's image (H, W) per pixel of disparity offset that a yaw makes."""
     kernel = np.array([[1, -8, 0, 8, -1]], np.float32) / 12
     along = cv2.filter2D(image, -1, kernel, borderType=cv2.BORDER_REPLICATE)
@@ -636,7 +636,7 @@ def _pattern(fx: float) -> tuple[Floats, Floats]:
 
 
 @lru_cache(maxsize=1)
-def _grain(size: int = 512, levels: int = 6) -> Image:
+def _grain(size: int = 512, levels: int = 6) -> FloatImage:
     """A tile of 1/f texture of unit std (levels, size, size), each level blurred twice as far."""
     rng = np.random.default_rng(3)
     frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(size), np.fft.rfftfreq(size), indexing="ij"))
@@ -649,19 +649,19 @@ def _grain(size: int = 512, levels: int = 6) -> Image:
     return (np.stack(tiles) / tiles[0].std()).astype(np.float32)
 
 
-def _speckle(rng: np.random.Generator, shape: tuple[int, ...]) -> Image:
+def _speckle(rng: np.random.Generator, shape: tuple[int, ...]) -> FloatImage:
     """Noise (H, W) of unit std whose grains are as wide as the laser's speckle."""
     noise = _blurred(rng.standard_normal(shape, np.float32), SPECKLE_SIGMA_PX)
     return noise / noise.std()
 
 
-def _blurred(image: Image, sigma_px: float) -> Image:
+def _blurred(image: FloatImage, sigma_px: float) -> FloatImage:
     """An image (H, W) blurred by a Gaussian of this standard deviation."""
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px), np.float32)
 
 
 @lru_cache(maxsize=1)
-def _noise_table() -> Image:
+def _noise_table() -> FloatImage:
     """Normal numbers to be read from a random place for each row: twenty times faster than new
     ones, and two frames share a row's numbers once in a million."""
     return np.random.default_rng(4).standard_normal(NOISE_TABLE, np.float32)

@@ -23,7 +23,7 @@ from coursekit.words import counted, wrapped
 CORRELATION_PX = 12  # disparities farther apart than the matching window (11 px) are independent
 JUMP_SIGMAS = 8.0  # a sample this far from the rest is a mismatch, not noise
 CHI2_95 = 3.84  # 95 % of chi-squared with one degree of freedom lies below
-SLACK = 0.05  # of 2 log likelihood: a drift that explains no more than this is not assumed
+DRIFT_SLACK = 0.05  # of 2 log likelihood: a drift that explains no more than this is not assumed
 
 
 # --- stacks and windows of them ---
@@ -355,8 +355,8 @@ def effective_frames(series: Floats) -> tuple[float, Interval]:
     maximum likelihood: Whittle, Estimation and information in stationary time series, Arkiv för
     Matematik 2 (1953), 423-434. The frequencies k / N, k > 0, do not see the mean. The number is
     var(one) / var(mean of N) of the fitted model; the interval holds what the profile likelihood
-    does not reject at 5 % (2 log ratio below CHI2_95). Of the models within SLACK of the best the
-    largest number is taken, or most white series would be given a drift.
+    does not reject at 5 % (2 log ratio below CHI2_95). Of the models within DRIFT_SLACK of the best
+    the largest number is taken, or most white series would be given a drift.
     Assumes a stationary, Gaussian series and tau from 1 to N frames: a slower drift is not seen,
     frames that correlate negatively count as independent. The periodograms of P pixels are
     averaged and count as one series, since pixels share the drift. Weak drifts leave the interval
@@ -371,7 +371,7 @@ def effective_frames(series: Floats) -> tuple[float, Interval]:
     binned = np.add.reduceat(weights * power / power.mean(), starts)
     deviance = log_spectra + 2 * weights.sum() * np.log(inverse @ binned)
     profile = deviance.min(axis=0)
-    best = int(np.argmax(profile <= profile.min() + SLACK))
+    best = int(np.argmax(profile <= profile.min() + DRIFT_SLACK))
     inside = np.flatnonzero(profile < profile.min() + CHI2_95)
     last = len(profile) - 1  # the interval's ends lie between two numbers: take the outer ones
     low, high = effective[[min(inside[-1] + 1, last), max(inside[0] - 1, 0)]]

@@ -1,0 +1,54 @@
+"""Boards, the bounds of counted shares and the form of refusals that many test modules share."""
+
+import os
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from coursekit.boards import Board
+from coursekit.geometry import Intrinsics
+
+NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
+CHARUCO = Board("charuco", (9, 6), 0.025)
+CHECKERBOARD = Board("checkerboard", (10, 7), 0.025)  # 9 x 6 inner corners
+WIDE = Intrinsics(
+    848, 480, 430.0, 432.0, 421.0, 243.0, "brown_conrady", (-0.05, 0.06, -8e-4, 1.4e-3, -0.02)
+)
+
+
+def derivative(function, step, n):
+    """The numerical derivative of a function of n numbers at zero, a column for each of them."""
+    steps = step * np.eye(n)
+    return np.stack([(function(e) - function(-e)) / (2 * step) for e in steps], axis=-1)
+
+
+def most(share, of):
+    """What a share of so many may be if it is at most this; chance exceeds it once in 1,000."""
+    return binom.ppf(0.999, of, share) / of
+
+
+def least(share, of):
+    """What a share of so many must be if it is at least this; chance misses it once in 1,000."""
+    return binom.ppf(0.001, of, share) / of
+
+
+def refusals(*cases):
+    """The test of a table of (message, call): each call raises ValueError with such a message."""
+
+    @pytest.mark.parametrize(("message", "call"), cases)
+    def test(message, call):
+        with pytest.raises(ValueError, match=message):
+            call()
+
+    return test
+
+
+def each(message, call, name, *values):
+    """Cases of refusals that differ in what one argument is."""
+    return [(message, lambda value=value: call(**{name: value})) for value in values]
+
+
+def named(call, **bad):
+    """Cases in which one argument is bad, and the message begins with its name."""
+    return [c for name, values in bad.items() for c in each(rf"^{name}: ", call, name, *values)]
