@@ -17,6 +17,7 @@ import struct
 import zipfile
 import zlib
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -229,6 +230,7 @@ def _a_million(seed: int) -> np.ndarray:
 # --- the kinds ---
 
 
+@cache
 def hostile() -> Kinds:
     """Every kind, each once: what it is, the reason that its refusal has to give, and its bytes.
 

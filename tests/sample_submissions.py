@@ -90,12 +90,11 @@ def stacks_of(random: Random, make: Callable[[float], Counts], distances=DISTANC
     return tuple(stacks)
 
 
-def claims_of(submission: Submission) -> bundle.Claims:
+def claims_of(found: Recomputed) -> bundle.Claims:
     """What an honest student claims. Levels, stds and holes by NumPy; errors and fits by the kit.
 
     A level is the mean over the pixels' means, a std that of each pixel with the squares pooled.
     """
-    found = recompute(submission)
     rows = []
     for m in found.at:
         z = m.z_mm[:, np.isfinite(m.z_mm).all(axis=0)]
@@ -174,7 +173,8 @@ def finished(facts: CameraFacts, stacks: tuple[Stack, ...], student: str) -> Sub
         conclusion=bundle.Conclusion(),
         outcomes=OUTCOMES,
     )
-    found, claims = recompute(empty), claims_of(empty)
+    found = recompute(empty)
+    claims = claims_of(found)
     at = tuple(row.distance_m for row in claims.rows)
     predicted = tuple(1e3 * float(std) for std in 1.07 * found.law.std_m(at)[0])
     plot = Plot(at, tuple(row.depth_std_mm for row in claims.rows), predicted)
@@ -194,7 +194,7 @@ def weak(seed: int = 0) -> Submission:
     far = full.stacks[2]
     short = replace(far, counts=far.counts[:84], times_s=far.times_s[:84])
     two = replace(full, stacks=(full.stacks[1], short), plot=None)
-    two = replace(two, claims=claims_of(two))
+    two = replace(two, claims=claims_of(recompute(two)))
     return replace(two, conclusion=replace(full.conclusion, paragraph="bias, I think"))
 
 
