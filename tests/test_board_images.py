@@ -85,9 +85,9 @@ def test_the_old_charuco_origin_is_only_another_frame():
 
 
 def test_light_agrees_with_a_warp_of_the_print_by_opencv(monkeypatch):
-    """OpenCV warps and distorts the print at six times the size, then takes means of 6x6."""
+    """OpenCV warps and distorts the print at four times the size, then takes means of 4x4."""
     monkeypatch.setattr(board_images, "LAMP_FROM_MIDDLE_M", (0.0, 0.0, -1e6))  # even light
-    T, times = pose(CHARUCO, TILTED), 6
+    T, times = pose(CHARUCO, TILTED), 4
     grey = render_board(CHARUCO, T, LENS, None).astype(float)
     light = (grey - board_images.NO_LIGHT_GREY) / LIGHT_GREY
     expected, inside = warped(T, times)

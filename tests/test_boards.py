@@ -22,7 +22,7 @@ BOTH = pytest.mark.parametrize("board", [CHECKERBOARD, CHARUCO], ids=lambda boar
 OLD = Board("charuco", (9, 6), 0.025, old_origin=True)
 DARK, BRIGHT, AROUND = 30.0, 200.0, 110.0
 FOCAL = 600.0
-OVER = 4  # samples a pixel each way
+OVER = 3  # samples a pixel each way
 
 
 def pose(board, tilt_deg=25.0, roll_deg=10.0, z_m=0.5, shift_m=(0.0, 0.0), axis_deg=30.0):
@@ -60,7 +60,7 @@ def view(board, T=None, size=(640, 480), blur_px=0.6, motion_px=(0.0, 0.0), pixe
     if any(motion_px):
         ways = ((np.arange(12) + 0.5) / 12 - 0.5)[:, None] * OVER * np.array(motion_px)
         there = np.float64([[[1, 0, dx], [0, 1, dy]] for dx, dy in ways])
-        grey = np.mean([cv2.warpAffine(grey, T, grey.shape[::-1]) for T in there], axis=0)
+        grey = sum(cv2.warpAffine(grey, T, grey.shape[::-1]) for T in there) / 12
     grey = grey.reshape(height, OVER, width, OVER).mean(axis=(1, 3))
     corners = np.c_[board.points[:, :2], np.ones(len(board.points))] @ H.T
     return grey, corners[:, :2] / corners[:, 2:]
