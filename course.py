@@ -125,13 +125,7 @@ COURSE, TEST = "requirements.txt", "requirements-test.txt"
 CAMERA = "requirements-camera.txt"
 NO_CAMERA = "The simulated camera works all the same; for a real one, the next start tries again."
 NO_KERNELS = "The notebooks compile them when they need them, and the next start tries again."
-KERNELS = (
-    "kernels",
-    "simulation/raycast",
-    "simulation/infrared",
-    "simulation/sad",
-    "simulation/board_kernels",
-)
+KERNELS = ("kernels", "simulation/raycast", "simulation/rig", "simulation/board_images")
 COMPILED = (COURSE, *(f"coursekit/{name}.py" for name in KERNELS))
 COMPILE = ("-m", "coursekit.warm_up")
 # A module's tests, and the cells of a notebook, stay together in one of the two processes.

@@ -30,19 +30,16 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from coursekit import results
-from coursekit.words import counted
-
 Condition = Literal["ok", "note", "problem"]
 
 OLDEST, NEWEST_TESTED = (3, 11), (3, 13)
-PINS = results.ROOT / "requirements.txt"
+PINS = Path(__file__).resolve().parents[1] / "requirements.txt"
 LOADED = ("numpy", "scipy", "cv2", "numba", "matplotlib", "ipywidgets")
 UDEV_FOLDERS = tuple(map(Path, ("/etc/udev/rules.d", "/usr/lib/udev/rules.d", "/lib/udev/rules.d")))
 LEAST_FREE_BYTES = 100_000_000  # results, recordings, bundles
-WIDTH = 100
+LINE_WIDTH = 100
 
-TEST_FRAMES, FRAMES_PER_S = 30, 30
+TEST_FRAMES, USUAL_FRAMES_PER_S = 30, 30
 LONGEST_TEST_S = 3.0  # on the camera's clock
 WINDOW_PX = 40  # the side of the window in the middle
 LEAST_FRAMES_FOR_NOISE = 5
@@ -78,11 +75,11 @@ class CheckUp:
     def __str__(self) -> str:
         head = f"{self.verdict:8} {self.check:12} "
         blank = " " * len(head)
-        text = textwrap.fill(self.says, WIDTH, initial_indent=head, subsequent_indent=blank)
+        text = textwrap.fill(self.says, LINE_WIDTH, initial_indent=head, subsequent_indent=blank)
         if not self.remedy:
             return text
         return f"{text}\n" + textwrap.fill(
-            self.remedy, WIDTH, initial_indent=f"{blank}-> ", subsequent_indent=f"{blank}   "
+            self.remedy, LINE_WIDTH, initial_indent=f"{blank}-> ", subsequent_indent=f"{blank}   "
         )
 
 
@@ -101,7 +98,7 @@ def run(camera: str = "auto") -> int:
         print(line, flush=True)
         found[line.verdict] += 1
     if problems := found["problem"]:
-        print(f"\n{counted(problems, 'problem')}: do what stands there, and ask again.")
+        print(f"\n{problems} problem{'s' * (problems > 1)}: do what stands there, and ask again.")
         return 1
     print("\nNothing is in the way. `python3 course.py lab` opens the notebooks.")
     return 0
@@ -275,6 +272,8 @@ def _browser() -> CheckUp:
 
 def _results() -> CheckUp:
     """Whether results can be saved; nothing is left behind."""
+    from coursekit import results
+
     folder = results.folder()
     there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     try:
@@ -508,11 +507,11 @@ def _arrival(frames: Sequence[Any]) -> CheckUp:
     lost = frames[-1].number - frames[0].number + 1 - count
     says = (
         f"{count} in {seconds:.2f} s, {lost} lost between them "
-        f"(usual: {FRAMES_PER_S} a second, none lost)"
+        f"(usual: {USUAL_FRAMES_PER_S} a second, none lost)"
     )
     rate = (count - 1) / max(seconds, 1e-3)
     return _ok_if(
-        rate >= 0.8 * FRAMES_PER_S and lost <= 0.1 * count,
+        rate >= 0.8 * USUAL_FRAMES_PER_S and lost <= 0.1 * count,
         says,
         "close what keeps the computer or its USB busy, plug the camera in directly, and do not "
         "run it beside another camera on one hub",

@@ -25,10 +25,10 @@ from coursekit.checks import want
 ROOT = Path(__file__).resolve().parent.parent
 FORMAT = 1
 Source = Literal["live", "recorded", "simulated", "reference"]
-Kind = Literal["bias", "noise"]
+ErrorKind = Literal["bias", "noise"]
 
 
-class Measured(Protocol):
+class MeasuringCamera(Protocol):
     """What a result is measured with: a camera, or what stands in for one."""
 
     @property
@@ -55,14 +55,14 @@ class Quantity:
     value: float
     unit: str
     sigma: float | None = None
-    kind: Kind | None = None
+    kind: ErrorKind | None = None
     note: str = ""
 
     def __post_init__(self) -> None:
         checks.number("value", self.value)
         if self.sigma is not None:
             checks.number("sigma", self.sigma, "a standard deviation >= 0", least=0.0)
-        checks.choice("kind", self.kind, (None, *get_args(Kind)))
+        checks.choice("kind", self.kind, (None, *get_args(ErrorKind)))
         want(self.unit, "unit", self.unit, "for example 'px', 'mm' or '1'")
 
 
@@ -111,7 +111,7 @@ def folder() -> Path:
 
 def save(
     lesson: str,
-    camera: Measured,
+    camera: MeasuringCamera,
     quantities: Mapping[str, Quantity],
     covariances: Mapping[str, Covariance] | None = None,
 ) -> Path:

@@ -2,10 +2,11 @@
 
 import sys
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
-from fake_realsense import real_library
+from fake_realsense import plugged_in, real_library
 
 from coursekit import specifications
 from coursekit.cameras import simulated
@@ -38,6 +39,12 @@ def small_cameras():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulated, "specifications", SimpleNamespace(device=device))
         yield
+
+
+@pytest.fixture
+def plug_in(monkeypatch, tmp_path):
+    """Plug in a fake D435 that behaves as the arguments say."""
+    return partial(plugged_in, monkeypatch, tmp_path)
 
 
 @pytest.fixture

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coursekit.cameras import librealsense, realsense
+from coursekit.cameras import Camera, Frame, librealsense, realsense
 from coursekit.cameras.librealsense import LibraryMissing, load_librealsense
 
 SERIAL = "728612070259"
@@ -23,6 +24,17 @@ def real_library() -> Any:
         return load_librealsense()
     except LibraryMissing as missing:
         pytest.skip(str(missing))
+
+
+def ending_after(camera: Camera, frames: int, error: BaseException) -> None:
+    """Let the camera's stream end with an error after so many frames."""
+    stream = camera.stream
+
+    def ending() -> Iterator[Frame]:
+        yield from itertools.islice(stream(), frames)
+        raise error
+
+    camera.stream = ending
 
 
 def plugged_in(monkeypatch: pytest.MonkeyPatch, usb: Path, **behaviour: Any) -> FakeRealSense:
@@ -50,17 +62,10 @@ class _Names:
 
 class FakeSensor:
     def __init__(self, depth: bool, options: dict[str, float]) -> None:
-        self._depth, self.options = depth, options
+        self.options = options
+        self.is_depth_sensor = lambda: depth
+        self.supports, self.get_option = options.__contains__, options.__getitem__
         self.set_calls: list[tuple[str, float]] = []
-
-    def is_depth_sensor(self) -> bool:
-        return self._depth
-
-    def supports(self, option: str) -> bool:
-        return option in self.options
-
-    def get_option(self, option: str) -> float:
-        return self.options[option]
 
     def set_option(self, option: str, value: float) -> None:
         self.set_calls.append((option, value))
@@ -75,29 +80,12 @@ class FakeSensor:
 
 class FakeProfile:
     def __init__(self, stream: str, form: str, width: int, height: int, fx: float) -> None:
-        self._stream, self._form = stream, form
-        self._intrinsics = SimpleNamespace(
-            width=width,
-            height=height,
-            fx=fx,
-            fy=fx + 0.25,
-            ppx=width / 2 + 1.5,
-            ppy=height / 2 - 2.5,
-            model="distortion.inverse_brown_conrady",
-            coeffs=[0.1, -0.2, 0.001, 0.002, 0.05],
-        )
-
-    def stream_type(self) -> str:
-        return self._stream
-
-    def format(self) -> str:
-        return f"format.{self._form}"
-
-    def as_video_stream_profile(self) -> FakeProfile:
-        return self
-
-    def get_intrinsics(self) -> SimpleNamespace:
-        return self._intrinsics
+        self.stream_type, self.format = (lambda: stream), (lambda: f"format.{form}")
+        self.as_video_stream_profile = lambda: self
+        size = {"width": width, "height": height, "ppx": width / 2 + 1.5, "ppy": height / 2 - 2.5}
+        lens = {"model": "distortion.inverse_brown_conrady", "fx": fx, "fy": fx + 0.25}
+        coeffs = [0.1, -0.2, 0.001, 0.002, 0.05]
+        self.get_intrinsics = lambda: SimpleNamespace(**size, **lens, coeffs=coeffs)
 
     def get_extrinsics_to(self, other: FakeProfile) -> SimpleNamespace:
         # A quarter turn about z, listed by columns as the library does: x goes to y.
@@ -106,17 +94,8 @@ class FakeProfile:
 
 class FakeImage:
     def __init__(self, number: int, frames_per_s: float, pixels: Callable[[], np.ndarray]) -> None:
-        self._number, self._pixels = number, pixels
-        self._time_ms = 1000.0 * number / frames_per_s
-
-    def get_data(self) -> np.ndarray:
-        return self._pixels()
-
-    def get_frame_number(self) -> int:
-        return self._number
-
-    def get_timestamp(self) -> float:
-        return self._time_ms
+        self.get_data, self.get_frame_number = pixels, lambda: number
+        self.get_timestamp = lambda: 1000.0 * number / frames_per_s
 
     def supports_frame_metadata(self, value: str) -> bool:
         return value in ("actual_exposure", "gain_level")

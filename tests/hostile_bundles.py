@@ -1,7 +1,8 @@
 """Bundles made to do harm, or damaged: for each kind its bytes, and the reason of its refusal.
 
-`submission()` is a small honest one; most kinds are it with one thing wrong and everything else
-right (hashes and checksums too), so that what refuses them is the check that they are about.
+`ZOE` is a small honest one, a bundle of some 3 kB; most kinds are it with one thing wrong and
+everything else right (hashes and checksums too), so that what refuses them is the check that they
+are about.
 """
 
 from __future__ import annotations
@@ -15,76 +16,45 @@ import pickle
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
-from coursekit.submission.format import (
-    CameraFacts,
-    Claims,
-    Conclusion,
-    Outcome,
-    Plot,
-    Stack,
-    Submission,
-    TableRow,
-    array_bytes,
-    bundle_bytes,
-    zip_bytes,
-)
+from coursekit.submission import format as bundle
+from coursekit.submission.format import Outcome, Stack, TableRow, array_bytes, zip_bytes
 
-CAMERA = {
-    "name": "Simulated D435",
-    "serial": "seed-7",
-    "source": "simulated",
-    "width": 848,
-    "height": 480,
-    "fx": 425.0,
-    "fy": 425.5,
-    "cx": 424.0,
-    "cy": 240.0,
-    "model": "none",
-    "coeffs": (0.0,) * 5,
-    "baseline_m": 0.05,
-    "depth_scale_m": 0.001,
-}
+LENS = (848, 480, 425.0, 425.5, 424.0, 240.0, "none", (0.0,) * 5)
+CAMERA = bundle.CameraFacts("Simulated D435", "seed-7", "simulated", *LENS, 0.05, 0.001)
 Parts = dict[str, bytes]
+Kinds = dict[str, tuple[str, bytes]]
 
 
-def submission(**changes: Any) -> Submission:
-    """Two distances, 3 frames of 5 x 4 px each: a bundle of some 3 kB; `changes` by field."""
+def small_stacks() -> list[Stack]:
+    """Two distances, 3 frames of 5 x 4 px each."""
     rng = np.random.default_rng(1)
-    stacks = [
-        Stack(
-            distance_m=z,
-            window=(420, 238, 5, 4),
-            counts=rng.integers(1000 * z - 3, 1000 * z + 3, (3, 4, 5)).astype(np.uint16),
-            times_s=np.arange(3) / 30,
-        )
-        for z in (0.3, 0.6)
-    ]
-    fields = {
-        "student": "Zoë O'Neill-Łukasiewicz",
-        "made": "2026-03-01T12:00:00+00:00",
-        "versions": {"python": "3.12.1", "numpy": "2.4.0"},
-        "camera": CameraFacts(**CAMERA),
-        "tape_sigma_m": 0.001,
-        "caliper_m": 0.06,
-        "stacks": stacks,
-        "claims": Claims(
-            rows=(TableRow(0.3, 0.5, 0.02, 1.25, 0.01, 0.0), TableRow(0.6, depth_std_mm=4.5)),
-            sigma_d_px=0.08,
-            sigma_d_interval_px=(0.07, 0.09),
-            exponent=2.1,
-            exponent_interval=(1.5, 2.75),
-        ),
-        "plot": Plot((0.3, 0.6), (1.25, 4.5), (1.2, 4.8)),
-        "conclusion": Conclusion(0.45, 30, "bias", "Bias.\nIt stays; noise averages down."),
-        "outcomes": {"depth_noise.width": Outcome(True, 2), "depth_std": Outcome(False, 1)},
-    }
-    return Submission(**fields | changes)
+    counts = [rng.integers(mm - 3, mm + 3, (3, 4, 5)).astype(np.uint16) for mm in (300, 600)]
+    window, times = (420, 238, 5, 4), np.arange(3) / 30
+    return [Stack(z, window, raw, times) for z, raw in zip((0.3, 0.6), counts, strict=True)]
+
+
+ZOE = bundle.Submission(
+    student="Zoë O'Neill-Łukasiewicz",
+    made="2026-03-01T12:00:00+00:00",
+    versions={"python": "3.12.1", "numpy": "2.4.0"},
+    camera=CAMERA,
+    tape_sigma_m=0.001,
+    caliper_m=0.06,
+    stacks=small_stacks(),
+    claims=bundle.Claims(
+        (TableRow(0.3, 0.5, 0.02, 1.25, 0.01, 0.0), TableRow(0.6, depth_std_mm=4.5)),
+        *(0.08, (0.07, 0.09), 2.1, (1.5, 2.75)),
+    ),
+    plot=bundle.Plot((0.3, 0.6), (1.25, 4.5), (1.2, 4.8)),
+    conclusion=bundle.Conclusion(0.45, 30, "bias", "Bias.\nIt stays; noise averages down."),
+    outcomes={"depth_noise.width": Outcome(True, 2), "depth_std": Outcome(False, 1)},
+)
 
 
 # --- taking a bundle apart, and packing it again ---
@@ -94,6 +64,11 @@ def parts(data: bytes) -> Parts:
     """The members of a bundle, by name."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         return {name: archive.read(name) for name in archive.namelist()}
+
+
+HONEST = bundle.bundle_bytes(ZOE)
+MEMBERS = parts(HONEST)
+DIRECTORY, END_RECORD = HONEST.index(b"PK\x01\x02"), HONEST.rindex(b"PK\x05\x06")
 
 
 def hashed(members: Parts) -> Parts:
@@ -117,14 +92,24 @@ def unhashed(name: str, content: bytes) -> bytes:
     return zip_bytes(MEMBERS | {name: content})
 
 
-def with_json(name: str, change: Callable[[Any], Any]) -> bytes:
-    """The honest bundle with one JSON member changed in place (or replaced by what returns)."""
-    content = json.loads(MEMBERS[name])
-    replaced = change(content)
-    changed = json.dumps(content if replaced is None else replaced).encode()
-    if name == "manifest.json":
-        return zip_bytes(MEMBERS | {name: changed})
-    return with_member(name, changed)
+GONE = "(gone)"
+
+
+def placed(content: Any, path: tuple[Any, ...], value: Any) -> Any:
+    """JSON with another value at a path, or with none there where the value is GONE."""
+    if not path:
+        return value
+    copy = content.copy()
+    copy[path[0]] = placed(content[path[0]], path[1:], value) if path[1:] else value
+    if copy[path[0]] == GONE:
+        del copy[path[0]]
+    return copy
+
+
+def with_json(name: str, content: Any) -> bytes:
+    """The honest bundle with another JSON in this member; all but the manifest are rehashed."""
+    pack = unhashed if name == "manifest.json" else with_member
+    return pack(name, json.dumps(content).encode())
 
 
 def with_text(name: str, old: str, new: str) -> bytes:
@@ -134,47 +119,33 @@ def with_text(name: str, old: str, new: str) -> bytes:
     return with_member(name, written.replace(old, new, 1).encode())
 
 
-def npy(
-    descr: str = "'<u2'",
-    shape: str = "(3, 4, 5)",
-    fortran: str = "False",
-    content: bytes = bytes(120),
-    version: bytes = b"\x01\x00",
-) -> bytes:
+def npy(descr="'<u2'", shape="(3, 4, 5)", fortran="False", content=bytes(120), version=b"\1\0"):
     """A .npy file with any header."""
     header = f"{{'descr': {descr}, 'fortran_order': {fortran}, 'shape': {shape}, }}\n".encode()
     return b"\x93NUMPY" + version + struct.pack("<H", len(header)) + header + content
 
 
-def packed_by(pack: Callable[[zipfile.ZipFile], object]) -> bytes:
-    """A zip that `pack` fills."""
+def zipped(members: Parts, of: str = "", streamed: bool = False, **attributes: Any) -> bytes:
+    """A zip as `zipfile` writes it, where attributes `of` one member are others.
+
+    streamed: to something that cannot seek, so that sizes stand behind each member.
+    """
     buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        pack(archive)
-    return buffer.getvalue()
-
-
-def with_info(name: str, **attributes: Any) -> bytes:
-    """The honest bundle, where the zip says something else about one member."""
-
-    def pack(archive: zipfile.ZipFile) -> None:
-        for member, content in MEMBERS.items():
-            info = zipfile.ZipInfo(member)
-            for attribute, value in attributes.items() if member == name else ():
+    pipe = SimpleNamespace(write=buffer.write, flush=buffer.flush)
+    with zipfile.ZipFile(pipe if streamed else buffer, "w") as archive:
+        for name, content in members.items():
+            info = zipfile.ZipInfo(name)
+            for attribute, value in attributes.items() if name == of else ():
                 setattr(info, attribute, value)
             archive.writestr(info, content)
-
-    return packed_by(pack)
+    return buffer.getvalue()
 
 
 # --- lies in the zip's headers ---
 
 LOCAL = {"flags": (6, 2), "method": (8, 2), "crc": (14, 4), "packed": (18, 4), "size": (22, 4)}
-CENTRAL = {k: (at + 2, n) for k, (at, n) in LOCAL.items()} | {
-    "disk": (34, 2),
-    "attributes": (38, 4),
-    "offset": (42, 4),
-}
+CENTRAL = {k: (at + 2, n) for k, (at, n) in LOCAL.items()}
+CENTRAL |= {"disk": (34, 2), "attributes": (38, 4), "offset": (42, 4)}
 END = {"disk": (4, 2), "here": (8, 2), "count": (10, 2), "size": (12, 4), "start": (16, 4)}
 
 
@@ -184,38 +155,34 @@ def headers(data: bytes, name: str) -> tuple[int, int]:
     return int.from_bytes(data[entry + 42 : entry + 46], "little"), entry
 
 
+def patched(data: bytes, header: int, table: dict[str, tuple[int, int]], **values: int) -> bytes:
+    """The data, where the header that lies there says otherwise, in what its table knows."""
+    for field in table.keys() & values.keys():
+        at, size = header + table[field][0], table[field][1]
+        number = (values[field] % 256**size).to_bytes(size, "little")
+        data = data[:at] + number + data[at + size :]
+    return data
+
+
 def lying(name: str, where: str = "both", **values: int) -> bytes:
     """The honest bundle, where headers of a member ("local", "central", "both") say otherwise."""
-    data = bytearray(HONEST)
     local, central = headers(HONEST, name)
-    for field, value in values.items():
-        for header, table, chosen in ((local, LOCAL, "local"), (central, CENTRAL, "central")):
-            if field in table and where in (chosen, "both"):
-                at, size = table[field]
-                data[header + at : header + at + size] = value.to_bytes(size, "little")
-    return bytes(data)
+    data = HONEST if where == "central" else patched(HONEST, local, LOCAL, **values)
+    return data if where == "local" else patched(data, central, CENTRAL, **values)
 
 
 def lying_end(**values: int) -> bytes:
     """The honest bundle, where the zip's end record says otherwise."""
-    data, end = bytearray(HONEST), HONEST.rindex(b"PK\x05\x06")
-    for field, value in values.items():
-        at, size = END[field]
-        data[end + at : end + at + size] = value.to_bytes(size, "little")
-    return bytes(data)
+    return patched(HONEST, END_RECORD, END, **values)
 
 
-def inserted(at: int, junk: bytes, moved: bool) -> bytes:
-    """The honest bundle with junk at a place; all offsets behind it moved along, or not."""
-    data = bytearray(HONEST)
-    end = HONEST.rindex(b"PK\x05\x06")
-    if moved:
-        places = [headers(HONEST, name)[1] + 42 for name in MEMBERS] + [end + 16]
-        for place in places:
-            offset = int.from_bytes(data[place : place + 4], "little")
-            if offset >= at:
-                data[place : place + 4] = (offset + len(junk)).to_bytes(4, "little")
-    return bytes(data[:at] + junk + data[at:])
+def inserted(at: int, junk: bytes) -> bytes:
+    """The honest bundle with junk at a place, and all offsets behind it moved along."""
+    data = HONEST
+    for local, entry in (headers(HONEST, name) for name in MEMBERS):
+        data = patched(data, entry, CENTRAL, offset=local + len(junk) * (local >= at))
+    data = patched(data, END_RECORD, END, start=DIRECTORY + len(junk) * (at <= DIRECTORY))
+    return data[:at] + junk + data[at:]
 
 
 def with_deflated(stream: bytes, size: int, crc: int) -> bytes:
@@ -228,6 +195,7 @@ def with_deflated(stream: bytes, size: int, crc: int) -> bytes:
 
 
 def deflated(content: bytes) -> bytes:
+    """A raw deflate stream."""
     stream = zlib.compressobj(9, zlib.DEFLATED, -15)
     return stream.compress(content) + stream.flush()
 
@@ -241,10 +209,9 @@ def junk_behind_stream() -> bytes:
     """The honest bundle with four bytes behind a member's compressed content, counted to it."""
     local, central = headers(HONEST, "facts.json")
     packed = int.from_bytes(HONEST[local + 18 : local + 22], "little")
-    data = bytearray(inserted(local + 30 + len("facts.json") + packed, b"junk", moved=True))
-    for at in (local + 18, central + 4 + 20):
-        data[at : at + 4] = (packed + 4).to_bytes(4, "little")
-    return bytes(data)
+    data = inserted(local + 30 + len("facts.json") + packed, b"junk")
+    data = patched(data, local, LOCAL, packed=packed + 4)
+    return patched(data, central + 4, CENTRAL, packed=packed + 4)
 
 
 class _Shell:
@@ -254,110 +221,24 @@ class _Shell:
         return os._exit, (3,)
 
 
-def _pickled_array() -> bytes:
-    buffer = io.BytesIO()
-    np.save(buffer, np.array([_Shell()], dtype=object), allow_pickle=True)
-    return buffer.getvalue()
-
-
-def _streamed() -> bytes:
-    """A zip written to something that cannot seek: sizes stand behind each member."""
-
-    class Pipe(io.RawIOBase):
-        data = b""
-
-        def writable(self) -> bool:
-            return True
-
-        def write(self, block: Any) -> int:
-            self.data += bytes(block)
-            return len(block)
-
-    pipe = Pipe()
-    with zipfile.ZipFile(pipe, "w") as archive:
-        for name, content in MEMBERS.items():
-            archive.writestr(name, content)
-    return pipe.data
-
-
-def _bomb() -> bytes:
-    """2 MB of zeros in 2 kB, within all sizes."""
-    zeros = np.zeros((250, 64, 64), np.uint16)
-    return packed_by(
-        lambda archive: [
-            archive.writestr(name, content, zipfile.ZIP_DEFLATED)
-            for name, content in hashed(MEMBERS | {"depth_0.npy": array_bytes(zeros[:240])}).items()
-        ]
-    )
-
-
-def _same_name() -> bytes:
-    """A zip with the same name twice (zipfile would warn)."""
-    return zip_bytes({"facts.json": b"{}", "factz.json": b"{}"}).replace(b"factz", b"facts")
-
-
-def _set(*path: Any, to: Any) -> Callable[[Any], None]:
-    """A change of JSON: what is at this path becomes `to`."""
-
-    def change(content: Any) -> None:
-        for key in path[:-1]:
-            content = content[key]
-        content[path[-1]] = to
-
-    return change
-
-
-def _without(*path: Any) -> Callable[[Any], None]:
-    def change(content: Any) -> None:
-        for key in path[:-1]:
-            content = content[key]
-        del content[path[-1]]
-
-    return change
-
-
 def _a_million(seed: int) -> np.ndarray:
     """Depths of 244 frames of 64 x 64 px, nearly all the same: quickly packed."""
     return np.uint16(300) + (np.random.default_rng(seed).random((244, 64, 64)) < 0.04)
 
 
-def full_size(last: int) -> bytes:
-    """As much as a bundle may hold, a million depths at two distances, the very last one wrong."""
-    counts = _a_million(2)
-    window = {"window": (400, 200, 64, 64), "times_s": np.arange(244) / 30}
-    stacks = [Stack(distance_m=z, counts=counts, **window) for z in (0.3, 0.6)]
-    members = parts(bundle_bytes(submission(stacks=stacks)))
-    content = members["depth_1.npy"]
-    members["depth_1.npy"] = content[:-1] + bytes([content[-1] ^ last])
-    return zip_bytes(members)
+# --- the kinds ---
 
 
-HONEST = bundle_bytes(submission())
-MEMBERS = parts(HONEST)
-DIRECTORY = HONEST.index(b"PK\x01\x02")
-
-
-@dataclass(frozen=True)
-class Hostile:
-    """One kind: what it is, its bytes, and the reason that its refusal has to give.
+def hostile() -> Kinds:
+    """Every kind, each once: what it is, the reason that its refusal has to give, and its bytes.
 
     Without a reason it is read: what was added to it is nowhere in what comes out.
     """
-
-    name: str
-    reason: str
-    data: bytes
-
-
-def hostile() -> Iterator[Hostile]:
-    """Every kind, each once."""
     groups = (_files, _zips, _headers, _names, _hashes, _jsons, _values, _arrays)
-    for group in groups:
-        for name, (reason, data) in group().items():
-            yield Hostile(name, reason, data)
+    return {name: kind for group in groups for name, kind in group().items()}
 
 
-def _files() -> dict[str, tuple[str, bytes]]:
+def _files() -> Kinds:
     return {
         "nothing": ("not_a_zip", b""),
         "a text": ("not_a_zip", b"Here is my homework.\n"),
@@ -371,18 +252,20 @@ def _files() -> dict[str, tuple[str, bytes]]:
         "a zip and another": ("not_plain", HONEST + HONEST),
         "a zip's comment": ("not_plain", HONEST[:-2] + b"\x03\x00abc"),
         "a program before": ("not_plain", b"#!/bin/sh\nexit\n" + HONEST),
-        "junk before, offsets moved": ("not_plain", inserted(0, b"GIF89a", moved=True)),
+        "junk before, offsets moved": ("not_plain", inserted(0, b"GIF89a")),
     }
 
 
-def _zips() -> dict[str, tuple[str, bytes]]:
+def _zips() -> Kinds:
     second = headers(HONEST, "facts.json")[0]
-    many = zip_bytes({f"depth_{i}.npy": b"" for i in range(33)})
+    large = HONEST[:END_RECORD] + b"PK\x06\x07" + bytes(16) + HONEST[END_RECORD:]  # zip64's locator
+    large = patched(large, END_RECORD + 20, END, size=END_RECORD + 20 - DIRECTORY)
+    twice = zip_bytes({"facts.json": b"{}", "factz.json": b"{}"})  # zipfile would warn
     return {
         "no members": ("missing_member", zip_bytes({})),
-        "33 members": ("too_large", many),
-        "junk between members": ("not_plain", inserted(second, b"junk", moved=True)),
-        "junk before the directory": ("not_plain", inserted(DIRECTORY, b"junk", moved=True)),
+        "33 members": ("too_large", zip_bytes({f"depth_{i}.npy": b"" for i in range(33)})),
+        "junk between members": ("not_plain", inserted(second, b"junk")),
+        "junk before the directory": ("not_plain", inserted(DIRECTORY, b"junk")),
         "overlapping members": ("not_plain", lying("facts.json", offset=0)),
         "a member longer than the file": ("not_plain", lying("times_1.npy", packed=10**6)),
         "the directory elsewhere": ("not_plain", lying_end(start=DIRECTORY + 1)),
@@ -392,46 +275,39 @@ def _zips() -> dict[str, tuple[str, bytes]]:
         "a split zip": ("not_plain", lying_end(disk=1)),
         "a member elsewhere": ("not_plain", lying("facts.json", disk=1)),
         "a large zip": ("not_plain", lying_end(here=0xFFFF, count=0xFFFF)),
-        "a large zip's locator": ("not_a_zip", inserted_locator()),
+        "a large zip's locator": ("not_a_zip", large),
         "a large member": ("too_large", lying("times_1.npy", packed=0xFFFFFFFF)),
-        "streamed": ("not_plain", _streamed()),
-        "extra fields": ("not_plain", with_info("facts.json", extra=b"\x55\x54\x01\x00\x00")),
-        "a member's comment": ("not_plain", with_info("facts.json", comment=b"hello")),
-        "a name twice": ("not_plain", _same_name()),
+        "streamed": ("not_plain", zipped(MEMBERS, streamed=True)),
+        "extra fields": ("not_plain", zipped(MEMBERS, "facts.json", extra=b"\x55\x54\x01\0\0")),
+        "a member's comment": ("not_plain", zipped(MEMBERS, "facts.json", comment=b"hello")),
+        "a name twice": ("not_plain", twice.replace(b"factz", b"facts")),
     }
 
 
-def inserted_locator() -> bytes:
-    """An honest bundle with a zip64 locator before its end, counted to the directory."""
-    data = inserted(HONEST.rindex(b"PK\x05\x06"), b"PK\x06\x07" + bytes(16), moved=False)
-    end, size = len(data) - 22, len(data) - 22 - DIRECTORY
-    return data[: end + 12] + size.to_bytes(4, "little") + data[end + 16 :]
-
-
-def _headers() -> dict[str, tuple[str, bytes]]:
-    facts = MEMBERS["facts.json"]
+def _headers() -> Kinds:
+    name, facts = "facts.json", MEMBERS["facts.json"]
     zeros, noise = bytes(300_000), np.random.default_rng(3).bytes(300_000)
     link, pipe = 0o120777 << 16, 0o010644 << 16
+    no_local = b"PK\x03\x04" + HONEST[4:].replace(b"PK\x03\x04", b"PK\x03\x05")
+    dark = hashed(MEMBERS | {"depth_0.npy": array_bytes(np.zeros((240, 64, 64), np.uint16))})
+    bomb = zipped(dark, "depth_0.npy", compress_type=zipfile.ZIP_DEFLATED)  # 2 MB in 2 kB
     return {
-        "encrypted": ("not_plain", lying("facts.json", flags=1)),
-        "strongly encrypted": ("not_plain", lying("facts.json", flags=0x41)),
-        "unknown flags": ("not_plain", lying("facts.json", flags=0x20)),
-        "a symlink": ("not_plain", with_info("facts.json", external_attr=link)),
-        "a pipe": ("not_plain", with_info("facts.json", external_attr=pipe)),
-        "a folder by attribute": ("not_plain", with_info("facts.json", external_attr=0x10)),
-        "LZMA": ("not_plain", with_info("facts.json", compress_type=zipfile.ZIP_LZMA)),
-        "bzip2 member": ("not_plain", lying("facts.json", method=12)),
-        "a zip bomb by ratio": ("too_large", _bomb()),
+        "encrypted": ("not_plain", lying(name, flags=1)),
+        "strongly encrypted": ("not_plain", lying(name, flags=0x41)),
+        "unknown flags": ("not_plain", lying(name, flags=0x20)),
+        "a symlink": ("not_plain", zipped(MEMBERS, name, external_attr=link)),
+        "a pipe": ("not_plain", zipped(MEMBERS, name, external_attr=pipe)),
+        "a folder by attribute": ("not_plain", zipped(MEMBERS, name, external_attr=0x10)),
+        "LZMA": ("not_plain", zipped(MEMBERS, name, compress_type=zipfile.ZIP_LZMA)),
+        "bzip2 member": ("not_plain", lying(name, method=12)),
+        "a zip bomb by ratio": ("too_large", bomb),
         "a gigabyte declared": ("too_large", lying("depth_0.npy", size=2**30)),
-        "300 kB of JSON": ("too_large", with_member("facts.json", noise)),
-        "two sizes": ("not_plain", lying("facts.json", where="local", size=9)),
+        "300 kB of JSON": ("too_large", with_member(name, noise)),
+        "two sizes": ("not_plain", lying(name, where="local", size=9)),
         "two names": ("damaged", HONEST.replace(b"facts.json", b"FACTS.json", 1)),
-        "two checksums": ("not_plain", lying("facts.json", where="central", crc=9)),
-        "stored, two sizes": ("damaged", lying("facts.json", method=0)),
-        "no local header": (
-            "damaged",
-            b"PK\x03\x04" + HONEST[4:].replace(b"PK\x03\x04", b"PK\x03\x05"),
-        ),
+        "two checksums": ("not_plain", lying(name, where="central", crc=9)),
+        "stored, two sizes": ("damaged", lying(name, method=0)),
+        "no local header": ("damaged", no_local),
         "more than declared": ("damaged", with_stream(facts * 9, size=len(facts))),
         "a bomb behind a lie": ("damaged", with_stream(zeros, size=9_000)),
         "less than declared": ("damaged", with_stream(facts, size=len(facts) + 1)),
@@ -442,7 +318,7 @@ def _headers() -> dict[str, tuple[str, bytes]]:
     }
 
 
-def _names() -> dict[str, tuple[str, bytes]]:
+def _names() -> Kinds:
     names = {
         "an absolute path": "/etc/passwd",
         "a Windows path": "C:\\Windows\\system.ini",
@@ -464,24 +340,27 @@ def _names() -> dict[str, tuple[str, bytes]]:
         "other digits in a name": "depth_٣.npy",
         "a long name": "a" * 60_000,
         "a formula for a name": '=HYPERLINK("http://x")',
+        "a NUL in a name": "facts.json?",
     }
     kinds = {kind: zip_bytes(MEMBERS | {name: b""}) for kind, name in names.items()}
-    nul = zip_bytes(MEMBERS | {"facts.json?": b""}).replace(b"json?", b"json\0")
-    return {k: ("unknown_member", v) for k, v in (kinds | {"a NUL in a name": nul}).items()}
+    return {k: ("unknown_member", data.replace(b"json?", b"json\0")) for k, data in kinds.items()}
 
 
-def _hashes() -> dict[str, tuple[str, bytes]]:
-    depth = bytearray(MEMBERS["depth_0.npy"])
-    depth[-2] ^= 1
-    claims = MEMBERS["claims.json"].replace(b"4.5", b"4.6", 1)
+def _hashes() -> Kinds:
+    depth, claims = MEMBERS["depth_0.npy"], MEMBERS["claims.json"].replace(b"4.5", b"4.6", 1)
+    depth = depth[:-2] + bytes([depth[-2] ^ 1]) + depth[-1:]
     gone = {k: v for k, v in MEMBERS.items() if k != "claims.json"}
-    listed = _set("members", "depth_0.npy", "bytes", to=9)
+    resized = placed(json.loads(MEMBERS["manifest.json"]), ("members", "depth_0.npy", "bytes"), 9)
+    counts, times = _a_million(2), np.arange(244) / 30
+    stacks = [Stack(z, (400, 200, 64, 64), counts, times) for z in (0.3, 0.6)]
+    full = parts(bundle.bundle_bytes(replace(ZOE, stacks=stacks)))  # as much as a bundle may hold
+    full["depth_1.npy"] = full["depth_1.npy"][:-1] + bytes([full["depth_1.npy"][-1] ^ 1])
     return {
-        "one raw value changed": ("wrong_hash", unhashed("depth_0.npy", bytes(depth))),
+        "one raw value changed": ("wrong_hash", unhashed("depth_0.npy", depth)),
         "one claim changed": ("wrong_hash", unhashed("claims.json", claims)),
         "members swapped": ("wrong_hash", unhashed("depth_0.npy", MEMBERS["depth_1.npy"])),
-        "a wrong size in the manifest": ("wrong_hash", with_json("manifest.json", listed)),
-        "as large as can be, last value changed": ("wrong_hash", full_size(last=1)),
+        "a wrong size in the manifest": ("wrong_hash", with_json("manifest.json", resized)),
+        "as large as can be, last value changed": ("wrong_hash", zip_bytes(full)),
         "a member missing": ("missing_member", zip_bytes(gone)),
         "a member missing everywhere": ("missing_member", zip_bytes(hashed(gone))),
         "no manifest": ("missing_member", zip_bytes({"facts.json": b"{}"})),
@@ -490,118 +369,125 @@ def _hashes() -> dict[str, tuple[str, bytes]]:
     }
 
 
-def _jsons() -> dict[str, tuple[str, bytes]]:
+def _jsons() -> Kinds:
     name = "claims.json"
-    whole = {
-        "no JSON": ("not_json", b"{'a': 1}"),
-        "brackets that do not match": ("not_json", b"]]][[["),
-        "brackets of two kinds": ("not_json", b"[}"),
-        "40,000 strings": ("bad_value", b"[" + b'"",' * 40_000 + b'""]'),
-        "half a JSON": ("not_json", MEMBERS[name][:40]),
-        "a byte order mark": ("not_json", b"\xef\xbb\xbf" + MEMBERS[name]),
-        "a string without end": ("not_json", b'"' + b'\\"' * 65_000),
-        "UTF-16": ("not_json", MEMBERS[name].decode().encode("utf-16")),
-        "invalid UTF-8": ("not_json", b'{"rows": "\xff\xfe\x80"}'),
-        "an overlong UTF-8": ("not_json", b'{"rows": "\xc0\xaf"}'),
-        "deep lists": ("not_json", b"[" * 60_000 + b"]" * 60_000),
-        "deep objects": ("not_json", b'{"a":' * 20_000 + b"1" + b"}" * 20_000),
-        "wide lists": ("bad_value", b"[" + b"[]," * 40_000 + b"[]]"),
-        "a list for an object": ("bad_value", b"[1, 2]"),
-        "a number for an object": ("bad_value", b"3"),
-        "a name of 5,000 letters": ("bad_value", b'{"' + b"a" * 5_000 + b'": 1}'),
-        "8,000 keys": ("bad_value", json.dumps(dict.fromkeys(map(str, range(8_000)))).encode()),
+    claims = MEMBERS[name]
+    not_json = {
+        "no JSON": b"{'a': 1}",
+        "brackets that do not match": b"]]][[[",
+        "brackets of two kinds": b"[}",
+        "half a JSON": claims[:40],
+        "a byte order mark": b"\xef\xbb\xbf" + claims,
+        "a string without end": b'"' + b'\\"' * 65_000,
+        "UTF-16": claims.decode().encode("utf-16"),
+        "invalid UTF-8": b'{"rows": "\xff\xfe\x80"}',
+        "an overlong UTF-8": b'{"rows": "\xc0\xaf"}',
+        "deep lists": b"[" * 60_000 + b"]" * 60_000,
+        "deep objects": b'{"a":' * 20_000 + b"1" + b"}" * 20_000,
     }
-    kinds = {kind: (reason, with_member(name, data)) for kind, (reason, data) in whole.items()}
-    return kinds | {
+    bad_value = {
+        "40,000 strings": b"[" + b'"",' * 40_000 + b'""]',
+        "wide lists": b"[" + b"[]," * 40_000 + b"[]]",
+        "a list for an object": b"[1, 2]",
+        "a number for an object": b"3",
+        "a name of 5,000 letters": b'{"' + b"a" * 5_000 + b'": 1}',
+        "8,000 keys": json.dumps(dict.fromkeys(map(str, range(8_000)))).encode(),
+    }
+    many = {f"a{i}": 1 for i in range(101)}
+    return {
+        **{kind: ("not_json", with_member(name, data)) for kind, data in not_json.items()},
+        **{kind: ("bad_value", with_member(name, data)) for kind, data in bad_value.items()},
+        "101 outcomes": ("bad_value", with_json("outcomes.json", many)),
         "NaN": ("bad_value", with_text(name, "4.5", "NaN")),
         "infinity": ("bad_value", with_text(name, "4.5", "-Infinity")),
         "1e999": ("bad_value", with_text(name, "4.5", "1e999")),
         "an integer of 5,000 digits": ("not_json", with_text(name, "4.5", "9" * 5_000)),
         "a number of 5,000 digits": ("", with_text(name, "4.5", "0." + "9" * 5_000)),
-        "a key twice": (
-            "not_json",
-            with_text(name, '"exponent"', '"sigma_d_px": 1, "exponent"'),
-        ),
-        "an unknown key": ("bad_value", with_json(name, _set("bonus", to=5))),
-        "a method's name for a key": ("bad_value", with_json(name, _set("__class__", to="x"))),
-        "a key missing": ("bad_value", with_json(name, _without("sigma_d_px"))),
-        "a key of a row missing": (
-            "bad_value",
-            with_json(name, _without("rows", 0, "depth_std_mm")),
-        ),
-        "a later format": ("other_format", with_json("manifest.json", _set("format", to=2))),
-        "no format": ("other_format", with_json("manifest.json", _without("format"))),
-        "True for a format": ("bad_value", with_json("manifest.json", _set("format", to=True))),
-        "members is a list": ("bad_value", with_json("manifest.json", _set("members", to=[1]))),
-        "101 outcomes": (
-            "bad_value",
-            with_member("outcomes.json", json.dumps({f"a{i}": 1 for i in range(101)}).encode()),
-        ),
-        "13 rows": ("bad_value", with_json(name, _set("rows", to=[{}] * 13))),
-        "13 stacks": ("bad_value", with_json("facts.json", _set("stacks", to=[{}] * 13))),
+        "a key twice": ("not_json", with_text(name, '"exponent"', '"sigma_d_px": 1, "exponent"')),
     }
 
 
-def _values() -> dict[str, tuple[str, bytes]]:
-    facts = {
-        "a negative focal length": (("camera", "fx"), -425),
-        "text for a number": (("camera", "fx"), "425"),
-        "True for a number": (("camera", "fx"), True),
-        "a huge focal length": (("camera", "fx"), 1e300),
-        "an integer of 39 digits": (("camera", "width"), 10**38),
-        "half a pixel": (("camera", "width"), 848.5),
-        "an unknown source": (("camera", "source"), "stolen"),
-        "a list for a source": (("camera", "source"), ["live"]),
-        "three coefficients": (("camera", "coeffs"), [0, 0, 0]),
-        "a block of no width": (("caliper_m",), 0),
-        "a version that is a list": (("versions", "numpy"), [2]),
-        "a window outside": (("stacks", 0, "window"), [846, 238, 5, 4]),
-        "a window of another size": (("stacks", 0, "window"), [420, 238, 4, 5]),
-        "a negative window": (("stacks", 0, "window"), [-1, 238, 5, 4]),
-        "a huge window": (("stacks", 0, "window"), [0, 0, 10**9, 10**9]),
-        "a negative distance": (("stacks", 0, "distance_m"), -0.3),
-        "a distance twice": (("stacks", 0, "distance_m"), 0.6),
-    }
-    manifest = {
-        "no name": "   ",
-        "an invisible name": "\u200b\u2060",
-        "a name of two lines": "Zoë\nsecond line",
-        "a name with a NUL": "Zo\0",
-        "a name that runs backwards": "\u202ezoe",
-        "half a character": "Zo\ud83d",
-        "a long name of a student": "Z" * 101,
-        "a list for a name": ["Zoë"],
-    }
-    claims, conclusion, outcomes = "claims.json", "conclusion.json", "outcomes.json"
-    others = {
-        "another exercise": ("manifest.json", _set("exercise", to="../studio_9")),
-        "no such day": ("manifest.json", _set("made", to="2026-02-30T12:00:00+00:00")),
-        "no time zone": ("manifest.json", _set("made", to="2026-02-03T12:00:00")),
-        "Arabic digits in a date": ("manifest.json", _set("made", to="٢٠٢٦-02-03T12:00:00+00:00")),
-        "a claim of 1e200": (claims, _set("rows", 0, "depth_std_mm", to=1e200)),
-        "an interval of three": (claims, _set("exponent_interval", to=[1, 2, 3])),
-        "an interval upside down": (claims, _set("exponent_interval", to=[2, 1])),
-        "a plot of unequal lists": (claims, _set("plot", "measured_mm", to=[1])),
-        "a row twice": (claims, _set("rows", 1, "distance_m", to=0.3)),
-        "minus 3 frames": (conclusion, _set("frames", to=-3)),
-        "a verdict of its own": (conclusion, _set("dominates", to="both")),
-        "a long paragraph": (conclusion, _set("paragraph", to="a b " * 1_300)),
-        "a path for an outcome": (outcomes, _set("../../x", to={"right": True, "attempts": 1})),
-        "minus 3 attempts": (outcomes, _set("depth_std", "attempts", to=-3)),
-        "1 for True": (outcomes, _set("depth_std", "right", to=1)),
-    }
-    changes = {k: ("facts.json", _set(*path, to=v)) for k, (path, v) in facts.items()}
-    changes |= {k: ("manifest.json", _set("student", to=v)) for k, v in manifest.items()}
-    kinds = {k: ("bad_value", with_json(*change)) for k, change in (changes | others).items()}
-    kinds["a window of another size"] = ("bad_array", kinds["a window of another size"][1])
-    return kinds
+# What is put where in a JSON member: the path, and last the value.
+WRONG_VALUES = {
+    "facts.json": {
+        "a negative focal length": ("camera", "fx", -425),
+        "text for a number": ("camera", "fx", "425"),
+        "True for a number": ("camera", "fx", True),
+        "a huge focal length": ("camera", "fx", 1e300),
+        "an integer of 39 digits": ("camera", "width", 10**38),
+        "half a pixel": ("camera", "width", 848.5),
+        "an unknown source": ("camera", "source", "stolen"),
+        "a list for a source": ("camera", "source", ["live"]),
+        "three coefficients": ("camera", "coeffs", [0, 0, 0]),
+        "a block of no width": ("caliper_m", 0),
+        "a version that is a list": ("versions", "numpy", [2]),
+        "a window outside": ("stacks", 0, "window", [846, 238, 5, 4]),
+        "a window of another size": ("stacks", 0, "window", [420, 238, 4, 5]),
+        "a negative window": ("stacks", 0, "window", [-1, 238, 5, 4]),
+        "a huge window": ("stacks", 0, "window", [0, 0, 10**9, 10**9]),
+        "a negative distance": ("stacks", 0, "distance_m", -0.3),
+        "a distance twice": ("stacks", 0, "distance_m", 0.6),
+        "13 stacks": ("stacks", [{}] * 13),
+    },
+    "manifest.json": {
+        "no name": ("student", "   "),
+        "an invisible name": ("student", "\u200b\u2060"),
+        "a name of two lines": ("student", "Zoë\nsecond line"),
+        "a name with a NUL": ("student", "Zo\0"),
+        "a name that runs backwards": ("student", "\u202ezoe"),
+        "half a character": ("student", "Zo\ud83d"),
+        "a long name of a student": ("student", "Z" * 101),
+        "a list for a name": ("student", ["Zoë"]),
+        "another exercise": ("exercise", "../studio_9"),
+        "no such day": ("made", "2026-02-30T12:00:00+00:00"),
+        "no time zone": ("made", "2026-02-03T12:00:00"),
+        "Arabic digits in a date": ("made", "٢٠٢٦-02-03T12:00:00+00:00"),
+        "a later format": ("format", 2),
+        "no format": ("format", GONE),
+        "True for a format": ("format", True),
+        "members is a list": ("members", [1]),
+    },
+    "claims.json": {
+        "a claim of 1e200": ("rows", 0, "depth_std_mm", 1e200),
+        "an interval of three": ("exponent_interval", [1, 2, 3]),
+        "an interval upside down": ("exponent_interval", [2, 1]),
+        "a plot of unequal lists": ("plot", "measured_mm", [1]),
+        "a row twice": ("rows", 1, "distance_m", 0.3),
+        "13 rows": ("rows", [{}] * 13),
+        "an unknown key": ("bonus", 5),
+        "a method's name for a key": ("__class__", "x"),
+        "a key missing": ("sigma_d_px", GONE),
+        "a key of a row missing": ("rows", 0, "depth_std_mm", GONE),
+    },
+    "conclusion.json": {
+        "minus 3 frames": ("frames", -3),
+        "a verdict of its own": ("dominates", "both"),
+        "a long paragraph": ("paragraph", "a b " * 1_300),
+    },
+    "outcomes.json": {
+        "a path for an outcome": ("../../x", {"right": True, "attempts": 1}),
+        "minus 3 attempts": ("depth_std", "attempts", -3),
+        "1 for True": ("depth_std", "right", 1),
+    },
+}
 
 
-def _arrays() -> dict[str, tuple[str, bytes]]:
-    struct_type = "[('a', '<u2'), ('b', '<u2')]"
+def _values() -> Kinds:
+    reasons = dict.fromkeys(("a later format", "no format"), "other_format")
+    reasons |= {"a window of another size": "bad_array"}
+    return {
+        kind: (reasons.get(kind, "bad_value"), with_json(name, placed(content, tuple(path), value)))
+        for name, wrong in WRONG_VALUES.items()
+        for content in [json.loads(MEMBERS[name])]
+        for kind, (*path, value) in wrong.items()
+    }
+
+
+def _arrays() -> Kinds:
+    np.save(pickled := io.BytesIO(), np.array([_Shell()], dtype=object), allow_pickle=True)
     code = "__import__('os').system('id')"
     depth = {
-        "a pickled object array": _pickled_array(),
+        "a pickled object array": pickled.getvalue(),
         "an object array in a record": npy("[('a', '|O')]"),
         "a zip for an array": HONEST,
         "a text for an array": b"1 2 3\n4 5 6\n",
@@ -618,7 +504,7 @@ def _arrays() -> dict[str, tuple[str, bytes]]:
         "complex counts": npy("'<c8'", content=bytes(480)),
         "text in an array": npy("'<U1'", content=bytes(240)),
         "dates in an array": npy("'<M8[s]'", content=bytes(480)),
-        "a record in an array": npy(struct_type, content=bytes(240)),
+        "a record in an array": npy("[('a', '<u2'), ('b', '<u2')]", content=bytes(240)),
         "big-endian": npy("'>u2'"),
         "Fortran order": npy(fortran="True"),
         "two dimensions": npy(shape="(12, 5)"),
@@ -633,17 +519,13 @@ def _arrays() -> dict[str, tuple[str, bytes]]:
         "another window": npy(shape="(3, 5, 4)"),
         "more frames than times": npy(shape="(4, 4, 5)", content=bytes(160)),
     }
-    nan, infinity = (struct.pack("<3d", 0, 1, value) for value in (float("nan"), float("inf")))
-    times = {
-        "NaN for a time": npy("'<f8'", "(3,)", content=nan),
-        "infinity for a time": npy("'<f8'", "(3,)", content=infinity),
-        "a time of 1e300": npy("'<f8'", "(3,)", content=struct.pack("<3d", 0, 1, 1e300)),
-    }
+    wild = {"NaN for a time": np.nan, "infinity for a time": np.inf, "a time of 1e300": 1e300}
+    times = {k: npy("'<f8'", "(3,)", content=struct.pack("<3d", 0, 1, t)) for k, t in wild.items()}
     kinds = {k: ("bad_array", with_member("depth_0.npy", data)) for k, data in depth.items()}
     kinds |= {k: ("bad_value", with_member("times_0.npy", data)) for k, data in times.items()}
     huge, clock = array_bytes(_a_million(4)), array_bytes(np.arange(244) / 30)
     three = {f"depth_{i}.npy": huge for i in range(3)} | {f"times_{i}.npy": clock for i in range(3)}
-    facts = json.loads(MEMBERS["facts.json"])
-    facts["stacks"] = [{"distance_m": 0.3 + i, "window": [0, 0, 64, 64]} for i in range(3)]
-    all_of = hashed(MEMBERS | three | {"facts.json": json.dumps(facts).encode()})
-    return kinds | {"three million values": ("bad_value", zip_bytes(all_of))}
+    stacks = [{"distance_m": 0.3 + i, "window": [0, 0, 64, 64]} for i in range(3)]
+    facts = json.dumps(json.loads(MEMBERS["facts.json"]) | {"stacks": stacks}).encode()
+    all_of = zip_bytes(hashed(MEMBERS | three | {"facts.json": facts}))
+    return kinds | {"three million values": ("bad_value", all_of)}

@@ -116,7 +116,7 @@ def test_batches_are_single_poses(anywhere: np.ndarray) -> None:
 
 def test_inverse_meets_the_pose_or_says_so() -> None:
     arm = widowx()
-    q = arm.random(np.random.default_rng(1), 300)
+    q = arm.random(np.random.default_rng(1), 150)
     q[:, 0] = np.clip(q[:, 0], -1.5, 1.5)
     found, reached = arm.inverse(arm.forward(q))
     assert reached.mean() > 0.85

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import itertools
 import os
-import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from fake_realsense import ending_after
 from scipy.spatial.transform import Rotation
 
 import coursekit as ck
@@ -25,9 +24,10 @@ from coursekit.geometry import (
     project,
     transform_points,
 )
-from coursekit.simulation import tabletop, wall_scene
+from coursekit.simulation import wall_scene
 
 CALIBRATION_TOLERANCE = 1e-6  # the recorder writes extrinsics with six decimals
+NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 SIGMA_D_PX = 0.08  # temporal std of one pixel's disparity, the planning value
 
 
@@ -155,64 +155,41 @@ def test_closing_twice_is_fine_and_a_closed_camera_says_so(camera):
         camera.frame()
 
 
-def test_lock_says_what_it_did(camera):
-    sentence = camera.lock()
-    assert sentence.endswith(".")
-    assert {"simulated": "Locked infrared exposure at ", "recorded": "cannot be changed"}[
-        camera.source
-    ] in sentence
+SAID = {
+    "simulated": (
+        "Locked infrared exposure at ",
+        "Simulated D435, seed 7: no real camera in use.\nPlug in a RealSense and run this cell "
+        'again, or name a recording: ck.open_camera("file.bag")',
+    ),
+    "recorded": (
+        "cannot be changed",
+        "Simulated D435 (recording tabletop.db3): depth 848x480, colour 640x480, "
+        "baseline 50.2 mm, depth unit 1 mm",
+    ),
+}
 
 
-def test_description(camera):
-    assert (
-        repr(camera)
-        == {
-            "simulated": "Simulated D435, seed 7: no real camera in use.\nPlug in a RealSense and "
-            'run this cell again, or name a recording: ck.open_camera("file.bag")',
-            "recorded": "Simulated D435 (recording tabletop.db3): depth 848x480, colour 640x480, "
-            "baseline 50.2 mm, depth unit 1 mm",
-        }[camera.source]
-    )
+def test_description_and_what_lock_did(camera):
+    locked, description = SAID[camera.source]
+    assert repr(camera) == description
+    assert locked in camera.lock()
 
 
-def stopping(camera, monkeypatch, after, stop):
-    """Let `stop()` happen while the frame after so many is waited for."""
-    stream = camera.stream
-
-    def stopped():
-        yield from itertools.islice(stream(), after)
-        stop()
-
-    monkeypatch.setattr(camera, "stream", stopped)
-
-
-def fail(error):
-    raise error
-
-
-@pytest.fixture
-def ctrl_c():
-    """Ctrl-C from the keyboard; it raises KeyboardInterrupt however the tests were started."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield lambda: signal.raise_signal(signal.SIGINT)
-    signal.signal(signal.SIGINT, before)
-
-
-def test_ctrl_c_keeps_the_frames_so_far(camera, capsys, monkeypatch, ctrl_c):
-    stopping(camera, monkeypatch, 3, ctrl_c)
+def test_ctrl_c_keeps_the_frames_so_far(camera, capsys):
+    ending_after(camera, 3, KeyboardInterrupt())
     frames = camera.frames(9)
     assert len(frames) == 3
     assert capsys.readouterr().out == "Stopped after 3 of 9 frames; they are kept.\n"
 
 
-def test_ctrl_c_before_the_first_frame_is_not_swallowed(camera, monkeypatch, ctrl_c):
-    stopping(camera, monkeypatch, 0, ctrl_c)
+def test_ctrl_c_before_the_first_frame_is_not_swallowed(camera):
+    ending_after(camera, 0, KeyboardInterrupt())
     with pytest.raises(KeyboardInterrupt):
         camera.frames(9)
 
 
-def test_an_error_carries_the_frames_so_far(camera, monkeypatch):
-    stopping(camera, monkeypatch, 2, lambda: fail(CameraError("gone")))
+def test_an_error_carries_the_frames_so_far(camera):
+    ending_after(camera, 2, CameraError("gone"))
     with pytest.raises(CameraError, match="gone") as caught:
         camera.frames(9)
     assert len(caught.value.frames) == 2
@@ -240,21 +217,7 @@ def test_two_views_of_one_recording_do_not_disturb_each_other(tabletop):
 # --- the simulated camera ---
 
 
-def test_simulated_frames_differ_and_do_not_share_memory():
-    with SimulatedCamera() as camera:
-        one, two = camera.frames(2)
-        assert (one.number, two.number) == (1, 2)
-        for mine, other in ((one.depth, two.depth), *zip(one.infrared, two.infrared, strict=True)):
-            assert 0.2 < np.mean(mine != other) < 1.0
-        np.testing.assert_array_equal(one.color, two.color)
-        for image in (one.depth, one.color, *one.infrared):
-            image[:] = 0
-        assert two.depth.any()
-        assert camera.frame().color.any()
-        assert camera.frame().number == 4
-
-
-@pytest.mark.parametrize(("seed", "distance_m"), [(7, 0.45), (1, 0.6)])
+@pytest.mark.parametrize(("seed", "distance_m"), [(7, 0.45), *([(1, 0.6)] if NIGHTLY else [])])
 def test_noise_on_the_face_has_the_size_that_the_matcher_gives_it(seed, distance_m):
     """Temporal std of a pixel about sigma_d Z^2 / (f B), and the mean where the truth puts it."""
     with SimulatedCamera(seed=seed, depth_scale_m=1e-4) as camera:
@@ -285,82 +248,6 @@ def test_the_three_scenes():
         assert np.mean(depth[:200, 50:250] == 0) > 0.5  # the finger and its shadow
         camera.place("wall", 0.6)
         assert np.mean(camera.frame().depth[50:-50, 150:-50] == 0) < 0.02
-
-
-def test_another_unit_of_depth_rounds_the_same_images():
-    with SimulatedCamera() as camera:
-        fine, coarse = [], []
-        for depth_scale_m, frames in ((1e-4, fine), (1e-3, coarse)):
-            sentence = camera.set(depth_scale_m=depth_scale_m)
-            assert f"depth unit {1000 * depth_scale_m:g} mm" in sentence
-            frames.extend(camera.frames(2))
-            assert frames[0].depth_scale_m == depth_scale_m
-    for one, other in zip(fine, coarse, strict=True):
-        np.testing.assert_array_equal(one.infrared[0], other.infrared[0])
-        far = one.depth == 0  # 65,535 counts of 0.1 mm end before the wall does
-        assert np.abs(one.depth[~far] / 10 - other.depth[~far]).max() <= 0.55
-
-
-def test_light_and_exposure_reach_the_images():
-    with SimulatedCamera() as camera:
-        automatic = camera.frame()
-        assert "Ambient infrared 0.01, exposure 1 ms" in camera.set(exposure=1.0)
-        dark = camera.frame().infrared[0].mean()
-        camera.set(exposure=2.0)
-        longer = camera.frame().infrared[0].mean()
-        assert "Ambient infrared 0.2, exposure 1 ms" in camera.set(ambient=0.2, exposure=1.0)
-        bright = camera.frame().infrared[0].mean()
-        assert "exposure auto" in camera.set(ambient=0.01, exposure="auto")
-        np.testing.assert_array_equal(camera.frame().infrared, automatic.infrared)
-    black = 4.0
-    assert longer - black == pytest.approx(2 * (dark - black), rel=0.1)
-    assert bright > dark + 3.0  # grey levels
-
-
-def test_lock_freezes_the_exposure_of_the_nearer_scene():
-    with SimulatedCamera() as camera:
-        camera.place("wall", 0.5)
-        camera.lock()
-        camera.place("wall", 1.0)
-        locked = np.percentile(camera.frame().infrared[0], 98)
-        camera.set(exposure="auto")
-        automatic = np.percentile(camera.frame().infrared[0], 98)
-    assert locked < 0.5 * automatic  # light falls off with the square of the distance
-
-
-BAD_SETTINGS = [
-    ({"ambient": -0.1}, "^ambient: got -0.1"),
-    ({"exposure": 0}, "^exposure: got 0"),
-    ({"exposure": "long"}, "^exposure: got 'long'"),
-    ({"depth_scale_m": 0.0}, "^depth_scale_m: got 0.0, want metres per count"),
-    ({"depth_scale_m": 1}, "^depth_scale_m: got 1, want metres per count"),
-    ({"depth_scale_m": float("nan")}, "^depth_scale_m: got nan"),
-]
-
-
-@pytest.mark.parametrize(("change", "message"), BAD_SETTINGS)
-def test_a_bad_setting_is_refused_and_changes_nothing(change, message):
-    with SimulatedCamera() as camera:
-        before = camera.frame().infrared
-        with pytest.raises(ValueError, match=message):
-            camera.set(**change)
-        camera.set()
-        np.testing.assert_array_equal(camera.frame().infrared, before)
-        assert camera.depth_scale_m == 0.001
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        *BAD_SETTINGS,
-        ({"device": "D999"}, "D999"),
-        ({"seed": -1}, "^seed: got -1"),
-        ({"seed": 1.5}, "^seed: got 1.5"),
-    ],
-)
-def test_simulated_refuses(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        SimulatedCamera(**arguments)
 
 
 def test_the_truth_is_near_what_is_reported_and_each_unit_has_its_own():
@@ -482,18 +369,10 @@ def test_a_board_that_faces_away_is_refused_and_changes_nothing():
         assert camera.scene is scene
 
 
-def test_a_recording_reveals_nothing(tabletop):
-    with (
-        open_camera(tabletop) as camera,
-        pytest.raises(CameraError, match="nobody knows the true geometry of the Simulated D435"),
-    ):
-        camera.reveal()
-
-
 @pytest.mark.parametrize("device", ["D405", "D415", "D455"])
 def test_every_device_sees_the_block(device):
     with SimulatedCamera(device=device, depth_scale_m=1e-4) as camera:
-        frames = camera.frames(3)
+        frames = camera.frames(1)
         truth_mm = 1000 * expected_m(camera, 0.45)
     window = middle_mm(frames, half=15)
     sigma_mm = SIGMA_D_PX * truth_mm**2 / (camera.depth.fx * 1000 * camera.baseline_m)
@@ -513,32 +392,16 @@ def test_simulated_depth_beyond_16_bits_is_invalid():
         assert np.isnan(middle_mm(camera.frames(1))).mean() > 0.95
 
 
-def test_a_scene_of_ones_own():
-    with SimulatedCamera(scene=tabletop(0.3)) as camera:
-        depth = middle_mm(camera.frames(3))
-        assert np.nanmedian(depth) == pytest.approx(1000 * expected_m(camera, 0.3), abs=1.0)
-
-
 # --- frames ---
 
 
-def depth_only_frame() -> Frame:
-    intrinsics = Intrinsics(4, 2, 5.0, 5.0, 1.5, 0.5)
+def test_a_frame_without_colour_in_metres_by_the_depth_unit():
     depth = np.array([[0, 1000, 2000, 65535], [1, 2, 3, 4]], np.uint16)
-    return Frame(depth, None, 0.0001, 0.5, 9, intrinsics)
-
-
-def test_depth_in_metres_uses_the_depth_unit():
+    frame = Frame(depth, None, 0.0001, 0.5, 9, Intrinsics(4, 2, 5.0, 5.0, 1.5, 0.5))
     expected = [[0, 0.1, 0.2, 6.5535], [1e-4, 2e-4, 3e-4, 4e-4]]
-    frame = depth_only_frame()
     np.testing.assert_allclose(frame.depth_m, expected, rtol=1e-6)
-    np.testing.assert_allclose(
-        frame.points()[0, 3], [1.5 / 5 * 6.5535, -0.65535, 6.5535], rtol=1e-6
-    )
-
-
-def test_a_frame_without_colour_says_so():
-    frame = depth_only_frame()
+    point = [1.5 / 5 * 6.5535, -0.65535, 6.5535]
+    np.testing.assert_allclose(frame.points()[0, 3], point, rtol=1e-6)
     with pytest.raises(CameraError, match="no colour stream"):
         frame.depth_on_color()
     assert repr(frame) == "Frame 9 at 0.500 s: depth 4x2, no colour"
@@ -558,13 +421,9 @@ def test_the_environment_variable_names_the_camera_of_auto(monkeypatch, tabletop
     monkeypatch.setenv("COURSEKIT_CAMERA", "simulated")
     assert open_camera().source == "simulated"
     monkeypatch.setenv("COURSEKIT_CAMERA", str(tabletop))
-    with open_camera("auto") as camera:
-        assert camera.source == "recorded"
-    with open_camera("simulated") as camera:
-        assert camera.source == "simulated"
-
-
-def test_a_bad_environment_variable_is_named(monkeypatch):
+    for which, source in (("auto", "recorded"), ("simulated", "simulated")):
+        with open_camera(which) as camera:
+            assert camera.source == source
     monkeypatch.setenv("COURSEKIT_CAMERA", "bogus")
     with pytest.raises(ValueError, match=r"^COURSEKIT_CAMERA: got 'bogus'"):
         open_camera()
@@ -581,8 +440,5 @@ def test_opening_the_simulated_camera_loads_no_hardware_library():
         "import sys, coursekit as ck; ck.open_camera('simulated').depth; "
         "sys.exit('pyrealsense2' in sys.modules or 'libusb_package' in sys.modules)"
     )
-    root = Path(ck.__file__).parents[1]
-    environment = os.environ | {"PYTHONPATH": str(root)}
-    assert (
-        subprocess.run([sys.executable, "-c", code], env=environment, check=False).returncode == 0
-    )
+    environment = os.environ | {"PYTHONPATH": str(Path(ck.__file__).parents[1])}
+    subprocess.run([sys.executable, "-c", code], env=environment, check=True)

@@ -97,7 +97,7 @@ class HeldBoard(Camera):
     depth, color = Intrinsics(848, 480, 431.0, 431.0, 436.0, 242.0), LENS
     baseline_m, depth_scale_m, T_color_depth = 0.05, 0.001, np.eye(4)
 
-    def __init__(self, poses, held=8, then=None, color=True):
+    def __init__(self, poses, held=module.STILL_FRAMES + 1, then=None, color=True):
         self.poses, self.held, self.then, self.has_color = poses, held, then, color
         self.locked = self.streams = 0
         self.shown = []  # what each frame showed: the number of a pose, or None on the way
@@ -149,33 +149,17 @@ def same(one, two):
 
 def test_the_simulated_camera_is_moved_and_says_so(tmp_path, capsys):
     seen = capture(SimulatedCamera(), BOARD, 4, tmp_path / "views")
-    out = capsys.readouterr().out
-    assert out == (
+    assert capsys.readouterr().out == (
         "4 views of the Simulated D435 in views: there is no board to hold, so the simulated "
         "camera was moved.\n"
     )
     assert pictures(tmp_path / "views") == [view.name for view in seen]
     assert [view.name for view in seen] == [f"view_{number:03d}.png" for number in range(4)]
     assert all(len(view) >= 16 for view in seen)
+    same(detect_all(tmp_path / "views", BOARD, progress=False), seen)
     assert list((tmp_path / "views").glob("*.part")) == []
     card = json.loads((tmp_path / "views" / "session.json").read_text(encoding="utf-8"))
     assert (card["serial"], card["board"]["squares"]) == ("seed-7", [9, 6])
-
-
-def test_the_folder_gives_the_same_corners(tmp_path):
-    seen = capture(SimulatedCamera(), BOARD, 3, tmp_path)
-    same(detect_all(tmp_path, BOARD, progress=False), seen)
-
-
-def test_the_same_call_takes_the_same_pictures_and_another_unit_others(tmp_path):
-    for name, seed in (("one", 7), ("two", 7), ("other", 8)):
-        capture(SimulatedCamera(seed=seed), BOARD, 2, tmp_path / name)
-    one, two, other = (
-        [(tmp_path / name / f"view_00{n}.png").read_bytes() for n in (0, 1)]
-        for name in ("one", "two", "other")
-    )
-    assert one == two
-    assert one[0] != other[0]
 
 
 @pytest.mark.parametrize("board", [BOARD, *([CHECKERS] if NIGHTLY else [])], ids=kind)
@@ -186,10 +170,9 @@ def test_twenty_guided_views_lack_nothing_and_determine_the_lens(board, tmp_path
     lens = camera.reveal().color_lens
     points = [board.points[view.ids].astype(np.float32) for view in seen]
     pixels = [view.pixels.astype(np.float32) for view in seen]
-    rms, K, _, _, _, sigma, _, _ = cv2.calibrateCameraExtended(
-        points, pixels, LENS.size, camera.color.K, np.zeros(5),
-        flags=cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3,
-    )  # fmt: skip
+    guess, flags = (camera.color.K, np.zeros(5)), cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3
+    found = cv2.calibrateCameraExtended(points, pixels, LENS.size, *guess, flags=flags)
+    rms, K, sigma = found[0], found[1], found[5]
     assert rms < 0.12
     assert sigma[0, 0] < 1.0
     assert abs(K[0, 0] - lens.fx) < 4 * sigma[0, 0]
@@ -217,8 +200,13 @@ def test_ctrl_c_keeps_what_came_and_the_next_call_goes_on(tmp_path, monkeypatch,
     assert len(seen) == 2
     assert capsys.readouterr().out.startswith("2 of 4 views of the Simulated D435 in stopped")
     assert pictures(tmp_path / "stopped") == ["view_000.png", "view_001.png"]
-    same(capture(SimulatedCamera(), BOARD, 4, tmp_path / "stopped"),
-         capture(SimulatedCamera(), BOARD, 4, tmp_path / "at once"))  # fmt: skip
+    went_on = capture(SimulatedCamera(), BOARD, 4, tmp_path / "stopped")
+    same(went_on, capture(SimulatedCamera(), BOARD, 4, tmp_path / "at once"))
+    for name in pictures(tmp_path / "at once"):
+        stored = [(tmp_path / folder / name).read_bytes() for folder in ("stopped", "at once")]
+        assert stored[0] == stored[1]
+    other_unit = capture(SimulatedCamera(seed=8), BOARD, 1, tmp_path / "other")
+    assert (other_unit[0].pixels[0] != went_on[0].pixels[0]).all()
 
 
 def test_ctrl_c_before_the_first_view_is_passed_on(tmp_path, monkeypatch):
@@ -296,13 +284,10 @@ def test_it_stops_as_soon_as_there_are_enough_views(tmp_path):
     assert camera.streams == 1  # the folder holds enough
 
 
-def test_a_pose_that_was_taken_is_not_taken_again(tmp_path):
-    assert len(capture(HeldBoard((POSES[0], POSES[1], POSES[0])), BOARD, 10, tmp_path)) == 2
-
-
-def test_a_board_that_is_not_held_long_enough_is_not_taken(tmp_path):
+def test_a_pose_is_not_taken_twice_nor_when_it_is_not_held_long_enough(tmp_path):
     short = HeldBoard(POSES, held=module.STILL_FRAMES - 1)
     assert len(capture(short, BOARD, 10, tmp_path)) == 0
+    assert len(capture(HeldBoard((POSES[0], POSES[1], POSES[0])), BOARD, 10, tmp_path)) == 2
 
 
 def test_it_gives_up_when_no_view_comes(tmp_path):

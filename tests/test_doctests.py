@@ -19,9 +19,7 @@ NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 MODULES = [module.name for module in pkgutil.walk_packages(coursekit.__path__, "coursekit.")]
 ROOMS = ("geometry", "intrinsics", "stereo")  # whose functions must have an example
 WITHOUT = {
-    "intrinsics.diagnose": "a spoiled session has no two-line example; notebook 03 shows four",
     "intrinsics.fit_bow": "needs a whole session of views of a bowed board",
-    "intrinsics.stored_power": "returns a file that tools/make_data.py wrote",
 }
 
 

@@ -9,19 +9,19 @@ from __future__ import annotations
 import os
 from collections import Counter
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2, norm
 
 from coursekit.arm import ArmErrors, pose_difference, widowx
+from coursekit.causes import CauseSearch, likelihood_ratios
 from coursekit.geometry import invert_transform, make_transform
 from coursekit.hand_eye import causes, misread
-from coursekit.hand_eye.causes import Arms, Search
+from coursekit.hand_eye.causes import Arms, MendedPairs, PosePairs
 from coursekit.hand_eye.diagnosis import diagnose
-from coursekit.hand_eye.pairs import Pairs, robust_fit
 from coursekit.hand_eye.session import HandEyeSession
 from coursekit.simulation.arm_sessions import HandEyeMistakes as M
 from coursekit.simulation.arm_sessions import HandEyeTruth, hand_eye_session
@@ -51,6 +51,7 @@ CLASSES = {
 }
 
 
+@lru_cache
 def session(seed: int, mistakes: M, **options) -> tuple[HandEyeSession, HandEyeTruth]:
     """Both mounts, arms with and without errors, and 15 to 30 poses in turn."""
     mount = ("eye_in_hand", "eye_to_hand")[seed % 2]
@@ -66,11 +67,11 @@ def session(seed: int, mistakes: M, **options) -> tuple[HandEyeSession, HandEyeT
 def test_a_mistake_is_named(label: str) -> None:
     """At least 95 of 100 named, at most 5 with a wrong name besides (nightly).
 
-    Of 8, 7: a diagnosis that names 80 % passes that with a probability of 50 %, one that names
-    50 % with 4 %.
+    Of 4, all: a diagnosis that names 80 % passes that with a probability of 41 %, one that names
+    50 % with 6 %. Four seeds are both mounts, with and without errors of the arm.
     """
     name, mistakes = CLASSES[label]
-    count, least, most_wrong = (100, 95, 5) if NIGHTLY else (8, 7, 1)
+    count, least, most_wrong = (100, 95, 5) if NIGHTLY else (4, 4, 0)
     found: Counter[tuple[str, ...]] = Counter()
     for seed in range(FIRST_SEED, FIRST_SEED + count):
         found[diagnose(session(seed, mistakes)[0]).names] += 1
@@ -80,8 +81,8 @@ def test_a_mistake_is_named(label: str) -> None:
 
 
 def test_healthy_sessions_get_no_finding() -> None:
-    """At most 4 of 200 (nightly); of 16 at most one: a rate of 25 % passes with 6 %."""
-    count, most = (200, 4) if NIGHTLY else (16, 1)
+    """At most 4 of 200 (nightly); of 12 none: a rate of 25 % passes with 3 %."""
+    count, most = (200, 4) if NIGHTLY else (12, 0)
     found: Counter[tuple[str, ...]] = Counter()
     for seed in range(FIRST_SEED + 1000, FIRST_SEED + 1000 + count):
         healthy, _ = session(seed, M(moving=(seed // 4) % 2 == 1))
@@ -95,31 +96,36 @@ def test_healthy_sessions_get_no_finding() -> None:
 def test_sizes_come_out() -> None:
     """Each size in the evidence is the one that was put in, in the fit behind it."""
     late, _ = session(FIRST_SEED, M(late_s=0.05))
-    assert state_of(late).delay_s == pytest.approx(0.05, abs=0.002)
+    assert search_of(late).model.delay_s == pytest.approx(0.05, abs=0.002)
     scaled, _ = session(FIRST_SEED, M(square_scale=1.05))
-    assert state_of(scaled).scale == pytest.approx(1.05, abs=0.002)
+    found = search_of(scaled)
+    assert found.model.scale == pytest.approx(1.05, abs=0.002)
     assert "26.2" in diagnose(scaled)[0].evidence
+    [step] = found.of(causes.SCALE)
+    assert step.before is found.start
+    assert causes.SCALE not in [rival.cause for rival in step.rivals]
     zero, truth = session(FIRST_SEED, M(joint_offset_deg=2.0))
-    offsets = np.degrees(state_of(zero).offsets)
+    offsets = np.degrees(search_of(zero).model.offsets)
     assert truth.joint is not None
     # read = true + offset: what has to be added to the readings is its negative
     assert offsets[truth.joint] == pytest.approx(-2.0, abs=0.1)
     assert np.abs(np.delete(offsets, truth.joint)).max() == 0.0
     slipped, truth = session(FIRST_SEED, M(slip_m=0.01, slip_deg=1.5))
-    [slip] = state_of(slipped).accepted
-    assert slip.view == truth.slipped_at
-    assert np.linalg.norm(slip.test.size[3:]) == pytest.approx(0.01, abs=5e-4)
+    [slip] = search_of(slipped).accepted
+    assert slip.test.at == truth.slipped_at
+    assert causes.turn_and_shift(slip.test)[1] == pytest.approx(0.01, abs=5e-4)
     odd, truth = session(FIRST_SEED, M(outliers=2))
-    found = state_of(odd).accepted
-    assert sorted(one.view for one in found) == list(truth.outliers)
+    found = search_of(odd)
+    views = [step.before.fit.pairs.view[step.test.at] for step in found.accepted]
+    assert sorted(views) == list(truth.outliers)
+    assert found.model.odd == 2
 
 
-def state_of(given: HandEyeSession) -> Search:
-    pairs = Pairs.of(given)
+def search_of(given: HandEyeSession) -> CauseSearch[MendedPairs]:
     velocity = None
     if given.dq is not None:
         velocity = (widowx().jacobian(given.q) @ given.dq[..., None])[..., 0]
-    return causes.search(pairs, Arms(widowx(), None, given.q, velocity), robust_fit(pairs))
+    return causes.search_pairs(PosePairs.of(given), Arms(widowx(), None, given.q, velocity))
 
 
 def test_two_mistakes_are_both_named() -> None:
@@ -138,9 +144,9 @@ def test_candidates_are_listed_and_the_true_one_has_the_true_X(seed: int, kind: 
              "wrong_mount": "another mount"}  # fmt: skip
     for number, name in enumerate(words.values(), 1):
         assert f"({number}) {name}" in finding.evidence
-    fit = robust_fit(replace(
-        Pairs.of(given), T_base_gripper=invert_transform(given.T_base_gripper)))  # fmt: skip
-    options = misread.candidates(fit, np.zeros(3), None, False)
+    inverted = invert_transform(given.T_base_gripper)
+    fit = replace(PosePairs.of(given), T_base_gripper=inverted).fit
+    options = misread.candidates(fit, given, misread.INVERTED)
     [mine] = [option for option in options if option.name.startswith(words[kind])]
     assert mine.mount == truth.mount
     assert not mine.against
@@ -151,14 +157,15 @@ def test_candidates_are_listed_and_the_true_one_has_the_true_X(seed: int, kind: 
 
 def test_two_inversions_that_cancel_are_named_by_what_they_imply() -> None:
     given, truth = session(FIRST_SEED, M(inverted_poses=True, inverted_detections=True))
-    assert robust_fit(Pairs.of(given)).shift_m < 0.005  # the equation is obeyed
+    assert PosePairs.of(given).fit.shift_m < 0.005  # the equation is obeyed
     [finding] = diagnose(given)
     assert finding.name == "inconsistent_convention"
     assert "arm poses and board poses both inverted" in finding.evidence
     assert truth.mount == "eye_in_hand"
 
 
-@pytest.mark.parametrize("order", ["xyz", "XYZ", "zyx"])
+# Angles about fixed axes in the order zyx are those about the body's own in the order XYZ.
+@pytest.mark.parametrize("order", ["xyz", "XYZ", "zyx"] if NIGHTLY else ["xyz", "zyx"])
 @pytest.mark.parametrize("way", ["degrees taken as radians", "radians taken as degrees"])
 def test_euler_angles_in_the_wrong_unit(order: str, way: str) -> None:
     given, _ = session(FIRST_SEED + 1, M())
@@ -191,12 +198,9 @@ def test_shuffled_images_fit_nothing_and_it_says_so() -> None:
 # --- what it takes and says ---
 
 
-def test_arrays_do_as_well_as_a_session() -> None:
+def test_poses_do_as_well_as_detections() -> None:
     given, _ = session(FIRST_SEED, M(square_scale=1.05))
-    options = {"board": given.board, "intrinsics": given.intrinsics}
-    findings = diagnose(given.T_base_gripper, given.detections, given.mount, **options)
-    assert findings.names == ("wrong_square_size",)
-    findings = diagnose(given.T_base_gripper, given.T_camera_board, given.mount)
+    findings = diagnose(HandEyeSession(given.mount, given.T_base_gripper, given.T_camera_board))
     assert findings.names == ("wrong_square_size",)
     assert any("joint angles" in reason for reason in findings.not_tested)
 
@@ -215,10 +219,8 @@ def test_what_cannot_be_tested_is_said() -> None:
 
 def test_two_pairs_are_too_few() -> None:
     given, _ = session(FIRST_SEED, M())
-    with pytest.raises(ValueError, match="session: has 2 pairs, want at least 3"):
+    with pytest.raises(ValueError, match="session: got 2, want at least 3 pairs"):
         diagnose(given.pick([0, 1]))
-    with pytest.raises(ValueError, match="seen, mount"):
-        diagnose(given.T_base_gripper)
 
 
 def test_velocities_come_from_the_times_of_small_steps() -> None:
@@ -245,49 +247,37 @@ def test_velocities_come_from_the_times_of_small_steps() -> None:
 
 def test_the_robust_fit_is_not_bent_by_an_outlier() -> None:
     given, truth = session(FIRST_SEED, M(outliers=1), arm_errors=None)
-    fit = robust_fit(Pairs.of(given))
+    fit = PosePairs.of(given).fit
     assert np.linalg.norm(pose_difference(truth.X, fit.X)[3:]) < 5e-4
 
 
 def test_gain_is_that_of_the_full_likelihood() -> None:
     """A scale's gain against a direct minimisation over X, Y, scale, at one covariance."""
     given, _ = session(FIRST_SEED + 2, M(square_scale=1.02), n=12)
-    pairs = Pairs.of(given)
-    state = Search(Arms(widowx(), None, given.q, None), robust_fit(pairs))
-    original = causes.FACTORS
-    causes.FACTORS = (1.0,)
-    try:
-        tested = causes._tests(state, without=set())
-    finally:
-        causes.FACTORS = original
-    [scale] = [test for test in tested if test.cause == causes.SCALE]
-    covariance = next(iter(causes._covariances(state)))
+    pairs = PosePairs.of(given)
+    model = MendedPairs(Arms(widowx(), None, given.q), pairs.fit)
+    [hypothesis] = [h for h in model.hypotheses() if h.cause == causes.SCALE]
+    residuals, covariance = pairs.fit.twists.ravel(), next(model.covariances())
+    J = pairs.fit.columns.reshape(len(residuals), -1)
+    [scale] = likelihood_ratios(residuals, J, [hypothesis], [covariance])
     root = np.linalg.inv(np.linalg.cholesky(covariance))
-    columns = root @ state.fit.columns.reshape(len(root), -1)
+    columns, right = root @ J, root @ residuals
     extra = np.zeros((len(pairs), 6))
     extra[:, 3:] = -pairs.T_camera_board[:, :3, 3]
-    right = root @ state.fit.twists.ravel()
 
     def squares(size: np.ndarray) -> float:
         left = right - root @ extra.ravel() * size[0]
         return float(((left - columns @ np.linalg.lstsq(columns, left, rcond=None)[0]) ** 2).sum())
 
     found = minimize(squares, [0.0], method="Nelder-Mead", options={"xatol": 1e-8})
-    assert scale.size[0] == pytest.approx(found.x[0], rel=1e-3)
+    assert scale.coefficients[0] == pytest.approx(found.x[0], rel=1e-3)
     assert scale.gain == pytest.approx(squares(np.zeros(1)) - found.fun, rel=1e-3)
-
-
-def test_log_tail_of_chi_square() -> None:
-    for dof, x in ((1, 3.0), (6, 40.0), (6, 1300.0)):
-        assert causes._log_chi2_tail(x, dof) == pytest.approx(chi2.logsf(x, dof), rel=1e-3)
-    # chi2(1) is the square of a normal variable, whose log tail is known far out
-    assert causes._log_chi2_tail(1e4, 1) == pytest.approx(np.log(2) + norm.logsf(100.0), rel=1e-3)
 
 
 def test_exchanged_pairs_obey_the_same_equation() -> None:
     for seed in (FIRST_SEED, FIRST_SEED + 1):
         given, truth = session(seed, M(), arm_errors=None)
-        fit = robust_fit(Pairs.of(given).exchanged())
+        fit = PosePairs.of(given).exchanged().fit
         assert fit.shift_m < 1e-3
         assert np.abs(invert_transform(fit.X)[:3, 3] - truth.X[:3, 3]).max() < 1e-3
 
@@ -295,7 +285,7 @@ def test_exchanged_pairs_obey_the_same_equation() -> None:
 def test_positions_alone_tell_the_arm_rotations_but_for_a_constant() -> None:
     for seed in (FIRST_SEED, FIRST_SEED + 1):
         given, _ = session(seed, M(), arm_errors=None)
-        places = misread.places(Pairs.of(given))
+        places = misread.places(PosePairs.of(given))
         assert places.agree
         constant = np.swapaxes(places.expected, 1, 2) @ given.T_base_gripper[:, :3, :3]
         turn = Rotation.from_matrix(constant[0].T @ constant).magnitude()

@@ -6,7 +6,11 @@ import dataclasses
 import itertools
 import json
 import math
+import os
 import re
+import sys
+from functools import partial
+from inspect import signature
 from pathlib import Path
 from statistics import mean
 
@@ -20,6 +24,7 @@ from coursekit.lessons.exercises import Exercise, Model
 from coursekit.lessons.progress import Verdict
 from coursekit.lessons.questions import EXAMPLES, Choice, Number, panel
 
+NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 FILES = [Path(lessons.__file__).with_name(f"{lesson}.toml") for lesson in lessons.LESSONS]
 each_exercise = pytest.mark.parametrize("exercise", EXERCISES.values(), ids=EXERCISES.keys())
 each_checkpoint = pytest.mark.parametrize("checkpoint", CHECKPOINTS.values(), ids=CHECKPOINTS)
@@ -46,12 +51,7 @@ def test_each_model_gets_its_verdict(exercise: Exercise) -> None:
         assert mistake.ask in verdict.lines
         assert "K[" not in repr(verdict)
         assert "np." not in repr(verdict).replace("`np.stack`", "")
-
-
-@each_exercise
-def test_the_texts_of_each_mistake(exercise: Exercise) -> None:
-    """A phrase that begins within a sentence, and a question or a hint that ends one."""
-    for mistake in exercise.mistakes:
+        # A phrase that begins within a sentence, and a question or a hint that ends one.
         assert not mistake.says.endswith((".", "?"))
         assert mistake.ask.endswith((".", "?", ")"))
         assert not re.search(r"\s\s|\n", mistake.says + mistake.ask)
@@ -121,7 +121,8 @@ def test_two_mistakes_are_called_more_than_one(exercise: Exercise) -> None:
     """Unless a single one gives the very same numbers (one hides the other, say): then that one."""
     steps = list(exercise.steps)
     alone = {}  # numbers of each mistake by itself
-    for a, b in itertools.permutations([m for m in exercise.mistakes if not m.alone], 2):
+    pairs = itertools.permutations([m for m in exercise.mistakes if not m.alone], 2)
+    for a, b in itertools.islice(pairs, None, None, 1 if NIGHTLY else 3):
         if steps.index(a.step) >= steps.index(b.step):
             continue
         pair = exercise.model(a, b)
@@ -159,48 +160,27 @@ PROJECT = EXERCISES["pinhole.project"]
 right = PROJECT.model()
 
 
-def without_dist(points, K):
-    return right(points, K)
+def in_place(points, K, dist=None, columns=slice(None)):
+    answer = right(points, K, dist)[:, columns]
+    points /= points[:, 2:]
+    return answer
 
 
-def raises_late(points, K, dist=None):
-    if dist is not None:
-        return right(points, K) @ np.eye(7)
-    return right(points, K)
+def beyond(rest):
+    """A function that is right in the core; with a lens, it is what is given."""
 
+    def function(points, K, dist=None):
+        return right(points, K) if dist is None else rest(points, K)
 
-def exits(points, K, dist=None):
-    raise SystemExit(3)
-
-
-def recursion(points, K, dist=None):
-    return recursion(points, K, dist)
+    return function
 
 
 def unready(points, K, dist=None):
     raise NotImplementedError
 
 
-def in_place(points, K, dist=None):
-    answer = right(points, K, dist)
-    points /= points[:, 2:]
-    return answer
-
-
-def in_place_and_swapped(points, K, dist=None):
-    answer = right(points, K, dist)[:, ::-1]
-    points[:] = 0
-    return answer
-
-
-def half_none(points, K, dist=None):
-    return right(points, K) if dist is None else None
-
-
-def half_unready(points, K, dist=None):
-    if dist is not None:
-        raise NotImplementedError
-    return right(points, K)
+def recursion(points, K, dist=None):
+    return recursion(points, K, dist)
 
 
 def core_only(points, K, dist=None):
@@ -210,10 +190,6 @@ def core_only(points, K, dist=None):
 def core_in_place(points, K, dist=None):
     points /= points[:, 2:]
     return right(points, K)
-
-
-def none_in_one_core_case(points, K, dist=None):
-    return right(points, K) if len(points) == 1 else None
 
 
 CORE_RIGHT = (
@@ -236,18 +212,22 @@ IN_PLACE_CORE = (
         (lambda points, K, dist=None: None, "not attempted", "returns None"),
         (unready, "not attempted", "not attempted yet"),
         (42, "not attempted", "not a function"),
-        (without_dist, "raised", "positional arguments"),
-        (raises_late, "raised", "return right(points, K) @ np.eye(7)"),
-        (exits, "raised", "SystemExit"),
+        (lambda points, K: points, "raised", "positional arguments"),
+        (beyond(lambda points, K: points @ np.eye(7)), "raised", "points @ np.eye(7)"),
+        (lambda points, K, dist=None: sys.exit(3), "raised", "SystemExit"),
         (recursion, "raised", "RecursionError"),
-        (half_none, "core right", CORE_RIGHT),
-        (half_unready, "core right", CORE_RIGHT),
+        (beyond(lambda points, K: None), "core right", CORE_RIGHT),
+        (beyond(unready), "core right", CORE_RIGHT),
         (core_only, "core right", CORE_RIGHT),
         (lambda *args: core_only(*args).T, "wrong", TRANSPOSED_CORE),
         (core_in_place, "wrong", IN_PLACE_CORE),
         (lambda *args: core_only(*args)[:, ::-1].T, "wrong", "more than one mistake"),
         (lambda *args: np.c_[core_only(*args), [0] * len(args[0])], "wrong", "wrong shape"),
-        (none_in_one_core_case, "wrong", "is a `return` missing"),
+        (
+            lambda *args: core_only(*args) if len(args[0]) == 1 else None,
+            "wrong",
+            "`return` missing",
+        ),
         (lambda *args: "pixels", "wrong", "a str"),
         (lambda *args: {1: 2}, "wrong", "a dict"),
         (lambda *args: [[1, 2], [3]], "wrong", "a list"),
@@ -258,7 +238,7 @@ IN_PLACE_CORE = (
         (lambda *args: np.full((len(args[0]), 2), np.nan), "wrong", "not right yet"),
         (lambda *args: right(*args).T, "wrong", "transposed"),
         (in_place, "wrong", "changes the array it is given. The numbers are right"),
-        (in_place_and_swapped, "wrong", "more than one mistake"),
+        (partial(in_place, columns=[1, 0]), "wrong", "more than one mistake"),
         (lambda *args: right(*args)[:, ::-1].T, "wrong", "more than one mistake"),
     ],
 )
@@ -269,40 +249,18 @@ def test_odd_functions(function, kind: str, says: str) -> None:
     assert verdict._repr_html_().count("<div") >= 1
 
 
-def bent(x, y, dist):
-    k1, k2, p1, p2, k3 = dist if dist is not None else [0] * 5
-    r2 = x * x + y * y
-    radial = 1 + k1 * r2 + k2 * r2 * r2 + k3 * r2**3
-    return (
-        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-    )
-
-
 def by_opencv(points, K, dist=None):
     return cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, dist)[0][:, 0]
 
 
-def in_lists(points, K, dist=None):
-    pairs = [bent(X / Z, Y / Z, dist) for X, Y, Z in points.tolist()]
-    return [[K[0][0] * x + K[0][2], K[1][1] * y + K[1][2]] for x, y in pairs]
-
-
 def homogeneous(points, K, dist=None):
-    rays = points / points[:, 2:3]
-    rays[:, 0], rays[:, 1] = bent(rays[:, 0].copy(), rays[:, 1].copy(), dist)
+    rays = np.c_[by_opencv(points, np.eye(3), dist), np.ones(len(points))]
     uvw = np.einsum("ij,nj->ni", K, rays)
     return uvw[:, :2] / uvw[:, 2:]
 
 
 def in_float32(points, K, dist=None):
-    return np.array(in_lists(points.astype(np.float32), K, dist), np.float32)
-
-
-@pytest.mark.parametrize("function", [by_opencv, in_lists, homogeneous, in_float32])
-def test_right_projects_in_other_styles_are_not_blamed(function) -> None:
-    verdict = PROJECT.judge(function)
-    assert verdict.kind == "right", verdict
+    return right(points.astype(np.float32), K, dist).astype(np.float32)
 
 
 def undistorted_by_opencv(pixels, depth, K, dist=None):
@@ -328,9 +286,13 @@ def twenty_rounds_of_division(pixels, depth, K, dist=None):
     return out
 
 
-@pytest.mark.parametrize("function", [undistorted_by_opencv, twenty_rounds_of_division])
-def test_right_deprojects_in_other_styles_are_not_blamed(function) -> None:
-    verdict = EXERCISES["pinhole.deproject"].judge(function)
+@pytest.mark.parametrize(
+    "function",
+    [by_opencv, homogeneous, in_float32, undistorted_by_opencv, twenty_rounds_of_division],
+)
+def test_right_answers_in_other_styles_are_not_blamed(function) -> None:
+    projects = "points" in signature(function).parameters
+    verdict = EXERCISES["pinhole.project" if projects else "pinhole.deproject"].judge(function)
     assert verdict.kind == "right", verdict
 
 
@@ -345,18 +307,13 @@ def test_the_counterexample_of_the_design() -> None:
     assert "expected (573.019, 140.749), yours (573.138, 140.658) px" in verdict.lines[0]
 
 
-def test_a_core_mistake_is_told_with_its_own_count() -> None:
+def test_a_mistake_in_the_core_is_told_with_its_own_count() -> None:
     verdict = PROJECT.judge(lambda points, K, dist=None: right(points * [1, -1, 1], K))
-    assert verdict.headline == (
-        "project: your y axis points up. 0 of the 4 cases without distortion agree. "
-        "(`dist` can wait.)"
-    )
+    agree = "0 of the 4 cases without distortion agree."
+    assert verdict.headline == f"project: your y axis points up. {agree} (`dist` can wait.)"
     assert verdict.named == "y_up"
-
-
-def test_an_unknown_mistake_in_the_core_is_counted_there_too() -> None:
     verdict = PROJECT.judge(lambda points, K, dist=None: right(points, K) + 0.1)
-    assert "not right yet. 0 of the 4 cases without distortion agree." in verdict.headline
+    assert f"not right yet. {agree}" in verdict.headline
     assert verdict.named is None
 
 
@@ -479,7 +436,7 @@ def test_no_message_tells_a_number() -> None:
 @pytest.mark.parametrize("given", ["", "two", "nan", "inf", None, "20 00", [2000], "3,000"])
 def test_what_is_no_number_is_not_an_attempt(given) -> None:
     assert PITCH.answer(given).kind == "not attempted"
-    assert progress.read() == {}
+    assert progress.read_attempts() == {}
 
 
 def test_a_letter_that_is_none() -> None:
@@ -506,7 +463,7 @@ def test_the_widget_commits() -> None:
     field.value = "C"
     button.click()
     assert "right" in said.value
-    kinds = [a["kind"] for a in progress.read()["pinhole.half_size"]]
+    kinds = [a["kind"] for a in progress.read_attempts()["pinhole.half_size"]]
     assert kinds == ["wrong", "right"]
 
 
@@ -538,7 +495,7 @@ def test_evidence_of_the_core() -> None:
 def test_a_damaged_record_is_set_aside(own_results: Path) -> None:
     (own_results / "progress.json").write_text("{half", encoding="utf-8")
     PITCH.answer(2000)
-    assert len(progress.read()["pinhole.pitch"]) == 1
+    assert len(progress.read_attempts()["pinhole.pitch"]) == 1
     assert (own_results / "progress.damaged.json").read_text(encoding="utf-8") == "{half"
 
 

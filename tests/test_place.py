@@ -1,4 +1,4 @@
-"""Placing things before a camera, recorded sets, and that a session comes back as it was."""
+"""Placing and lighting things before a camera, recorded sets, and that a session comes back."""
 
 from __future__ import annotations
 
@@ -108,6 +108,96 @@ def test_an_unknown_thing_is_refused():
         ):
             camera.place("mug", 0.4)
         assert camera.scene is before
+
+
+def test_simulated_frames_differ_and_do_not_share_memory():
+    with SimulatedCamera() as camera:
+        one, two = camera.frames(2)
+        assert (one.number, two.number) == (1, 2)
+        for mine, other in ((one.depth, two.depth), *zip(one.infrared, two.infrared, strict=True)):
+            assert 0.2 < np.mean(mine != other) < 1.0
+        np.testing.assert_array_equal(one.color, two.color)
+        for image in (one.depth, one.color, *one.infrared):
+            image[:] = 0
+        assert two.depth.any()
+        assert camera.frame().color.any()
+        assert camera.frame().number == 4
+
+
+def test_another_unit_of_depth_rounds_the_same_images():
+    with SimulatedCamera() as camera:
+        fine, coarse = [], []
+        for depth_scale_m, frames in ((1e-4, fine), (1e-3, coarse)):
+            sentence = camera.set(depth_scale_m=depth_scale_m)
+            assert f"depth unit {1000 * depth_scale_m:g} mm" in sentence
+            frames.extend(camera.frames(2))
+            assert frames[0].depth_scale_m == depth_scale_m
+    for one, other in zip(fine, coarse, strict=True):
+        np.testing.assert_array_equal(one.infrared[0], other.infrared[0])
+        far = one.depth == 0  # 65,535 counts of 0.1 mm end before the wall does
+        assert np.abs(one.depth[~far] / 10 - other.depth[~far]).max() <= 0.55
+
+
+def test_light_and_exposure_reach_the_images():
+    with SimulatedCamera() as camera:
+        automatic = camera.frame()
+        assert "Ambient infrared 0.01, exposure 1 ms" in camera.set(exposure=1.0)
+        dark = camera.frame().infrared[0].mean()
+        camera.set(exposure=2.0)
+        longer = camera.frame().infrared[0].mean()
+        assert "Ambient infrared 0.2, exposure 1 ms" in camera.set(ambient=0.2, exposure=1.0)
+        bright = camera.frame().infrared[0].mean()
+        assert "exposure auto" in camera.set(ambient=0.01, exposure="auto")
+        np.testing.assert_array_equal(camera.frame().infrared, automatic.infrared)
+    black = 4.0
+    assert longer - black == pytest.approx(2 * (dark - black), rel=0.1)
+    assert bright > dark + 3.0  # grey levels
+
+
+def test_lock_freezes_the_exposure_of_the_nearer_scene():
+    with SimulatedCamera() as camera:
+        camera.place("wall", 0.5)
+        camera.lock()
+        camera.place("wall", 1.0)
+        locked = np.percentile(camera.frame().infrared[0], 98)
+        camera.set(exposure="auto")
+        automatic = np.percentile(camera.frame().infrared[0], 98)
+    assert locked < 0.5 * automatic  # light falls off with the square of the distance
+
+
+BAD_SETTINGS = [
+    ({"ambient": -0.1}, "^ambient: got -0.1"),
+    ({"exposure": 0}, "^exposure: got 0"),
+    ({"exposure": "long"}, "^exposure: got 'long'"),
+    ({"depth_scale_m": 0.0}, "^depth_scale_m: got 0.0, want metres per count"),
+    ({"depth_scale_m": 1}, "^depth_scale_m: got 1, want metres per count"),
+    ({"depth_scale_m": float("nan")}, "^depth_scale_m: got nan"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), BAD_SETTINGS)
+def test_a_bad_setting_is_refused_and_changes_nothing(change, message):
+    with SimulatedCamera() as camera:
+        before = camera.frame().infrared
+        with pytest.raises(ValueError, match=message):
+            camera.set(**change)
+        camera.set()
+        np.testing.assert_array_equal(camera.frame().infrared, before)
+        assert camera.depth_scale_m == 0.001
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        *BAD_SETTINGS,
+        ({"device": "D999"}, "D999"),
+        ({"seed": -1}, "^seed: got -1"),
+        ({"seed": 1.5}, "^seed: got 1.5"),
+    ],
+)
+def test_simulated_refuses(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        SimulatedCamera(**arguments)
 
 
 # --- recorded sets ---

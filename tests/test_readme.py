@@ -53,6 +53,13 @@ def test_each_subcommand_is_in_the_readme(capsys: pytest.CaptureFixture[str]) ->
         assert f"coursekit {command}" in TEXT, command
 
 
+def test_the_places_to_change_something_exist() -> None:
+    table = TEXT.partition("| you want to change |")[2].partition("\n\n")[0]
+    places = re.findall(r"`([\w/]+\.(?:py|toml))`", table)
+    assert len(places) > 20
+    assert [place for place in places if not (ROOT / "coursekit" / place).is_file()] == []
+
+
 def test_functions_that_it_names_exist() -> None:
     names = {m for line in CODE for m in re.findall(r"\bck\.([\w.]+)\(", line)}
     assert {"open_camera", "progress"} <= names

@@ -42,13 +42,13 @@ def page_of(path, pages):
 
 
 def code_cell(output, **metadata):
-    return {
-        "id": "here",
-        "cell_type": "code",
-        "metadata": metadata,
-        "source": "# An answer\nshow()",
-        "outputs": [output],
-    }
+    cell = {"id": "here", "cell_type": "code", "source": "# An answer\nshow()"}
+    return cell | {"metadata": metadata, "outputs": [output]}
+
+
+def figure_cell(text):
+    data = {"image/png": PNG, "text/plain": text}
+    return code_cell({"output_type": "display_data", "data": data, "metadata": {}})
 
 
 def a_page():
@@ -237,16 +237,12 @@ def test_every_figure_is_there_and_has_a_text_alternative(files, pages):
 
 @pytest.mark.parametrize("text", ["", "<Figure size 800x400 with 1 Axes>"])
 def test_a_figure_without_a_text_alternative_is_refused(text):
-    data = {"image/png": PNG, "text/plain": text}
-    cell = code_cell({"output_type": "display_data", "data": data, "metadata": {}})
     with pytest.raises(ValueError, match=r"01_pinhole: cell here: .* no text alternative"):
-        build_site.cell_html(a_page(), cell)
+        build_site.cell_html(a_page(), figure_cell(text))
 
 
 def test_the_text_of_a_figure_stands_in_for_its_alt():
-    data = {"image/png": PNG, "text/plain": ['A "line" & ', "a dot"]}
-    cell = code_cell({"output_type": "display_data", "data": data, "metadata": {}})
-    html = build_site.cell_html(a_page(), cell)
+    html = build_site.cell_html(a_page(), figure_cell(['A "line" & ', "a dot"]))
     assert 'alt="A &quot;line&quot; &amp; a dot"' in html
     assert 'width="800" height="400"' in html
 
@@ -282,17 +278,19 @@ def test_every_checkpoint_keeps_its_explanation_closed(pages):
     assert not any(details.has_attr("open") for details in closed)
 
 
-def test_a_progress_bar_is_left_out_and_text_is_escaped():
-    outputs = (
+@pytest.mark.parametrize(
+    ("output", "html"),
+    [
         ({"data": {"text/plain": "  0%|          | 0/26 [00:00<?, ?image/s]"}}, ""),
         ({"data": {"text/plain": "a < b"}}, '<pre class="output">a &lt; b</pre>\n'),
         ({"text": ["a", " & b\n"]}, '<pre class="output">a &amp; b</pre>\n'),
         ({"data": {"text/html": "<b>x</b>", "text/plain": "x"}}, "<b>x</b>"),
-    )
-    for output, html in outputs:
-        said = build_site.output_html(a_page(), {}, {"output_type": "display_data", **output})
-        assert html in said
-        assert bool(html) == bool(said)
+    ],
+)
+def test_a_progress_bar_is_left_out_and_text_is_escaped(output, html):
+    said = build_site.output_html(a_page(), {}, {"output_type": "display_data", **output})
+    assert html in said
+    assert bool(html) == bool(said)
 
 
 def test_a_stored_error_is_refused():

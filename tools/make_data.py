@@ -26,7 +26,7 @@ from coursekit.cameras.capture import session_card
 from coursekit.cameras.simulated import SimulatedCamera
 from coursekit.hand_eye.poses import Mount
 from coursekit.intrinsics import diagnose
-from coursekit.intrinsics.diagnosis import STORED
+from coursekit.intrinsics.diagnosis import POWER_FILE
 from coursekit.results import Quantity, write_bytes, write_json
 from coursekit.simulation.arm_sessions import SIMULATED, rendered_session
 from coursekit.simulation.corner_sessions import Effects, corner_session, view_poses
@@ -132,7 +132,7 @@ def diagnosis_power() -> None:
         "Measured by tools/make_data.py: sessions of 28 views simulated at the corners, 0.08 px of "
         "noise, the course's ChArUco board, the factory lens of the simulated D435's colour camera."
     )
-    write_json(STORED, {"origin": origin, "causes": causes})
+    write_json(POWER_FILE, {"origin": origin, "causes": causes})
 
 
 def times_named(cause: str, size: float, seeds: Sequence[int] = POWER_SEEDS) -> int:

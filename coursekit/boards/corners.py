@@ -71,6 +71,32 @@ class _Window:
     dy: Patch
 
 
+def steps(pixels: Floats, ids: NDArray[np.intp], board: Board) -> Floats:
+    """Pixels per square along the board's x and y at each corner, (N, 2, 2), as columns.
+
+    Half the way from the neighbour before to the neighbour after; where one is missing, the
+    derivative of the homography through all corners.
+    """
+    columns, rows = board.corners
+    grid = np.full((rows + 2, columns + 2, 2), np.nan)
+    row, column = np.divmod(ids, columns)
+    grid[row + 1, column + 1] = pixels
+    along_x = (grid[row + 1, column + 2] - grid[row + 1, column]) / 2
+    along_y = (grid[row + 2, column + 1] - grid[row, column + 1]) / 2
+    central = np.stack([along_x, along_y], axis=-1)
+    return np.where(np.isnan(central), _homography_steps(pixels, ids, board), central)
+
+
+def _homography_steps(pixels: Floats, ids: NDArray[np.intp], board: Board) -> Floats:
+    plane = board.points[ids][:, :2] / board.square_m
+    H, _ = cv2.findHomography(plane, pixels)
+    if H is None:
+        raise ValueError("pixels: the corners lie on one line")
+    p = np.c_[plane, np.ones(len(plane))] @ H.T
+    uv = p[:, :2] / p[:, 2:]
+    return (H[:2, :2] - uv[:, :, None] * H[2, :2]) / p[:, 2, None, None]
+
+
 def refine_corners(
     grey: Grey, start: Floats, steps: Floats, ids: NDArray[np.intp], board: Board
 ) -> tuple[Floats, Floats]:
@@ -334,7 +360,7 @@ def blur_covariance(
 ) -> Floats | None:
     """The blur's covariance (2, 2), px^2, the pixel's own width included.
 
-    pixels (N, 2): corners, px. steps (N, 2, 2): px per square, as `find.steps` gives them. None
+    pixels (N, 2): corners, px. steps (N, 2, 2): px per square, as `steps` gives them. None
     where fewer than four edges in either direction can be measured.
     """
     sets = [_fit(_edges(grey, pixels, ids, steps, board, axis)) for axis in (0, 1)]

@@ -20,9 +20,9 @@ import numpy as np
 
 from coursekit.arrays import Grey, NDArray
 from coursekit.boards.board import Board, BoardNotFound, Detection, Detections, Skipped
-from coursekit.boards.corners import blur_covariance, refine_corners
+from coursekit.boards.corners import blur_covariance, refine_corners, steps
 from coursekit.boards.explain import explain
-from coursekit.boards.find import find_corners, steps
+from coursekit.boards.find import find_corners
 from coursekit.checks import want
 
 FEWEST_CORNERS = 6

@@ -56,32 +56,6 @@ def shrunk(grey: Grey, longest_px: int) -> Grey:
     return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def steps(pixels: Floats, ids: NDArray[np.intp], board: Board) -> Floats:
-    """Pixels per square along the board's x and y at each corner, (N, 2, 2), as columns.
-
-    Half the way from the neighbour before to the neighbour after; where one is missing, the
-    derivative of the homography through all corners.
-    """
-    columns, rows = board.corners
-    grid = np.full((rows + 2, columns + 2, 2), np.nan)
-    row, column = np.divmod(ids, columns)
-    grid[row + 1, column + 1] = pixels
-    along_x = (grid[row + 1, column + 2] - grid[row + 1, column]) / 2
-    along_y = (grid[row + 2, column + 1] - grid[row, column + 1]) / 2
-    central = np.stack([along_x, along_y], axis=-1)
-    return np.where(np.isnan(central), _homography_steps(pixels, ids, board), central)
-
-
-def _homography_steps(pixels: Floats, ids: NDArray[np.intp], board: Board) -> Floats:
-    plane = board.points[ids][:, :2] / board.square_m
-    H, _ = cv2.findHomography(plane, pixels)
-    if H is None:
-        raise ValueError("pixels: the corners lie on one line")
-    p = np.c_[plane, np.ones(len(plane))] @ H.T
-    uv = p[:, :2] / p[:, 2:]
-    return (H[:2, :2] - uv[:, :, None] * H[2, :2]) / p[:, 2, None, None]
-
-
 def _charuco(grey: Grey, board: Board) -> Corners | None:
     settings = cv2.aruco.CharucoParameters()
     settings.minMarkers = 1  # of the two beside a corner: half as many corners again in a blur

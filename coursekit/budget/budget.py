@@ -33,7 +33,7 @@ from coursekit.arrays import Bools, Floats, Interval
 from coursekit.budget.view import AXES, GraspAxes, View
 from coursekit.checks import want
 from coursekit.geometry import cross_matrix
-from coursekit.results import Kind
+from coursekit.results import ErrorKind
 from coursekit.stereo.law import depth_slope
 from coursekit.words import html_list, html_table, wrapped
 
@@ -118,7 +118,7 @@ class ErrorTerm:
     """
 
     name: str
-    kind: Kind
+    kind: ErrorKind
     low: float
     high: float
     along: Along
@@ -129,7 +129,7 @@ class ErrorTerm:
     floor: float = 0.0
 
     def __post_init__(self) -> None:
-        checks.choice("kind", self.kind, get_args(Kind))
+        checks.choice("kind", self.kind, get_args(ErrorKind))
         checks.choice("along", self.along, get_args(Along))
         for name, pair in (("low, high", (self.low, self.high)), ("stated_m", self.stated_m)):
             ordered = pair is None or 0 <= pair[0] <= pair[1] < math.inf

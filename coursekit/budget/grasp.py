@@ -13,7 +13,7 @@ from coursekit.arrays import Floats
 from coursekit.budget.budget import ErrorBudget
 from coursekit.budget.view import AXES
 from coursekit.checks import want
-from coursekit.results import Kind
+from coursekit.results import ErrorKind
 
 DRAWS = 20_000  # of a probability that is redrawn while dragging: a standard error of 0.4 % at most
 DISTANCES = 200
@@ -129,7 +129,7 @@ class Gain:
     """
 
     name: str
-    kind: Kind
+    kind: ErrorKind
     factor: float
     worst_case_m: float
     noise_m: float

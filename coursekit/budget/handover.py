@@ -23,7 +23,7 @@ from coursekit.budget.view import GRIPPER_DOWN, View
 from coursekit.checks import want
 from coursekit.geometry import Intrinsics
 from coursekit.intrinsics.derivatives import PARAMETERS, scaled_root
-from coursekit.results import Covariance, Kind, Quantity, Result
+from coursekit.results import Covariance, ErrorKind, Quantity, Result
 from coursekit.specifications import DATA, device
 from coursekit.stereo.law import depth_slope
 
@@ -59,7 +59,7 @@ def lesson_terms(stated: bool) -> tuple[ErrorTerm, ...]:
     """The lesson's six rows; stated: with its own rounded millimetres at the object."""
 
     def row(
-        name: str, kind: Kind, low: float, high: float, along: Along, *at_mm: float
+        name: str, kind: ErrorKind, low: float, high: float, along: Along, *at_mm: float
     ) -> ErrorTerm:
         at = (1e-3 * at_mm[0], 1e-3 * at_mm[-1]) if stated else None
         return ErrorTerm(name, kind, low, high, along, LESSON, stated_m=at)

@@ -15,7 +15,7 @@ from coursekit.cameras.simulated import SimulatedCamera
 __all__ = ["Camera", "CameraError", "Frame", "Frames", "conventions", "open_camera", "place"]
 
 VARIABLE = "COURSEKIT_CAMERA"
-WANTED = (
+CAMERA_NAMES = (
     'want "auto", "simulated", a serial number, the path of a .db3 or .bag recording, '
     "or a folder of them"
 )
@@ -51,7 +51,7 @@ def open_camera(which: str | os.PathLike[str] = "auto", infrared: bool = False) 
         path = Path(which)
         if path.suffix or "/" in which or os.sep in which or (which and path.is_dir()):
             return _recording(path)
-    raise ValueError(f"{argument}: got {which!r}, {WANTED}")
+    raise ValueError(f"{argument}: got {which!r}, {CAMERA_NAMES}")
 
 
 def _connected_or_simulated(infrared: bool) -> Camera:

@@ -67,7 +67,11 @@ PROPOSED_SHARE = 0.75  # of a ChArUco board's corners; a checkerboard must be se
 AWAY = ("right", "bottom right", "bottom", "bottom left", "left", "top left", "top", "top right")
 
 
-WANTED, SEEN, TAKEN = (0, 159, 230), (115, 158, 0), (233, 180, 86)  # Okabe-Ito, in BGR
+WANTED_COLOR, SEEN_COLOR, TAKEN_COLOR = (
+    (0, 159, 230),
+    (115, 158, 0),
+    (233, 180, 86),
+)  # Okabe-Ito, in BGR
 LINE_PX = 2
 
 
@@ -663,13 +667,13 @@ def draw(sight: Sight, ring: Floats) -> Image:
     """The image in colour (H, W, 3), BGR, with the corners that were taken, those that are seen,
     and the outline (4, 2) px that is wanted."""
     canvas = np.repeat(sight.image[..., None], 3, axis=2)
-    dots = [(view, 1, TAKEN, -1) for view in sight.taken]
-    dots += [(sight.detection, 4, SEEN, LINE_PX)] if sight.detection is not None else []
+    dots = [(view, 1, TAKEN_COLOR, -1) for view in sight.taken]
+    dots += [(sight.detection, 4, SEEN_COLOR, LINE_PX)] if sight.detection is not None else []
     for view, radius_px, color, width in dots:
         for u, v in np.rint(view.pixels).astype(int).tolist():
             cv2.circle(canvas, (u, v), radius_px, color, width)
     if np.isfinite(ring).all():
-        cv2.polylines(canvas, [np.rint(ring).astype(np.int32)], True, WANTED, LINE_PX)
+        cv2.polylines(canvas, [np.rint(ring).astype(np.int32)], True, WANTED_COLOR, LINE_PX)
     return canvas
 
 

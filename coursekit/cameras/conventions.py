@@ -17,7 +17,7 @@ from coursekit.cameras.recording import realsense_intrinsics
 from coursekit.geometry import Intrinsics
 from coursekit.specifications import DATA
 
-STORED = DATA / "vendor_models.json"
+VENDOR_MODELS = DATA / "vendor_models.json"
 POINTS = 2000
 # A 640x480 camera with fx != fy, p1 != p2 and every coefficient in use, so that nothing cancels.
 CAMERA = Intrinsics(640, 480, 612.5, 598.0, 331.4, 236.8)
@@ -87,7 +87,7 @@ def _largest(difference: Floats) -> float:
 
 def stored() -> list[Agreement]:
     """The table in data/vendor_models.json; a test measures it again."""
-    return [Agreement(**row) for row in results.read_json(STORED)["rows"]]
+    return [Agreement(**row) for row in results.read_json(VENDOR_MODELS)["rows"]]
 
 
 def table() -> tuple[list[Agreement], str]:
@@ -101,4 +101,4 @@ def table() -> tuple[list[Agreement], str]:
 def store() -> None:
     """Measure and write data/vendor_models.json (called by tools/make_data.py)."""
     note = f"coursekit.cameras.conventions, pyrealsense2 {version('pyrealsense2')}"
-    results.write_json(STORED, {"source": note, "rows": [asdict(row) for row in measure()]})
+    results.write_json(VENDOR_MODELS, {"source": note, "rows": [asdict(row) for row in measure()]})

@@ -46,7 +46,7 @@ class SimulatedCamera(Camera):
     """A stand-in for one unit of a real camera model, looking at a block on a table.
 
     Two infrared images are rendered and exposed, and depth is what a block matcher makes of them:
-    see `simulation.active_stereo`. The colour image has no noise unless it shows a board (see
+    see `simulation.rig`. The colour image has no noise unless it shows a board (see
     `show_board`), and its true lens is not quite the one that the camera reports.
 
     device: a name of data/devices.toml. seed: names the unit, so its hidden truth, its pattern of

@@ -1,259 +1,403 @@
-"""What the residuals of a hand-eye fit speak for: likelihood-ratio tests between causes.
+"""What the residuals of a hand-eye fit speak for: wrong squares, a late clock, and three more.
 
-Residuals are taken as normal with the covariance of what careful people have: the board pose's, as
-the image says, and the arm's (`arm.fk_covariance`), most of which all poses share. Since arms
-differ the latter is multiplied by a factor that is fitted anew under each suspicion, so that no
-cause passes for a bad arm or the other way round. Each suspected cause adds columns: a scale, a
-delay, a board that moved between two poses, one pose that is off, the zero of a joint. The one that
-explains most is taken in, the fit repeated, and the others are tested once more.
+A session under examination is a set of pairs of arm pose and board pose (`PosePairs`). X and Y are
+fitted to them so that outliers hardly bend them; the residual of a pair is the twist (omega, v)
+from where the camera should see the board to where it does, rad and m, in the camera's axes.
+
+The model that is searched for causes is that fit, of pairs with the causes found so far put right
+(`MendedPairs`). Its residuals are taken as normal with the covariance of what careful people have:
+the board pose's, as the image says, and the arm's (`arm.fk_covariance`), most of which all poses
+share. Since arms differ the latter is multiplied by a factor that is fitted anew under each
+hypothesis. Hypotheses are a scale, a delay, a board that moved between two poses, one pose that is
+off, and the zero of a joint; the search is that of `coursekit.causes`.
 
 Where the joint angles are not known, the arm's error is taken as independent from pose to pose, of
 the size that the residuals have.
-
-Source: Seber and Lee, "Linear Regression Analysis" (2003), chapters 3 and 4.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
-from coursekit.arm import Arm, ArmErrors, fk_covariance
+from coursekit.arm import Arm, ArmErrors, fk_covariance, pose_difference
 from coursekit.arrays import Floats, NDArray
-from coursekit.geometry import turned
-from coursekit.hand_eye.pairs import LEAST_M, LEAST_RAD, MEDIAN_3D, Fit, Pairs, robust_fit
-from coursekit.hand_eye.poses import by_arm_twist
+from coursekit.causes import CauseSearch, Hypothesis, Tested, likelihood_ratios, search
+from coursekit.geometry import invert_transform, turned
+from coursekit.hand_eye.closed_form import motions, rotation_by_axes
+from coursekit.hand_eye.poses import (
+    Mount,
+    by_arm_twist,
+    by_X_and_Y,
+    camera_board,
+    carrier_stand,
+    mean_pose,
+)
+from coursekit.hand_eye.session import HandEyeSession
 
-SCALE, LATE, SLIP, OUTLIER, OFFSET = (
-    "wrong_square_size", "late_time_stamps", "slipping_board", "outlier_pose", "arm_error",
-)  # fmt: skip
-SMOOTH = (SCALE, LATE, OFFSET)  # one number that acts on all pairs
+ROBUST_STEPS, SMALLEST_STEP = 15, 1e-7  # m and rad
+CAUCHY_WIDTH = 3.0  # times the usual residual: from there on a pair counts less and less
+# Below this nobody's residuals are, whatever the arm: 0.005 deg and 0.02 mm.
+LEAST_RAD, LEAST_M = np.radians(0.005), 2e-5
+MEDIAN_3D = 1.5382  # the median length of three independent standard normal numbers
+SCALE, LATE, ARM_ERROR = "wrong_square_size", "late_time_stamps", "arm_error"
+SLIP, OUTLIER = "slipping_board", "outlier_pose"
+SMOOTH = (SCALE, LATE, ARM_ERROR)  # one number that acts on all pairs
 # At most 2 % of healthy sessions may get a finding, and five kinds of test at this level make
 # 0.05 %; the rest is for arms whose errors are not quite normal.
-LEVEL = 1e-4
+_CHANCE_LEVEL = 1e-4
 # What careful people have, and no finding: squares measured with a ruler, a driver's own delay, a
 # board that settles, a pose in which the arm still swings, a zero that a jig sets.
-NORMAL = {SCALE: 0.01, LATE: 5e-3, SLIP: 2e-3, OUTLIER: 5e-3, OFFSET: np.radians(0.6)}
+NORMAL_SIZE = {SCALE: 0.01, LATE: 5e-3, SLIP: 2e-3, OUTLIER: 5e-3, ARM_ERROR: np.radians(0.6)}
 NORMAL_TURN_RAD = {SLIP: np.radians(0.5), OUTLIER: np.radians(1.0)}
 # Times as much, where no image says how well it knows its board pose, or no joint angles what the
 # arm may be wrong by: some pose of a healthy one is off by four times the typical error.
-ROUGH = 3.0
+ROUGH_DATA = 3.0
 # Times the typical residual, where no joint angles say which errors poses share: those of the arm
 # then look like a slip of their own size.
-SLIP_OVER_USUAL, OUTLIER_OVER_USUAL = 2.5, 4.0
+OVER_USUAL = {SLIP: 2.5, OUTLIER: 4.0}
 SCALE_WITHOUT_JOINTS = 0.02  # the arm's own shared errors can imitate that much of a scale
 CAMERA_RAD, CAMERA_M = np.radians(0.02), 1e-4  # what imperfect intrinsics do to a board's pose
 # Of the arm's stated errors; one that is worse than the last is itself a mistake. A larger factor
 # also drowns two bad poses, and lets a nonsensical scale explain what is left.
-FACTORS = (1.0, 1.5, 2.0, 3.0, 5.0)
+ARM_FACTORS = (1.0, 1.5, 2.0, 3.0, 5.0)
 FACTORS_WITHOUT_JOINTS = (0.1, 0.2, 0.35, 0.6, 1.0, 1.5)  # of the residuals as they are
-SHORTEST = 3  # pairs on either side of a slip
-FEWEST = 6  # pairs below which one odd pose cannot be told from 24 odd numbers
-MOST_ROUNDS = 8
+SHORTEST_SEGMENT = 3  # pairs on either side of a slip
+FEWEST_PAIRS = 6  # below which one odd pose cannot be told from 24 odd numbers
+MOST_OUTLIERS = 4  # at most one pair in as many
+
+
+# --- pairs and their fit ---
+
+
+@dataclass(frozen=True, eq=False)
+class PosePairs:
+    """Arm poses and board poses that belong together.
+
+    T_base_gripper, T_camera_board (n, 4, 4), m. image (n, 6, 6): the covariance of the latter's
+    twist as the image says, rad and m, 0 where only poses are known. segment (n,): pairs with the
+    same number share one Y. view, row (n,): the numbers of the image and of the arm pose in the
+    session.
+    """
+
+    T_base_gripper: Floats
+    T_camera_board: Floats
+    mount: Mount
+    image: Floats
+    segment: NDArray[np.intp]
+    view: NDArray[np.intp]
+    row: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, session: HandEyeSession) -> PosePairs:
+        """The pairs of a session as they were given."""
+        n = len(session)
+        image = np.zeros((n, 6, 6))
+        if session.board_poses:
+            image = np.stack([pose.covariance for pose in session.board_poses])
+        arm, seen, order = session.T_base_gripper, session.T_camera_board.copy(), np.arange(n)
+        return cls(arm, seen, session.mount, image, np.zeros(n, int), order, order)
+
+    def __len__(self) -> int:
+        return len(self.view)
+
+    def keep(self, mask: NDArray[np.bool_]) -> PosePairs:
+        """The pairs where mask (n,) is true."""
+        arm, seen, image = (a[mask] for a in (self.T_base_gripper, self.T_camera_board, self.image))
+        segment, view, row = (a[mask] for a in (self.segment, self.view, self.row))
+        return PosePairs(arm, seen, self.mount, image, segment, view, row)
+
+    @cached_property
+    def fit(self) -> Fit:
+        """`robust_fit` of these pairs."""
+        return robust_fit(self)
+
+    def scaled(self, factor: float) -> PosePairs:
+        """With a board that is `factor` times as large as it was taken for."""
+        T, image = self.T_camera_board.copy(), self.image.copy()
+        T[:, :3, 3] *= factor
+        image[:, 3:] *= factor
+        image[:, :, 3:] *= factor
+        return replace(self, T_camera_board=T, image=image)
+
+    def arm_scaled(self, factor: float) -> PosePairs:
+        """With the arm's translations times `factor`."""
+        T = self.T_base_gripper.copy()
+        T[:, :3, 3] *= factor
+        return replace(self, T_base_gripper=T)
+
+    def exchanged(self) -> PosePairs:
+        """Camera and arm with their parts exchanged, as eye-to-hand: C Y^-1 = X^-1 M."""
+        M = carrier_stand(self.T_base_gripper, self.mount)
+        return replace(
+            self, T_base_gripper=self.T_camera_board, T_camera_board=M, mount="eye_to_hand"
+        )
+
+    def shifted(self, by: int) -> PosePairs:
+        """Each image with the arm pose `by` places further on; the ends fall off."""
+        n = len(self)
+        images = np.arange(max(0, -by), min(n, n - by))
+        moved = self.keep(np.isin(np.arange(n), images))
+        rows = images + by
+        return replace(moved, T_base_gripper=self.T_base_gripper[rows], row=self.row[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """X and Y of pairs, and what they leave over.
+
+    X (4, 4), Y (k, 4, 4) of the segments, m. twists (n, 6): the residuals, rad and m.
+    """
+
+    pairs: PosePairs
+    X: Floats
+    Y: Floats
+    twists: Floats
+
+    @property
+    def turn_rad(self) -> float:
+        """The rotation of a typical residual: the median over the pairs."""
+        return float(np.median(np.linalg.norm(self.twists[:, :3], axis=1)))
+
+    @property
+    def shift_m(self) -> float:
+        """The displacement of a typical residual: the median over the pairs."""
+        return float(np.median(np.linalg.norm(self.twists[:, 3:], axis=1)))
+
+    @property
+    def columns(self) -> Floats:
+        """d predicted twists / d twists of X and of each segment's Y: (n, 6, 6 + 6 k)."""
+        columns = np.zeros((len(self.pairs), 6, 6 + 6 * len(self.Y)))
+        for number, Y in enumerate(self.Y):
+            mine = self.pairs.segment == number
+            both = by_X_and_Y(self.pairs.T_base_gripper[mine], self.X, Y, self.pairs.mount)
+            columns[mine, :, :6] = both[..., :6]
+            columns[mine, :, 6 + 6 * number : 12 + 6 * number] = both[..., 6:]
+        return columns
+
+    def says(self) -> str:
+        """Its typical residual in words: "0.4 mm and 0.05 deg"."""
+        return f"{1e3 * self.shift_m:.1f} mm and {np.degrees(self.turn_rad):.2f} deg"
+
+    def better_than(self, other: Fit) -> float:
+        """How many times smaller the residuals are, the geometric mean of rotation and position."""
+        turn = (other.turn_rad + LEAST_RAD) / (self.turn_rad + LEAST_RAD)
+        shift = (other.shift_m + LEAST_M) / (self.shift_m + LEAST_M)
+        return float(np.sqrt(turn * shift))
+
+
+def robust_fit(pairs: PosePairs, start: tuple[Floats, Floats] | None = None) -> Fit:
+    """X and Y by least squares with Cauchy weights, from the closed form or a start (X, Y).
+
+    start: X (4, 4) and Y (k, 4, 4) of the segments. The residuals' usual size, one for rotations
+    and one for positions, comes from their medians. Poses that leave X free get some X.
+    Source: Holland and Welsch, "Robust regression using iteratively reweighted least squares"
+    (1977).
+    """
+    X, Y = start or _closed_form(pairs)
+    fit = _at(pairs, X, Y)
+    for _ in range(ROBUST_STEPS):
+        usual = [fit.turn_rad / MEDIAN_3D + LEAST_RAD, fit.shift_m / MEDIAN_3D + LEAST_M]
+        scale = 1.0 / np.repeat(usual, 3)
+        far = ((fit.twists * scale) ** 2).sum(axis=1) / 6.0
+        weight = scale / np.sqrt(1.0 + far / CAUCHY_WIDTH**2)[:, None]
+        rows, right = fit.columns * weight[..., None], fit.twists * weight
+        step = np.linalg.lstsq(rows.reshape(right.size, -1), right.ravel(), rcond=1e-10)[0]
+        X, Y = turned(fit.X, step[:6]), turned(fit.Y, step[6:].reshape(-1, 6))
+        fit = _at(pairs, X, Y)
+        if np.abs(step).max() < SMALLEST_STEP:
+            break
+    return fit
+
+
+def _at(pairs: PosePairs, X: Floats, Y: Floats) -> Fit:
+    predicted = camera_board(pairs.T_base_gripper, X, Y[pairs.segment], pairs.mount)
+    return Fit(pairs, X, Y, pose_difference(predicted, pairs.T_camera_board))
+
+
+def _closed_form(pairs: PosePairs) -> tuple[Floats, Floats]:
+    """X from the pairs of the largest segment, Y of each segment."""
+    largest = np.bincount(pairs.segment).argmax()
+    main = pairs.keep(pairs.segment == largest)
+    A, B = motions(main.T_base_gripper, main.T_camera_board, pairs.mount)
+    X = np.eye(4)
+    X[:3, :3] = rotation_by_axes(A, B)
+    rows = (A[:, :3, :3] - np.eye(3)).reshape(-1, 3)
+    right = (B[:, :3, 3] @ X[:3, :3].T - A[:, :3, 3]).ravel()
+    X[:3, 3] = np.linalg.lstsq(rows, right, rcond=1e-10)[0]
+    stand = invert_transform(carrier_stand(pairs.T_base_gripper, pairs.mount))
+    places = stand @ X @ pairs.T_camera_board
+    Y = [mean_pose(places[pairs.segment == k]) for k in range(pairs.segment.max() + 1)]
+    return X, np.stack(Y)
+
+
+# --- causes ---
 
 
 @dataclass(frozen=True, eq=False)
 class Arms:
     """What is known of the arm besides its poses: for all pairs of the session.
 
-    velocity (n, 6): the gripper's twist rate when the image was taken, rad/s and m/s, None where
-    unknown. q (n, 6): joint angles, rad, None where unknown.
+    arm: whose joint angles they are; errors: what is normal for it, `ArmErrors` unless given.
+    q (n, 6): joint angles, rad, None where unknown. velocity (n, 6): the gripper's twist rate when
+    the image was taken, rad/s and m/s, None where unknown.
     """
 
-    arm: Arm | None = None
+    arm: Arm
     errors: ArmErrors | None = None
     q: Floats | None = None
     velocity: Floats | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class Tested:
-    """A cause: twice the log-likelihood that it gains, log p, its coefficients, their covariance.
+class MendedPairs:
+    """Pairs with the causes found so far put right, and their fit.
 
-    at: the first pair after a slip, the odd pair, or the joint.
+    scale: of the board; delay_s: of the arm poses; offsets (6,): of the joints, rad. smooth: cause
+    and place of those that are fitted along from now on. odd: how many pairs were left out.
     """
-
-    cause: str
-    gain: float
-    log_p: float
-    size: Floats
-    covariance: Floats
-    at: int = 0
-
-    @property
-    def p_value(self) -> float:
-        """How often chance alone would explain as much."""
-        return float(np.exp(self.log_p))
-
-    @property
-    def sigma(self) -> float:
-        """Of the first coefficient."""
-        return float(np.sqrt(self.covariance[0, 0]))
-
-
-@dataclass(eq=False)
-class Accepted:
-    """A cause that was taken in, with the fits before and after."""
-
-    test: Tested
-    view: int  # the pair's number in the session, where `at` is a pair
-    before: Fit
-    after: Fit
-
-
-@dataclass(eq=False)
-class Search:
-    """Where the search is: the pairs with the causes found so far put right, and their fit."""
 
     arms: Arms
     fit: Fit
     scale: float = 1.0
     delay_s: float = 0.0
     offsets: Floats = field(default_factory=lambda: np.zeros(6))
-    accepted: list[Accepted] = field(default_factory=list)
-    refused: set[tuple[str, int]] = field(default_factory=set)
+    smooth: tuple[tuple[str, int], ...] = ()
+    odd: int = 0
 
+    def hypotheses(self) -> list[Hypothesis]:
+        """What is suspected and was not put right."""
+        if len(self.fit.pairs) < FEWEST_PAIRS:
+            return []
+        return [h for h in self._suspects if (h.cause, h.at) not in self.smooth]
 
-def search(pairs: Pairs, arms: Arms, fit: Fit) -> Search:
-    """The causes that the residuals of pairs speak for, the strongest first."""
-    state = Search(arms, fit)
-    for _ in range(MOST_ROUNDS):
-        if len(state.fit.pairs) < FEWEST:
-            break
-        best = min(_significant(state), key=lambda test: test.log_p, default=None)
-        if best is None:
-            break
-        after = _with(state, best)
-        if best.cause in SMOOTH and after.fit.better_than(state.fit) <= 1.0:
-            state.refused.add((best.cause, best.at))  # linear, it fitted; in full it does not
+    def tested(self, hypotheses: Sequence[Hypothesis]) -> list[Tested]:
+        """Each hypothesis with its most likely size of the arm's errors."""
+        residuals = self.fit.twists.ravel()
+        along = [h.columns for h in self._suspects if (h.cause, h.at) in self.smooth]
+        columns = np.hstack([self.fit.columns.reshape(len(residuals), -1), *along])
+        return likelihood_ratios(residuals, columns, hypotheses, self.covariances())
+
+    def matters(self, test: Tested) -> bool:
+        """Whether the effect is larger than what careful people have."""
+        normal, n = NORMAL_SIZE[test.cause], len(self.fit.pairs)
+        if test.cause in SMOOTH:
+            if test.cause == SCALE and self.arms.q is None:
+                normal = SCALE_WITHOUT_JOINTS
+            return bool(abs(test.coefficients[0]) > normal)
+        if test.cause == OUTLIER and self.odd >= (n + self.odd) // MOST_OUTLIERS:
+            return False
+        rough = 1.0 if self.fit.pairs.image.any() and self.arms.q is not None else ROUGH_DATA
+        usual = OVER_USUAL[test.cause] if self.arms.q is None else 0.0
+        least_turn = max(rough * NORMAL_TURN_RAD[test.cause], usual * self.fit.turn_rad)
+        least_shift = max(rough * normal, usual * self.fit.shift_m)
+        turn, shift = turn_and_shift(test)
+        return shift > least_shift or turn > least_turn
+
+    def accept(self, test: Tested) -> MendedPairs | None:
+        """The data put right for a cause and fitted again; None where that does not fit better."""
+        pairs, arms, at, size = self.fit.pairs, self.arms, test.at, float(test.coefficients[0])
+        if test.cause == OUTLIER:
+            left = pairs.keep(np.arange(len(pairs)) != at)
+            return replace(self, fit=left.fit, odd=self.odd + 1)
+        if test.cause == SLIP:
+            segment, Y = pairs.segment.copy(), self.fit.Y
+            moved = turned(Y[segment[at]], test.coefficients)
+            segment[(segment == segment[at]) & (np.arange(len(pairs)) >= at)] = len(Y)
+            start = (self.fit.X, np.concatenate([Y, moved[None]]))
+            return replace(self, fit=robust_fit(replace(pairs, segment=segment), start))
+        after = replace(self, smooth=(*self.smooth, (test.cause, at)))
+        if test.cause == SCALE:
+            pairs = pairs.scaled(1.0 + size)
+            after = replace(after, scale=self.scale * (1.0 + size))
+        elif test.cause == LATE:
+            assert arms.velocity is not None
+            pairs = _moved(pairs, -size * arms.velocity[pairs.row])
+            after = replace(after, delay_s=self.delay_s + size)
         else:
-            state = after
-    return state
+            change = size * np.eye(6)[at]
+            pairs = _moved(pairs, self._jacobian() @ change)
+            after = replace(after, offsets=self.offsets + change)
+        fit = pairs.fit
+        return replace(after, fit=fit) if fit.better_than(self.fit) > 1.0 else None
+
+    @cached_property
+    def _suspects(self) -> list[Hypothesis]:
+        """Every hypothesis, the smooth ones that were accepted too."""
+        fit, pairs, n = self.fit, self.fit.pairs, len(self.fit.pairs)
+        scale = np.zeros((n, 6))
+        scale[:, 3:] = -pairs.T_camera_board[:, :3, 3]
+        found = [Hypothesis(SCALE, scale.reshape(-1, 1))]
+        if self.arms.velocity is not None:
+            moved = np.einsum("nij,nj->ni", self._by_arm, self.arms.velocity[pairs.row])
+            found.append(Hypothesis(LATE, -moved.reshape(-1, 1)))
+        if self.arms.q is not None:
+            turned_joint = (self._by_arm @ self._jacobian()).reshape(6 * n, 6)
+            # The first joint turns the base and the last the gripper: so do X and Y.
+            for joint in range(1, 5):
+                column = turned_joint[:, joint : joint + 1]
+                found.append(Hypothesis(ARM_ERROR, column, joint, tried=4))
+        rows = np.arange(6 * n).reshape(n, 6)
+        found += [Hypothesis(OUTLIER, np.eye(6), i, rows[i], tried=n) for i in range(n)]
+        by_Y = fit.columns[:, :, 6:].reshape(n, 6, -1, 6).sum(axis=2)
+        later = {}
+        for at in range(1, n):
+            mine = np.flatnonzero(pairs.segment == pairs.segment[at])
+            after = mine[mine >= at]
+            if SHORTEST_SEGMENT <= len(after) <= len(mine) - SHORTEST_SEGMENT:
+                later[at] = after
+        for at, after in later.items():
+            columns = by_Y[after].reshape(-1, 6)
+            found.append(Hypothesis(SLIP, columns, at, rows[after].ravel(), tried=len(later)))
+        return found
+
+    def covariances(self) -> Iterator[Floats]:
+        """Of all residuals, (6 n, 6 n), for each factor of the arm's errors."""
+        pairs, n = self.fit.pairs, len(self.fit.pairs)
+        image = _diagonal(pairs.image + np.diag(np.repeat([CAMERA_RAD**2, CAMERA_M**2], 3)))
+        if self.arms.q is not None:
+            errors = fk_covariance(self._joints(), self.arms.errors, self.arms.arm)
+            shared = (self._by_arm @ errors.shared * errors.sigma).reshape(6 * n, -1)
+            each = self._by_arm @ errors.each @ np.swapaxes(self._by_arm, 1, 2)
+            arm = shared @ shared.T + _diagonal(each)
+        else:
+            turn = max(self.fit.turn_rad / MEDIAN_3D, LEAST_RAD)
+            shift = max(self.fit.shift_m / MEDIAN_3D, LEAST_M)
+            arm = np.diag(np.tile(np.repeat([turn**2, shift**2], 3), n))
+        for factor in FACTORS_WITHOUT_JOINTS if self.arms.q is None else ARM_FACTORS:
+            yield image + factor**2 * arm
+
+    @cached_property
+    def _by_arm(self) -> Floats:
+        """d predicted twist / d the gripper's twist in the base's axes, (n, 6, 6)."""
+        pairs = self.fit.pairs
+        by_arm = np.empty((len(pairs), 6, 6))
+        for number, Y in enumerate(self.fit.Y):
+            mine = pairs.segment == number
+            by_arm[mine] = by_arm_twist(pairs.T_base_gripper[mine], self.fit.X, Y, pairs.mount)
+        return by_arm
+
+    def _joints(self) -> Floats:
+        """The joint angles (n, 6) with their zeros put right, rad."""
+        assert self.arms.q is not None
+        return self.arms.q[self.fit.pairs.row] + self.offsets
+
+    def _jacobian(self) -> Floats:
+        return self.arms.arm.jacobian(self._joints())
 
 
-def _significant(state: Search) -> Iterator[Tested]:
-    done = {(one.test.cause, one.test.at) for one in state.accepted if one.test.cause in SMOOTH}
-    odd = sum(one.test.cause == OUTLIER for one in state.accepted)
-    for test in _tests(state, without=done | state.refused):
-        if test.log_p > np.log(LEVEL) or not _matters(state, test):
-            continue
-        if test.cause == OUTLIER and odd >= (len(state.fit.pairs) + odd) // 4:
-            continue
-        yield test
+def search_pairs(pairs: PosePairs, arms: Arms) -> CauseSearch[MendedPairs]:
+    """The causes that the residuals of pairs speak for, the strongest first."""
+    return search(MendedPairs(arms, pairs.fit), _CHANCE_LEVEL)
 
 
-def _matters(state: Search, test: Tested) -> bool:
-    """Whether the effect is larger than what careful people have."""
-    normal = NORMAL[test.cause]
-    if test.cause == SCALE and state.arms.q is None:
-        normal = SCALE_WITHOUT_JOINTS
-    if test.cause in (SLIP, OUTLIER):
-        turn, shift = np.linalg.norm(test.size[:3]), np.linalg.norm(test.size[3:])
-        least_turn, least_shift = _least(state, test.cause)
-        return bool(shift > least_shift or turn > least_turn)
-    return bool(abs(test.size[0]) > normal)
-
-
-def _least(state: Search, cause: str) -> tuple[float, float]:
-    """The smallest turn (rad) and shift (m) of a slip or an odd pose that matters."""
-    known = state.fit.pairs.image.any() and state.arms.q is not None
-    rough = 1.0 if known else ROUGH
-    turn, shift = rough * NORMAL_TURN_RAD[cause], rough * NORMAL[cause]
-    if state.arms.q is None:
-        usual = SLIP_OVER_USUAL if cause == SLIP else OUTLIER_OVER_USUAL
-        turn = max(turn, usual * state.fit.turn_rad)
-        shift = max(shift, usual * state.fit.shift_m)
-    return turn, shift
-
-
-# --- the tests ---
-
-
-def _tests(state: Search, without: set[tuple[str, int]]) -> list[Tested]:
-    """All suspected causes, each with its most likely size of the arm's errors.
-
-    without: those that were accepted or refused. Smooth ones that were accepted are fitted along.
-    """
-    fit = state.fit
-    every = list(_suspects(state))
-    accepted = {(one.test.cause, one.test.at) for one in state.accepted}
-    along = [block for cause, at, _, block in every if cause in SMOOTH and (cause, at) in accepted]
-    suspects = [suspect for suspect in every if suspect[:2] not in without]
-    best = np.full(len(suspects), np.inf)
-    found: list[tuple[Floats, Floats]] = [(np.zeros(0), np.zeros(0))] * len(suspects)
-    plain = np.inf
-    residuals = fit.twists.ravel()
-    columns = np.hstack([fit.columns.reshape(len(residuals), -1), *along])
-    for covariance in _covariances(state):
-        information, log_det = _inverse(covariance)
-        weighted = information @ columns
-        normal = np.linalg.pinv(columns.T @ weighted, rcond=1e-12, hermitian=True)
-        P = information - weighted @ normal @ weighted.T
-        seen = P @ residuals
-        deviance = log_det + float(residuals @ seen)
-        plain = min(plain, deviance)
-        for number, (_, _, rows, block) in enumerate(suspects):
-            inner = block.T @ P[np.ix_(rows, rows)] @ block
-            right = block.T @ seen[rows]
-            inverse: Floats = np.asarray(
-                np.linalg.pinv(inner, rcond=1e-9, hermitian=True), np.float64
-            )
-            size: Floats = np.asarray(inverse @ right, np.float64)
-            now = deviance - float(right @ size)
-            if now < best[number]:
-                best[number], found[number] = now, (size, inverse)
-    counts = {c: sum(s[0] == c for s in suspects) for c in NORMAL}
-    return [
-        _tested(cause, at, plain - best[i], *found[i], counts[cause])
-        for i, (cause, at, _, _) in enumerate(suspects)
-    ]
-
-
-def _tested(
-    cause: str, at: int, gain: float, size: Floats, covariance: Floats, tried: int
-) -> Tested:
-    log_p = _log_chi2_tail(max(gain, 0.0), len(size)) + float(np.log(tried))
-    return Tested(cause, gain, min(log_p, 0.0), size, covariance, at)
-
-
-def _log_chi2_tail(x: float, dof: int) -> float:
-    """log P(chi2 > x), beyond what a float holds by its asymptote: causes compete out there."""
-    from scipy.special import chdtrc, gammaln
-
-    tail = float(chdtrc(dof, x))
-    if tail > 1e-290:
-        return float(np.log(tail))
-    return float((dof / 2 - 1) * np.log(x / 2) - x / 2 - gammaln(dof / 2))
-
-
-def _inverse(covariance: Floats) -> tuple[Floats, float]:
-    root = np.linalg.cholesky(covariance)
-    inverse = np.linalg.inv(root)
-    return inverse.T @ inverse, 2.0 * float(np.log(np.diag(root)).sum())
-
-
-def _covariances(state: Search) -> Iterator[Floats]:
-    """Of all residuals, (6 n, 6 n), for each factor of the arm's errors."""
-    pairs, n = state.fit.pairs, len(state.fit.pairs)
-    camera = pairs.image + np.diag(np.repeat([CAMERA_RAD**2, CAMERA_M**2], 3))
-    by_arm = _by_arm(state.fit)
-    if state.arms.q is not None and state.arms.arm is not None:
-        q = state.arms.q[pairs.row] + state.offsets
-        errors = fk_covariance(q, state.arms.errors, state.arms.arm)
-        shared = by_arm @ errors.shared * errors.sigma
-        shared = shared.reshape(6 * n, -1)
-        arm = shared @ shared.T + _diagonal(by_arm @ errors.each @ np.swapaxes(by_arm, 1, 2))
-        factors: tuple[float, ...] = FACTORS
-    else:
-        turn = max(state.fit.turn_rad / MEDIAN_3D, LEAST_RAD)
-        shift = max(state.fit.shift_m / MEDIAN_3D, LEAST_M)
-        arm = np.diag(np.tile(np.repeat([turn**2, shift**2], 3), n))
-        factors = FACTORS_WITHOUT_JOINTS
-    image = _diagonal(camera)
-    for factor in factors:
-        yield image + factor**2 * arm
+def turn_and_shift(test: Tested) -> tuple[float, float]:
+    """How far a slip or an odd pose turns, rad, and moves, m."""
+    turn, shift = np.linalg.norm(test.coefficients.reshape(2, 3), axis=1)
+    return float(turn), float(shift)
 
 
 def _diagonal(blocks: Floats) -> Floats:
@@ -264,79 +408,6 @@ def _diagonal(blocks: Floats) -> Floats:
     return full.reshape(6 * n, 6 * n)
 
 
-def _by_arm(fit: Fit) -> Floats:
-    """d predicted twist / d the gripper's twist in the base's axes, (n, 6, 6)."""
-    by_arm = np.empty((len(fit.pairs), 6, 6))
-    for number, Y in enumerate(fit.Y):
-        mine = fit.pairs.segment == number
-        poses = fit.pairs.T_base_gripper[mine]
-        by_arm[mine] = by_arm_twist(poses, fit.X, Y, fit.pairs.mount)
-    return by_arm
-
-
-def _suspects(state: Search) -> Iterator[tuple[str, int, NDArray[np.intp], Floats]]:
-    """Cause, place, rows of the residuals (r,) and columns (r, k) of each suspicion."""
-    fit, n = state.fit, len(state.fit.pairs)
-    every = np.arange(6 * n)
-    scale = np.zeros((n, 6))
-    scale[:, 3:] = -fit.pairs.T_camera_board[:, :3, 3]
-    yield SCALE, 0, every, scale.reshape(-1, 1)
-    by_arm = _by_arm(fit)
-    if state.arms.velocity is not None:
-        moved = np.einsum("nij,nj->ni", by_arm, state.arms.velocity[fit.pairs.row])
-        yield LATE, 0, every, -moved.reshape(-1, 1)
-    if state.arms.q is not None and state.arms.arm is not None:
-        q = state.arms.q[fit.pairs.row] + state.offsets
-        turned_joint = (by_arm @ state.arms.arm.jacobian(q)).reshape(6 * n, 6)
-        for joint in range(1, 5):  # the first turns the base and the last the gripper: so do X, Y
-            yield OFFSET, joint, every, turned_joint[:, joint : joint + 1]
-    for view in range(n):
-        yield OUTLIER, view, np.arange(6 * view, 6 * view + 6), np.eye(6)
-    by_Y = fit.columns[:, :, 6:].reshape(n, 6, -1, 6).sum(axis=2)
-    for at in range(1, n):
-        mine = np.flatnonzero(fit.pairs.segment == fit.pairs.segment[at])
-        before, after = mine[mine < at], mine[mine >= at]
-        if len(before) >= SHORTEST and len(after) >= SHORTEST:
-            rows = (6 * after[:, None] + np.arange(6)).ravel()
-            yield SLIP, at, rows, by_Y[after].reshape(-1, 6)
-
-
-# --- taking a cause in ---
-
-
-def _with(state: Search, test: Tested) -> Search:
-    """The search with the data put right for a cause, and fitted again."""
-    before, pairs = state.fit, state.fit.pairs
-    view = int(pairs.view[test.at]) if test.cause in (SLIP, OUTLIER) else test.at
-    size = float(test.size[0])
-    new, start = replace(state), None
-    if test.cause == SCALE:
-        new.scale = state.scale * (1.0 + size)
-        pairs = pairs.scaled(1.0 + size)
-    elif test.cause == OUTLIER:
-        pairs = pairs.keep(np.arange(len(pairs)) != test.at)
-    elif test.cause == SLIP:
-        segment = pairs.segment.copy()
-        moved = turned(before.Y[segment[test.at]], test.size)
-        segment[(segment == segment[test.at]) & (np.arange(len(pairs)) >= test.at)] = len(before.Y)
-        start = (before.X, np.concatenate([before.Y, moved[None]]))
-        pairs = replace(pairs, segment=segment)
-    elif test.cause == LATE:
-        assert state.arms.velocity is not None
-        new.delay_s = state.delay_s + size
-        pairs = _moved(pairs, -size * state.arms.velocity[pairs.row])
-    else:
-        change = size * np.eye(6)[test.at]
-        assert state.arms.arm is not None
-        assert state.arms.q is not None
-        q = state.arms.q[pairs.row] + state.offsets
-        new.offsets = state.offsets + change
-        pairs = _moved(pairs, state.arms.arm.jacobian(q) @ change)
-    new.fit = robust_fit(pairs, start)
-    new.accepted = [*state.accepted, Accepted(test, view, before, new.fit)]
-    return new
-
-
-def _moved(pairs: Pairs, twists: Floats) -> Pairs:
+def _moved(pairs: PosePairs, twists: Floats) -> PosePairs:
     """The pairs with their arm poses moved by twists (n, 6)."""
     return replace(pairs, T_base_gripper=turned(pairs.T_base_gripper, twists))

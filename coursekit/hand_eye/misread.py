@@ -1,9 +1,11 @@
 """Ways of reading arm poses wrongly, undone: which of them would make a session consistent.
 
-Positions alone fix the mount but for the camera's rotation (`places_agree`), so a mistake in the
+Positions alone fix the mount but for the camera's rotation (`places`), so a mistake in the
 rotations shows against positions that agree. Degrees that were taken as radians can be undone: an
 angle that became a matrix is known up to 360 "degrees" that are 2 pi, so there are a few dozen
-candidates for each, and only the true ones fit the camera in all poses.
+candidates for each, and only the true ones fit the camera in all poses. Where a session fits with
+one side inverted, three mistakes obey the same equation (`candidates`); what they imply tells them
+apart.
 """
 
 from __future__ import annotations
@@ -16,18 +18,42 @@ from scipy.spatial.transform import Rotation
 
 from coursekit.arrays import Floats
 from coursekit.geometry import invert_transform
-from coursekit.hand_eye.pairs import LEAST_M, Fit, Pairs, robust_fit
-from coursekit.hand_eye.poses import nearest_rotation
+from coursekit.hand_eye.causes import LEAST_M, Fit, PosePairs
+from coursekit.hand_eye.poses import Mount, nearest_rotation
+from coursekit.hand_eye.session import HandEyeSession
 
 PER_RADIAN = 180.0 / np.pi
-MENDED, KEPT = 0.5, 1.5  # most displacement left over: of pairs put right, of rotations alone
-GOLD = 4.0  # times smaller residuals: by chance a wrong reading is better by 1.5 at most
+# The most displacement that a reading may leave over, in units of that as given. Pairs put right
+# must mend positions too; of rotations alone only the rotations.
+PAIRING_SHIFT_LEFT, ROTATION_SHIFT_LEFT = 0.5, 1.5
+CLEARLY_BETTER = 4.0  # times smaller residuals: by chance a wrong reading is better by 1.5 at most
 PLACES_AGREE = 0.15  # of the positions' spread; in degrees taken as radians positions stay true
-LIKE_CHANCE = np.radians(80.0)  # median angle of a decoding; random rotations are 130 deg apart
-CLOSE = np.radians(85.0)  # noise in degrees taken as radians grows 57-fold
-WITNESSES = 6  # poses that a candidate must pass before all of them are asked
-FIRST_TRIES = 8  # poses that candidates are taken from
+CHANCE_TURN_RAD = np.radians(80.0)  # median of a decoding; random rotations are 130 deg apart
+MATCH_RAD = np.radians(85.0)  # noise in degrees taken as radians grows 57-fold
+CHECKED_POSES = 6  # that a candidate must pass before all of them are asked
+SOURCE_POSES = 8  # that candidates are taken from
+CHECKED_CANDIDATES = 50  # the best of them, with all poses
+ROTATION_VECTORS = "rotation vectors"
 EULER = ("xyz", "XYZ")  # about fixed axes (roll, pitch, yaw), and about the body's own
+CAMERA_ON_GRIPPER_M = 0.4  # no wrist carries a camera farther away
+BOARD_IN_GRIPPER_M = 0.5  # nor a board
+ROOM_M = 4.0  # from the base to a camera or a board that it works with
+WIDE_DEG = 50.0  # from the optical axis to the board's middle, where no intrinsics are known
+BEYOND_IMAGE = 1.1  # of the field of view: a board's middle may be a little outside
+SHARE_IN_VIEW = 0.9  # of the images in which the board must be in view
+# Mistakes that obey the same equation: those behind a session that fits with its arm poses
+# inverted, and those that cancel in one that fits as declared. The second exchanges X and Y and
+# inverts the board's poses, the third belongs to the other mount.
+INVERTED = (
+    "arm poses inverted (T_gripper_base given)",
+    "board poses inverted (T_board_camera given)",
+    "another mount than declared ({other})",
+)
+DECLARED = (
+    "as declared",
+    "arm poses and board poses both inverted",
+    "arm poses inverted and another mount than declared ({other})",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,23 +66,20 @@ class Reading:
 
 
 def better_readings(
-    given: Fit, readings: Iterator[tuple[str, str, Pairs]], most_shift: float
+    given: Fit, readings: Iterator[tuple[str, str, PosePairs]], most_shift: float
 ) -> list[Reading]:
-    """The readings that make residuals GOLD times smaller, the best first.
+    """The readings that make residuals clearly smaller, the best first.
 
     most_shift: how large the displacements left over may be, in units of those as given; a wrong
     reading may mend the rotations alone.
     """
-    fits = [Reading(name, says, robust_fit(pairs)) for name, says, pairs in readings]
-    good = [
-        reading for reading in fits
-        if reading.fit.better_than(given) > GOLD
-        and reading.fit.shift_m < most_shift * given.shift_m + LEAST_M
-    ]  # fmt: skip
-    return sorted(good, key=lambda reading: -reading.fit.better_than(given))
+    fits = [Reading(name, says, pairs.fit) for name, says, pairs in readings]
+    left = most_shift * given.shift_m + LEAST_M
+    clear = [r for r in fits if r.fit.better_than(given) > CLEARLY_BETTER and r.fit.shift_m < left]
+    return sorted(clear, key=lambda reading: -reading.fit.better_than(given))
 
 
-def other_pairing(pairs: Pairs) -> Iterator[tuple[str, str, Pairs]]:
+def other_pairing(pairs: PosePairs) -> Iterator[tuple[str, str, PosePairs]]:
     """Images with the arm pose of another image, and either one inverted."""
     for by in (-1, 1, -2, 2):
         if len(pairs) - abs(by) >= 4:
@@ -67,7 +90,7 @@ def other_pairing(pairs: Pairs) -> Iterator[tuple[str, str, Pairs]]:
     yield "inverted", "one side inverted", replace(pairs, T_base_gripper=T)
 
 
-def other_rotations(pairs: Pairs) -> Iterator[tuple[str, str, Pairs]]:
+def other_rotations(pairs: PosePairs) -> Iterator[tuple[str, str, PosePairs]]:
     """The arm's rotations as another convention would have them; the positions stay."""
     R = Rotation.from_matrix(pairs.T_base_gripper[:, :3, :3])
     quaternions = R.as_quat()
@@ -81,21 +104,15 @@ def other_rotations(pairs: Pairs) -> Iterator[tuple[str, str, Pairs]]:
     for name, places in (("(w, x, y, z)", [1, 2, 3, 0]), ("(x, y, z, w)", [3, 0, 1, 2])):
         words = f"the quaternions read as {name}"
         yield "quaternion", words, with_rotations(pairs, Rotation.from_quat(quaternions[:, places]))
-    yield (
-        "transposed",
-        "the rotations transposed, the positions left",
-        with_rotations(pairs, R.inv()),
-    )
+    words = "the rotations transposed, the positions left"
+    yield "transposed", words, with_rotations(pairs, R.inv())
     for said, meant in (("xyz", "XYZ"), ("XYZ", "xyz"), ("xyz", "zyx"), ("zyx", "xyz")):
         other = Rotation.from_euler(meant, R.as_euler(said))
-        yield (
-            "euler",
-            f"Euler angles of order {said!r} read as {meant!r}",
-            with_rotations(pairs, other),
-        )
+        words = f"Euler angles of order {said!r} read as {meant!r}"
+        yield "euler", words, with_rotations(pairs, other)
 
 
-def with_rotations(pairs: Pairs, R: Rotation) -> Pairs:
+def with_rotations(pairs: PosePairs, R: Rotation) -> PosePairs:
     """The same pairs with other rotations of the arm."""
     T = pairs.T_base_gripper.copy()
     T[:, :3, :3] = R.as_matrix()
@@ -123,7 +140,7 @@ class Places:
         return self.gap_m < PLACES_AGREE * self.spread_m
 
 
-def places(pairs: Pairs) -> Places:
+def places(pairs: PosePairs) -> Places:
     """The arm's positions against the camera's view of the board.
 
     Eye-in-hand: the gripper's origin has a fixed place p in the camera's frame, so in the board's
@@ -161,38 +178,34 @@ def undo_degrees(given: Fit, expected: Floats) -> Reading | None:
 
     expected (n, 3, 3): from `places`. Tried are rotation vectors and two orders of Euler angles.
     """
-    for kind in ("rotation vectors", *EULER):
+    for kind in (ROTATION_VECTORS, *EULER):
         R = _decoded(given.pairs.T_base_gripper[:, :3, :3], expected, kind)
         if R is None:
             continue
-        fit = robust_fit(with_rotations(given.pairs, R))
+        fit = with_rotations(given.pairs, R).fit
         # `expected` leans on positions alone; with X and Y a pose's neighbours are told apart
-        R = _nearest(given.pairs.T_base_gripper[:, :3, :3], _arm_rotations(fit), kind)
-        fit = robust_fit(with_rotations(given.pairs, R))
-        if fit.better_than(given) > GOLD:
+        M = fit.X @ fit.pairs.T_camera_board @ invert_transform(fit.Y[0])
+        arm = M if fit.pairs.mount == "eye_to_hand" else invert_transform(M)
+        R = _nearest(given.pairs.T_base_gripper[:, :3, :3], arm[:, :3, :3], kind)
+        fit = with_rotations(given.pairs, R).fit
+        if fit.better_than(given) > CLEARLY_BETTER:
             what = kind if kind not in EULER else f"Euler angles ({kind})"
             return Reading("degrees", f"the {what} read as degrees", fit)
     return None
 
 
-def _arm_rotations(fit: Fit) -> Floats:
-    """The arm's rotations (n, 3, 3) that the camera, X and Y imply."""
-    M = fit.X @ fit.pairs.T_camera_board @ invert_transform(fit.Y[0])
-    return (M if fit.pairs.mount == "eye_to_hand" else invert_transform(M))[:, :3, :3]
-
-
 def _decoded(given: Floats, expected: Floats, kind: str) -> Rotation | None:
     """The true rotations (n,) behind given ones (n, 3, 3), or None."""
-    order = np.linspace(0, len(given) - 1, min(FIRST_TRIES, len(given))).astype(int)
+    order = np.linspace(0, len(given) - 1, min(SOURCE_POSES, len(given))).astype(int)
     for first in order:
         constant = expected[first].T @ _candidates(given[first], kind)
-        others = [i for i in range(len(given)) if i != first][:WITNESSES]
+        others = [i for i in range(len(given)) if i != first][:CHECKED_POSES]
         near = np.zeros(len(constant), int)
         for i in others:
-            near += _misses(given[i], expected[i] @ constant, kind) < CLOSE
-        for number in np.argsort(-near, kind="stable")[:50]:
+            near += _misses(given[i], expected[i] @ constant, kind) < MATCH_RAD
+        for number in np.argsort(-near, kind="stable")[:CHECKED_CANDIDATES]:
             wrong = _misses(given, expected @ constant[number], kind)
-            if np.median(wrong) < LIKE_CHANCE:
+            if np.median(wrong) < CHANCE_TURN_RAD:
                 return _nearest(given, expected @ constant[number], kind)
     return None
 
@@ -201,13 +214,12 @@ def _candidates(R: Floats, kind: str) -> Floats:
     """All rotations (m, 3, 3) whose angles in degrees, taken as radians, give R (3, 3)."""
     angles = _angles(R, kind)
     turns = 2 * np.pi * np.arange(-29, 30)
-    if kind == "rotation vectors":
+    if kind == ROTATION_VECTORS:
         length = np.linalg.norm(angles)
         axis = angles / length if length > 0 else np.array([0.0, 0.0, 1.0])
         sizes = (length + turns) / PER_RADIAN
-        return np.asarray(
-            Rotation.from_rotvec(sizes[np.abs(sizes) <= np.pi, None] * axis).as_matrix()
-        )
+        sizes = sizes[np.abs(sizes) <= np.pi, None]
+        return np.asarray(Rotation.from_rotvec(sizes * axis).as_matrix())
     limits = np.array([np.pi, np.pi / 2, np.pi]) * PER_RADIAN  # as drivers give them
     found = []
     for same in _same_rotation(angles):
@@ -226,46 +238,36 @@ def _same_rotation(angles: Floats) -> list[Floats]:
 
 def _angles(R: Floats, kind: str) -> Floats:
     turn = Rotation.from_matrix(R)
-    return turn.as_rotvec() if kind == "rotation vectors" else turn.as_euler(kind)
-
-
-def _as_radians(R: Floats, kind: str) -> Rotation:
-    """What becomes of rotations (m, 3, 3) whose angles in degrees are taken as radians."""
-    angles = PER_RADIAN * _angles(R, kind)
-    if kind == "rotation vectors":
-        return Rotation.from_rotvec(angles)
-    return Rotation.from_euler(kind, angles)
+    return turn.as_rotvec() if kind == ROTATION_VECTORS else turn.as_euler(kind)
 
 
 def _misses(given: Floats, R: Floats, kind: str) -> Floats:
-    """Angles (m,), rad, between given (3, 3) or (m, 3, 3) and what R (m, 3, 3) would become."""
-    return np.asarray((_as_radians(R, kind).inv() * Rotation.from_matrix(given)).magnitude())
+    """Angles (m,), rad, between given rotations and what R (m, 3, 3) in degrees would become.
+
+    given (3, 3) or (m, 3, 3): what was made of angles in degrees that were taken as radians.
+    """
+    angles = PER_RADIAN * _angles(R, kind)
+    vectors = kind == ROTATION_VECTORS
+    became = Rotation.from_rotvec(angles) if vectors else Rotation.from_euler(kind, angles)
+    return np.asarray((became.inv() * Rotation.from_matrix(given)).magnitude())
 
 
 def _nearest(given: Floats, near: Floats, kind: str) -> Rotation:
     """The candidates (n,) of given rotations that are nearest to rotations (n, 3, 3)."""
-    if kind == "rotation vectors":
+    if kind == ROTATION_VECTORS:
         chosen = []
         for R, expected in zip(given, near, strict=True):
             tried = _candidates(R, kind)
             chosen.append(tried[np.einsum("mij,ij->m", tried, expected).argmax()])
         return Rotation.from_matrix(np.stack(chosen))
     wanted = PER_RADIAN * _angles(near, kind)
-    tried = np.stack([
-        angles + 2 * np.pi * np.round((wanted - angles) / (2 * np.pi))
-        for angles in _same_rotation(_angles(given, kind))
-    ])  # fmt: skip
+    same = np.stack(_same_rotation(_angles(given, kind)))
+    tried = same + 2 * np.pi * np.round((wanted - same) / (2 * np.pi))
     best = np.linalg.norm(tried - wanted, axis=2).argmin(axis=0)
     return Rotation.from_euler(kind, tried[best, np.arange(len(given))], degrees=True)
 
 
 # --- inverted poses, inverted detections, the other mount ---
-
-CAMERA_ON_GRIPPER_M = 0.4  # no wrist carries a camera farther away
-BOARD_IN_GRIPPER_M = 0.5  # nor a board
-ROOM_M = 4.0  # from the base to a camera or a board that it works with
-WIDE_DEG = 50.0  # from the optical axis to the board's middle, where no intrinsics are known
-ENOUGH = 0.9  # of the images in which the board must be in view
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,7 +278,7 @@ class Candidate:
     """
 
     name: str
-    mount: str
+    mount: Mount
     X: Floats
     Y: Floats
     against: tuple[str, ...]
@@ -289,81 +291,49 @@ class Candidate:
         return line + (f"; against it: {', '.join(self.against)}" if self.against else "")
 
 
-def declared(
-    fit: Fit, middle: Floats, view_limit: Floats | None, measured: bool
-) -> list[Candidate]:
-    """The session as declared, and the two pairs of mistakes that cancel, as `candidates`.
+def candidates(fit: Fit, session: HandEyeSession, names: tuple[str, ...]) -> list[Candidate]:
+    """Three readings that obey the same equation, with the X that each implies.
 
-    Arm and board poses both inverted obey the declared equation with X and Y exchanged; inverted
-    arm poses together with the other mount obey it as they are.
+    names: `INVERTED` for a fit of the declared mount with inverted arm poses, `DECLARED` for a fit
+    as declared. With M = T_carrier_stand of the declared mount and C = T_camera_board, data that
+    fit inverted obey C = X^-1 M^-1 Y. So M was inverted; or the mount is the other one, whose M
+    this is; or C^-1 = Y^-1 M X was meant, where X and Y exchange their parts.
     """
     pairs, X, Y = fit.pairs, fit.X, fit.Y[0]
-    seen, inverse = pairs.T_camera_board, invert_transform(pairs.T_camera_board)
-    other = "eye_to_hand" if pairs.mount == "eye_in_hand" else "eye_in_hand"
-    rows = [
-        ("as declared", pairs.mount, X, Y, seen),
-        ("arm poses and board poses both inverted", pairs.mount, Y, X, inverse),
-        (f"arm poses inverted and another mount than declared ({other})", other, X, Y, seen),
-    ]
-    return _judged(rows, middle, view_limit, measured)
-
-
-def candidates(
-    fit: Fit, middle: Floats, view_limit: Floats | None, measured: bool
-) -> list[Candidate]:
-    """The three readings behind a session that fits with its arm poses inverted, and their X.
-
-    fit: of the declared mount with inverted arm poses. middle (3,): of the board. view_limit (2,):
-    half the field of view, tangents, None where no intrinsics are known. measured: whether the
-    board's poses were computed here from corners, and so cannot be inverted.
-    """
-    pairs, X, Y = fit.pairs, fit.X, fit.Y[0]
-    seen, inverse = pairs.T_camera_board, invert_transform(pairs.T_camera_board)
-    other = "eye_to_hand" if pairs.mount == "eye_in_hand" else "eye_in_hand"
-    # With M = T_carrier_stand of the declared mount and C = T_camera_board the data obey
-    # C = X^-1 M^-1 Y. So M was inverted; or the mount is the other one, whose M this is; or C^-1 =
-    # Y^-1 M X was meant, where X and Y exchange their parts.
-    rows = [
-        ("arm poses inverted (T_gripper_base given)", pairs.mount, X, Y, seen),
-        ("board poses inverted (T_board_camera given)", pairs.mount, Y, X, inverse),
-        (f"another mount than declared ({other})", other, X, Y, seen),
-    ]
-    return _judged(rows, middle, view_limit, measured)
-
-
-def _judged(
-    rows: list[tuple[str, str, Floats, Floats, Floats]],
-    middle: Floats,
-    view_limit: Floats | None,
-    measured: bool,
-) -> list[Candidate]:
-    """Name, mount, X, Y and T_camera_board of each reading, with what speaks against it."""
+    seen, other = pairs.T_camera_board, other_mount(pairs.mount)
+    rows = ((pairs.mount, X, Y, seen), (pairs.mount, Y, X, invert_transform(seen)))
     found = []
-    as_given = rows[0][4]
-    for name, mount, X, Y, C in rows:
-        against = list(_implausible(mount, X, Y, C @ [*middle, 1.0], view_limit))
-        if measured and C is not as_given:
+    for name, (mount, X_, Y_, C) in zip(names, (*rows, (other, X, Y, seen)), strict=True):
+        against = list(_implausible(mount, X_, Y_, C, session))
+        if session.detections is not None and C is not seen:
             against.append("the board's poses were computed here from the images")
-        found.append(Candidate(name, mount, X, Y, tuple(against)))
+        found.append(Candidate(name.format(other=other), mount, X_, Y_, tuple(against)))
     return found
 
 
+def other_mount(mount: Mount) -> Mount:
+    """The mount that it is not."""
+    return "eye_to_hand" if mount == "eye_in_hand" else "eye_in_hand"
+
+
 def _implausible(
-    mount: str, X: Floats, Y: Floats, place: Floats, view_limit: Floats | None
+    mount: Mount, X: Floats, Y: Floats, T_camera_board: Floats, session: HandEyeSession
 ) -> Iterator[str]:
+    """What speaks against a reading: distances that no arm has, a board that is not in view."""
+    in_hand = mount == "eye_in_hand"
     camera, board = np.linalg.norm(X[:3, 3]), np.linalg.norm(Y[:3, 3])
-    limits = (
-        (CAMERA_ON_GRIPPER_M, ROOM_M) if mount == "eye_in_hand" else (ROOM_M, BOARD_IN_GRIPPER_M)
-    )
-    stands = ("gripper", "base") if mount == "eye_in_hand" else ("base", "gripper")
-    if camera > limits[0]:
-        yield f"the camera would be {camera:.2f} m from the {stands[0]}"
-    if board > limits[1]:
-        yield f"the board would be {board:.2f} m from the {stands[1]}"
-    limit = np.full(2, np.tan(np.radians(WIDE_DEG))) if view_limit is None else view_limit
+    if camera > (CAMERA_ON_GRIPPER_M if in_hand else ROOM_M):
+        yield f"the camera would be {camera:.2f} m from the {'gripper' if in_hand else 'base'}"
+    if board > (ROOM_M if in_hand else BOARD_IN_GRIPPER_M):
+        yield f"the board would be {board:.2f} m from the {'base' if in_hand else 'gripper'}"
+    middle = np.zeros(3) if session.board is None else session.board.points.mean(axis=0)
+    limit, lens = np.full(2, np.tan(np.radians(WIDE_DEG))), session.intrinsics
+    if lens is not None:
+        limit = BEYOND_IMAGE * np.array([lens.width / lens.fx, lens.height / lens.fy]) / 2
+    place = T_camera_board @ [*middle, 1.0]
     front = place[:, 2] > 0
     with np.errstate(divide="ignore", invalid="ignore"):
         inside = front & (np.abs(place[:, :2] / place[:, 2:3]) < limit).all(axis=1)
-    if inside.mean() < ENOUGH:
-        what = "behind the camera" if front.mean() < ENOUGH else "outside its field of view"
+    if inside.mean() < SHARE_IN_VIEW:
+        what = "behind the camera" if front.mean() < SHARE_IN_VIEW else "outside its field of view"
         yield f"the board would be {what} in {np.sum(~inside)} of {len(inside)} images"

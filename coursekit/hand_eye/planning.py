@@ -23,7 +23,7 @@ from coursekit.hand_eye.session import HandEyeResult, HandEyeSession
 from coursekit.hand_eye.views import PixelViews, board_gap, rms_length, view_residuals
 
 CORNER_PX = 0.1  # corner noise where no images have told
-ROOM_PX = 10.0  # that a proposed view leaves between the board and the image's border
+VIEW_ROOM_PX = 10.0  # that a proposed view leaves between the board and the image's border
 LEAST_FACING = 0.5  # cosine between the board's normal and the line of sight: 60 deg
 NEARER_THAN_EVER, FARTHER_THAN_EVER = 0.6, 1.5  # times the nearest and farthest view so far
 DRAW_RAD, DRAWN, PROPOSALS = 0.35, 4000, 400  # std about known joints; how many, how many stay
@@ -199,7 +199,7 @@ def _in_view(result: HandEyeResult, T_base_gripper: Floats) -> Mask:
     facing_so_far, away_so_far = _facing(result.T_camera_board, board)
     side = np.sign(np.median(facing_so_far))  # z may point into the board or out of it
     return (
-        seen(board.points, C, intrinsics, ROOM_PX).all(axis=1)
+        seen(board.points, C, intrinsics, VIEW_ROOM_PX).all(axis=1)
         & (side * facing > LEAST_FACING)
         & (away > NEARER_THAN_EVER * away_so_far.min())
         & (away < FARTHER_THAN_EVER * away_so_far.max())

@@ -36,7 +36,7 @@ from coursekit.arrays import ArrayLike, Floats, Integers
 from coursekit.boards import Board, Detection, Detections, detect_all
 from coursekit.boards.board import Skipped
 from coursekit.boards.detector import SESSION
-from coursekit.checks import array, choice, transform, want
+from coursekit.checks import array, choice, instance, transform, want
 from coursekit.geometry import Intrinsics, invert_transform, make_transform, pose_difference
 from coursekit.hand_eye import refinement, views
 from coursekit.hand_eye.closed_form import CLOSED_FORMS, FEWEST_POSES, closed_form
@@ -276,8 +276,7 @@ def _card(folder: Path) -> dict[str, Any]:
         card = json.loads(path.read_text("utf-8"))
     except ValueError as error:
         raise ValueError(f"folder: {SESSION} is no JSON ({error})") from error
-    want(isinstance(card, dict), "folder", f"{SESSION} with a {type(card).__name__}", "an object")
-    return card
+    return instance(SESSION, card, dict)
 
 
 def _from_card(card: dict[str, Any], key: str) -> Any:

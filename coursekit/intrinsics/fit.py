@@ -94,7 +94,8 @@ class IntrinsicsResult(Estimate):
     what was estimated besides (the bow of a board); it widens every covariance and is not part of
     it.
 
-    `value`, `sigma` and `interval` take one of `names`; "fx" and "fy" are known where "f" is.
+    `value`, `sigma` and `Estimate.interval` take one of `names`; "fx" and "fy" are known where "f"
+    is.
     """
 
     intrinsics: Intrinsics

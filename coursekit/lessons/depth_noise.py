@@ -13,7 +13,7 @@ from coursekit import specifications
 from coursekit.arrays import Floats
 from coursekit.lessons.exercises import Exercise, Model, Step
 
-Window = tuple[int, int, int, int]  # first row, the one after the last; the same for columns
+Bounds = tuple[int, int, int, int]  # first row, the one after the last; the same for columns
 
 # --- depth_noise ---
 
@@ -315,7 +315,7 @@ def _nearest(coordinate: float) -> int:
     return round(coordinate)
 
 
-def _window(row: int, column: int, half: int) -> Window:
+def _window(row: int, column: int, half: int) -> Bounds:
     return row - half, row + half + 1, column - half, column + half + 1
 
 
@@ -450,7 +450,7 @@ def truncated(coordinate: float) -> int:
 
 
 @ROBUST_DEPTH.mistake("window")
-def last_missing(row: int, column: int, half: int) -> Window:
+def last_missing(row: int, column: int, half: int) -> Bounds:
     """your window lacks its last row and column
 
     A slice stops before its end index. How many pixels lie between `v - half` and `v + half`?
@@ -459,7 +459,7 @@ def last_missing(row: int, column: int, half: int) -> Window:
 
 
 @ROBUST_DEPTH.mistake("window")
-def half_ignored(row: int, column: int, half: int) -> Window:
+def half_ignored(row: int, column: int, half: int) -> Bounds:
     """your window does not depend on `half`
 
     What does your function do when somebody asks for half = 1?
@@ -468,7 +468,7 @@ def half_ignored(row: int, column: int, half: int) -> Window:
 
 
 @ROBUST_DEPTH.mistake("window")
-def half_halved(row: int, column: int, half: int) -> Window:
+def half_halved(row: int, column: int, half: int) -> Bounds:
     """your window reaches only `half // 2` pixels to each side
 
     `half = 2` makes a window of 5x5. How many pixels does yours have?

@@ -12,12 +12,12 @@ from coursekit.lessons import depth_noise, error_budget, hand_eye, intrinsics, p
 from coursekit.lessons import progress as record
 from coursekit.lessons.exercises import Exercise
 from coursekit.lessons.progress import Verdict
-from coursekit.lessons.questions import Checkpoint, Objective, load
+from coursekit.lessons.questions import Checkpoint, Objective, load_questions
 from coursekit.words import html_table, table
 
 LESSONS = ("pinhole", "depth_noise", "intrinsics", "hand_eye", "error_budget")  # by notebook
 
-_LOADED = {lesson: load(lesson) for lesson in LESSONS}
+_LOADED = {lesson: load_questions(lesson) for lesson in LESSONS}
 CHECKPOINTS: dict[str, Checkpoint] = {c.name: c for asked, _ in _LOADED.values() for c in asked}
 EXERCISES: dict[str, Exercise] = {
     exercise.name: exercise
@@ -34,7 +34,7 @@ EXERCISES: dict[str, Exercise] = {
     )
 }
 DONE = {"right", "core right"}
-WORDS = {"wrong": "not right yet", "raised": "raised an error"}
+STANDING_WORDS = {"wrong": "not right yet", "raised": "raised an error"}
 
 
 def checkpoint(name: str) -> Checkpoint:
@@ -85,7 +85,7 @@ class Evidence:
 
     def rows(self) -> list[tuple[str, str]]:
         """(objective, evidence) as text; a later attempt counts, the first one is mentioned."""
-        attempts = record.read()
+        attempts = record.read_attempts()
 
         def state(name: str) -> str:
             nothing = "not attempted yet" if name in EXERCISES else "not answered yet"
@@ -109,7 +109,7 @@ def _state(attempts: list[dict[str, str]]) -> str:
         return "right" if tries == 1 else f"right at try {tries}"
     if "core right" in kinds:
         return "core right"
-    return WORDS.get(kinds[-1], kinds[-1]) if kinds else ""
+    return STANDING_WORDS.get(kinds[-1], kinds[-1]) if kinds else ""
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,9 @@ def progress() -> Overview:
     >>> [standing.notebook for standing in progress().standings][:2]
     ['01_pinhole', '02_depth_noise']
     """
-    kinds = {name: [a["kind"] for a in attempts] for name, attempts in record.read().items()}
+    kinds = {
+        name: [a["kind"] for a in attempts] for name, attempts in record.read_attempts().items()
+    }
 
     def standing(notebook: str, prefix: str) -> Standing:
         questions = [name for name in CHECKPOINTS if name.startswith(prefix)]

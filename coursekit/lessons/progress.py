@@ -13,10 +13,10 @@ from typing import Any, Literal
 from coursekit import results
 
 FILE = "progress.json"
-Kind = Literal["right", "core right", "wrong", "raised", "not attempted"]
+VerdictKind = Literal["right", "core right", "wrong", "raised", "not attempted"]
 
 # Okabe-Ito; the word beside it says the same, so nothing hangs on the colour.
-COLORS = {
+SIDE_COLORS = {
     "right": "#009E73",
     "core right": "#009E73",
     "wrong": "#D55E00",
@@ -33,7 +33,7 @@ class Verdict:
     """
 
     subject: str
-    kind: Kind
+    kind: VerdictKind
     headline: str
     lines: tuple[str, ...] = ()
     named: str | None = None
@@ -44,7 +44,7 @@ class Verdict:
     def _repr_html_(self) -> str:
         body = "".join(f"<div>{_markup(line)}</div>" for line in self.lines)
         return (
-            f'<div style="border-left: 4px solid {COLORS[self.kind]}; padding: 2px 0 2px 12px;'
+            f'<div style="border-left: 4px solid {SIDE_COLORS[self.kind]}; padding: 2px 0 2px 12px;'
             f' line-height: 1.4; max-width: 52em">'
             f"<b>{_markup(self.headline)}</b>{body}</div>"
         )
@@ -66,7 +66,7 @@ def noted(verdict: Verdict, answer: str = "") -> Verdict:
         return verdict
     attempt = {"kind": verdict.kind, "answer": answer, "date": results.now()}
     try:
-        attempts = read()
+        attempts = read_attempts()
         attempts.setdefault(verdict.subject, []).append(attempt)
         results.write_json(results.folder() / FILE, attempts)
     except OSError as error:
@@ -74,7 +74,7 @@ def noted(verdict: Verdict, answer: str = "") -> Verdict:
     return verdict
 
 
-def read() -> dict[str, list[dict[str, Any]]]:
+def read_attempts() -> dict[str, list[dict[str, Any]]]:
     """All attempts by name, oldest first; a damaged file is set aside, not overwritten.
 
     Each attempt has the keys kind (as in `Verdict`), answer and date.

@@ -245,14 +245,14 @@ def panel(checkpoint: Checkpoint) -> Any:
 
 def _earlier(name: str) -> str:
     """What the student did here before, for the widget only: stored outputs never show it."""
-    attempts = progress.read().get(name, [])
+    attempts = progress.read_attempts().get(name, [])
     if not attempts:
         return ""
     last = attempts[-1]
     return f"<em>You have answered this one before ({html.escape(last['kind'])}).</em>"
 
 
-def load(lesson: str) -> tuple[tuple[Checkpoint, ...], tuple[Objective, ...]]:
+def load_questions(lesson: str) -> tuple[tuple[Checkpoint, ...], tuple[Objective, ...]]:
     """The checkpoints and the objectives of a lesson, in the order of its TOML file.
 
     A choice has its options under A, B, C, ..., each with why it is right or wrong, and the right

@@ -8,11 +8,9 @@ from typing import Any
 import numpy as np
 
 from coursekit.arrays import ArrayLike, Floats
-from coursekit.plots.style import COLORS, LessonFigure, figure, plain_ticks, single
+from coursekit.plots.style import COLORS, MARKERS, STYLES, LessonFigure, figure, plain_ticks, single
 
 RANGE_M = np.linspace(0.25, 3.0, 200)
-STYLES = ("-", "--", "-.", ":")
-MARKERS = ("o", "s", "^", "D", "v")
 
 
 def technologies(fx: float, baseline_m: float, sigma_d_px: float) -> LessonFigure:

@@ -15,7 +15,7 @@ from coursekit.budget import BestDistance, Draws, ErrorBudget, Gripper, Target
 from coursekit.plots.style import COLORS, LessonFigure, figure, single
 
 KINDS = {"bias": "measured", "noise": "depth"}
-CHI2_95 = 5.991  # of two degrees of freedom
+CHI2_95_IN_A_PLANE = 5.991  # of two degrees of freedom
 CHI2_95_SPACE = 7.815  # of three
 
 
@@ -126,7 +126,7 @@ def _from_above(ax: Any, width: float, opening: float, covariance: Floats, bias:
         ax.axvline(side * room, color=COLORS["ink"], ls="--", lw=1)
     ax.add_patch(Rectangle((-width / 2, -width / 2), width, width, fc=COLORS["cube"], alpha=0.25))
     values, vectors = np.linalg.eigh(covariance)
-    half = np.sqrt(CHI2_95 * np.clip(values, 0, None))[::-1]
+    half = np.sqrt(CHI2_95_IN_A_PLANE * np.clip(values, 0, None))[::-1]
     turn = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
     middle = (float(bias[0]), float(bias[1]))
     place = Ellipse(middle, 2 * half[0], 2 * half[1], angle=turn, fc=COLORS["measured"], alpha=0.5)

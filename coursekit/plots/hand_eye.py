@@ -10,12 +10,19 @@ from scipy.spatial.transform import Rotation
 
 from coursekit.arrays import ArrayLike, Floats
 from coursekit.hand_eye import StudyPoint
-from coursekit.plots.style import COLORS, LessonFigure, cross, figure, plain_ticks, single
+from coursekit.plots.style import (
+    COLORS,
+    MARKERS,
+    STYLES,
+    LessonFigure,
+    cross,
+    figure,
+    plain_ticks,
+    single,
+)
 from coursekit.simulation.arm_poses import Setup
 
 AXIS_M = 0.09  # how long a frame's axes are drawn
-STYLES = ("-", "--", "-.", ":")
-MARKERS = ("o", "s", "^", "D")
 
 
 def mounts(setups: Mapping[str, Setup], joints: Mapping[str, ArrayLike]) -> LessonFigure:

@@ -29,7 +29,9 @@ COLORS = {
     "faint": "#BBBBBB",
 }
 DEPTH_COLORMAP = "viridis"
-UNITS = ("mm", "m", "px", "deg")
+STYLES = ("-", "--", "-.", ":")
+MARKERS = ("o", "s", "^", "D", "v")
+SLIDER_UNITS = ("mm", "m", "px", "deg")
 
 mpl.rcParams.update(
     {
@@ -184,4 +186,4 @@ class Draggable:
 def label(name: str) -> str:
     """`focal_length_mm` as `focal length (mm)`."""
     words, _, unit = name.rpartition("_")
-    return f"{words.replace('_', ' ')} ({unit})" if unit in UNITS and words else name
+    return f"{words.replace('_', ' ')} ({unit})" if unit in SLIDER_UNITS and words else name

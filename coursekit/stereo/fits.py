@@ -29,8 +29,8 @@ FREE_CONSTANT_FROM = 5  # distances, from which a constant depth error is estima
 class LawFit(Estimate):
     """A law whose parameters were fitted to residuals of unit variance.
 
-    names (k), theta (k,): the parameters, which `value`, `sigma` and `interval` take by name.
-    covariance (k, k): theirs, if the stated errors are right. chi2: the sum of the squared
+    names (k), theta (k,): the parameters, which `value`, `sigma` and `Estimate.interval` take by
+    name. covariance (k, k): theirs, if the stated errors are right. chi2: the sum of the squared
     residuals; n_residuals: how many there were. fx (px), baseline_m: what the camera reports.
     notes: what a reader must know.
     """

@@ -31,7 +31,7 @@ from coursekit import results
 from coursekit.arrays import AnyArray, Floats, Interval, NDArray
 from coursekit.checks import shown
 
-FORMAT = 1
+VERSION = 1
 MAX_FILE = 5 * 2**20  # bytes
 MAX_MEMBERS = 32
 MAX_TOTAL = 6 * 2**20  # bytes, of all members together, unpacked
@@ -238,7 +238,7 @@ def bundle_bytes(submission: Submission) -> bytes:
         members[f"depth_{i}.npy"] = array_bytes(stack.counts)
         members[f"times_{i}.npy"] = array_bytes(stack.times_s)
     manifest = {
-        "format": FORMAT,
+        "format": VERSION,
         "exercise": s.exercise,
         "student": s.student,
         "made": s.made,
@@ -449,8 +449,10 @@ def _document(members: dict[str, bytes], name: str) -> dict[str, Any]:
         document = _with_tuples(json.loads(text, **hooks), MAX_NESTED)
     except (ValueError, RecursionError) as error:  # also an integer of thousands of digits
         raise Refused("not_json", f"{name} cannot be read ({error})") from None
-    if name == MANIFEST and isinstance(document, dict) and document.get("format") != FORMAT:
-        wrong = f"The bundle has format {shown(document.get('format'))}, this grader reads {FORMAT}"
+    if name == MANIFEST and isinstance(document, dict) and document.get("format") != VERSION:
+        wrong = (
+            f"The bundle has format {shown(document.get('format'))}, this grader reads {VERSION}"
+        )
         cure = "update the course where you pack or where you grade, whichever is older"
         raise Refused("other_format", wrong, cure)
     try:

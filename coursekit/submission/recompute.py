@@ -86,7 +86,7 @@ def _check_rule(section: str, key: str, value: Any, most: float) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class WithError:
     """A number and its standard error, both in the unit in which it is claimed."""
 
     value: float
@@ -94,7 +94,7 @@ class Estimate:
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class AtDistance:
     """One distance; None is what its raw depths do not say.
 
     bias, std in mm. bias_se_mm holds the tape's error, bias_se_apart_mm does not. invalid: as a
@@ -104,11 +104,11 @@ class Measured:
     stack: Stack
     scale_m: float
     stats: WindowStats
-    bias: Estimate | None
+    bias: WithError | None
     bias_se_mm: float | None
     bias_se_apart_mm: float | None
-    std: Estimate | None
-    invalid: Estimate
+    std: WithError | None
+    invalid: WithError
 
     @property
     def distance_m(self) -> float:
@@ -147,7 +147,7 @@ class Recomputed:
     law, free: None where the stds do not give it; why_no_law then says so in a sentence.
     """
 
-    at: tuple[Measured, ...]
+    at: tuple[AtDistance, ...]
     law: NoiseFit | None
     free: NoiseFit | None
     why_no_law: str = ""
@@ -164,7 +164,7 @@ def recompute(submission: Submission) -> Recomputed:
     return Recomputed(at, law, free, why)
 
 
-def _measured(stack: Stack, scale: float, tape: float) -> Measured:
+def _measured(stack: Stack, scale: float, tape: float) -> AtDistance:
     """What one stack says; scale: metres of a count, tape: std of a reading in m."""
     _, height, width = stack.counts.shape
     with np.errstate(all="ignore"):  # depths that no camera gives; what is not finite is dropped
@@ -172,29 +172,29 @@ def _measured(stack: Stack, scale: float, tape: float) -> Measured:
     bias = _finite(1e3 * (stats.depth_m - stack.distance_m))
     bias_se = _finite(1e3 * stats.depth_error_m)
     std, std_se = _finite(1e3 * stats.pixel_std_m), _finite(1e3 * stats.pixel_std_error_m)
-    return Measured(
+    return AtDistance(
         stack=stack,
         scale_m=scale,
         stats=stats,
-        bias=None if bias is None or bias_se is None else Estimate(bias, bias_se),
+        bias=None if bias is None or bias_se is None else WithError(bias, bias_se),
         bias_se_mm=None if bias_se is None else math.hypot(bias_se, 1e3 * tape),
         bias_se_apart_mm=bias_se,
-        std=None if std is None or std_se is None else Estimate(std, std_se),
+        std=None if std is None or std_se is None else WithError(std, std_se),
         invalid=_invalid(stack),
     )
 
 
-def _invalid(stack: Stack) -> Estimate:
+def _invalid(stack: Stack) -> WithError:
     """The invalid fraction and its standard error, from how it changes from frame to frame."""
     each = (stack.counts == 0).mean(axis=(1, 2))
     least = 0.5 / stack.counts.size  # half a sample
     std, squares = series_std(each)
     se = std / math.sqrt(max(squares, 1.0)) if math.isfinite(std) else 0.0
-    return Estimate(float(each.mean()), max(se, least))
+    return WithError(float(each.mean()), max(se, least))
 
 
 def _law(
-    submission: Submission, at: tuple[Measured, ...], exponent: float | None
+    submission: Submission, at: tuple[AtDistance, ...], exponent: float | None
 ) -> tuple[NoiseFit | None, str]:
     """The noise law through the stds with this exponent (None: free), or why there is none."""
     known = [m for m in at if m.std is not None]

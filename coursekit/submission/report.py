@@ -41,7 +41,7 @@ FORMULA = tuple("=+-@\t\r\n＝＋－＠")  # what makes a spreadsheet calculate 
 HERE = Path(__file__).parent
 
 # Of a figure, in units of its view (a phone shows it at three quarters of that), and its margins.
-VIEW = {"W": 480, "H": 320, "LEFT": 52, "RIGHT": 14, "TOP": 14, "BOTTOM": 46}
+PLOT = {"W": 480, "H": 320, "LEFT": 52, "RIGHT": 14, "TOP": 14, "BOTTOM": 46}
 LARGEST_MM = 1e6  # beyond this nothing is drawn
 
 
@@ -51,7 +51,7 @@ def _template() -> jinja2.Template:
     loader = jinja2.FileSystemLoader(HERE)
     pages = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True)
     pages.filters |= {"points": _points, "counted": counted, "px": "{:.1f}".format}
-    pages.globals |= VIEW | {"style": Markup((HERE / "report.css").read_text(encoding="utf-8"))}
+    pages.globals |= PLOT | {"style": Markup((HERE / "report.css").read_text(encoding="utf-8"))}
     return pages.get_template("report.html.jinja")
 
 
@@ -279,12 +279,12 @@ class _Axes(NamedTuple):
     top: float
 
     def x(self, value: float) -> float:
-        inside = VIEW["W"] - VIEW["LEFT"] - VIEW["RIGHT"]
-        return VIEW["LEFT"] + inside * (value - self.low) / (self.high - self.low)
+        inside = PLOT["W"] - PLOT["LEFT"] - PLOT["RIGHT"]
+        return PLOT["LEFT"] + inside * (value - self.low) / (self.high - self.low)
 
     def y(self, value: float) -> float:
-        inside = VIEW["H"] - VIEW["TOP"] - VIEW["BOTTOM"]
-        return VIEW["H"] - VIEW["BOTTOM"] - inside * value / self.top
+        inside = PLOT["H"] - PLOT["TOP"] - PLOT["BOTTOM"]
+        return PLOT["H"] - PLOT["BOTTOM"] - inside * value / self.top
 
     def split(self, points: Iterable[tuple[float, float]]) -> tuple[list[Any], list[Any]]:
         """The points that fit, in the view's units; and the others, in words."""
@@ -407,7 +407,7 @@ def _histogram(percents: Sequence[float]) -> dict[str, Any]:
     return {
         "bins": bins,
         "most": max([*bins, 1]),
-        "wide": (VIEW["W"] - VIEW["LEFT"] - VIEW["RIGHT"]) / 10,
+        "wide": (PLOT["W"] - PLOT["LEFT"] - PLOT["RIGHT"]) / 10,
         "alt": f"Students by points: {words}." if words else "No graded bundle.",
     }
 

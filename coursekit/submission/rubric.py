@@ -20,7 +20,7 @@ from coursekit.submission.flags import Fingerprint, Flag, data_flags, fingerprin
 from coursekit.submission.format import Plot, Submission, TableRow
 from coursekit.submission.recompute import (
     LABELS,
-    Measured,
+    AtDistance,
     Recomputed,
     grading_rules,
     recompute,
@@ -32,7 +32,12 @@ Judgement = Literal["right", "partial", "wrong", "missing"]
 SAME_DISTANCE_M = 0.005  # a row or a point of the plot belongs to the stack this near
 EXPLAINED_WITHIN = 0.03  # a wrong number is explained by a mistake that gives it to this part
 
-UNITS = {"sigma_d": " px", "sigma_d_interval": " px", "exponent": "", "invalid": " %"}  # else mm
+UNIT_OF = {
+    "sigma_d": " px",
+    "sigma_d_interval": " px",
+    "exponent": "",
+    "invalid": " %",
+}  # else mm
 
 
 @dataclass(frozen=True)
@@ -171,11 +176,11 @@ def _at_distances(submission: Submission, found: Recomputed) -> Iterator[Item]:
             yield from _one_distance(submission, m.distance_m, m, dict.fromkeys(points, 0.0))
 
 
-def _chosen(wanted: Sequence[float], at: Sequence[Measured]) -> dict[float, Measured]:
+def _chosen(wanted: Sequence[float], at: Sequence[AtDistance]) -> dict[float, AtDistance]:
     """For each wanted distance the nearest measured one within the slack, none of them twice."""
     slack = grading_rules()["exercise"]["slack_m"]
     pairs = sorted((abs(m.distance_m - z), z, i) for z in wanted for i, m in enumerate(at))
-    chosen: dict[float, Measured] = {}
+    chosen: dict[float, AtDistance] = {}
     for off, z, i in pairs:
         if off <= slack + 1e-9 and z not in chosen and at[i] not in chosen.values():
             chosen[z] = at[i]
@@ -189,7 +194,7 @@ def _row(submission: Submission, z: float) -> TableRow | None:
 
 
 def _one_distance(
-    submission: Submission, z: float, m: Measured | None, points: dict[str, float]
+    submission: Submission, z: float, m: AtDistance | None, points: dict[str, float]
 ) -> Iterator[Item]:
     """Raw depths and the five numbers of the table at z; m: what was measured there."""
     yield _data(_Question("data", points["data"], f" at {z:.2f} m"), z, m)
@@ -205,7 +210,7 @@ def _one_distance(
             yield judge(asked, submission, m, claim)
 
 
-def _data(asked: _Question, z: float, m: Measured | None) -> Item:
+def _data(asked: _Question, z: float, m: AtDistance | None) -> Item:
     """Whether there are raw depths enough: frames, and a window that is large enough."""
     exercise = grading_rules()["exercise"]
     needed, side = exercise["frames"], exercise["window_px"]
@@ -228,7 +233,7 @@ def _data(asked: _Question, z: float, m: Measured | None) -> Item:
     return asked.item("partial", says, "incomplete", min(n / needed, 1.0) * (0.5 if small else 1.0))
 
 
-def _bias(asked: _Question, _: Submission, m: Measured, claim: float) -> Item:
+def _bias(asked: _Question, _: Submission, m: AtDistance, claim: float) -> Item:
     """Mean depth minus the distance by tape, mm; the sign is the commonest mistake."""
     if m.bias is None:
         return _unknown(asked, claim)
@@ -248,7 +253,7 @@ def _bias(asked: _Question, _: Submission, m: Measured, claim: float) -> Item:
     return _judge(asked, claim, found, tolerance, mistakes)
 
 
-def _bias_se(asked: _Question, submission: Submission, m: Measured, claim: float) -> Item:
+def _bias_se(asked: _Question, submission: Submission, m: AtDistance, claim: float) -> Item:
     """The standard error of the bias, mm: of the mean depth, as the frames correlate.
 
     With the tape's error or without it is right; it is itself known to a part only.
@@ -284,7 +289,7 @@ def _bias_se(asked: _Question, submission: Submission, m: Measured, claim: float
     return item
 
 
-def _std(asked: _Question, _: Submission, m: Measured, claim: float) -> Item:
+def _std(asked: _Question, _: Submission, m: AtDistance, claim: float) -> Item:
     """The std of one pixel over time, mm, the pixels' variances averaged."""
     if m.std is None:
         return _unknown(asked, claim)
@@ -317,7 +322,7 @@ def _std(asked: _Question, _: Submission, m: Measured, claim: float) -> Item:
     return _judge(asked, claim, found, tolerance, mistakes)
 
 
-def _std_se(asked: _Question, _: Submission, m: Measured, claim: float) -> Item:
+def _std_se(asked: _Question, _: Submission, m: AtDistance, claim: float) -> Item:
     """The standard error of that std, mm: std / sqrt(2 dof), dof the effective ones."""
     if m.std is None:
         return _unknown(asked, claim)
@@ -339,7 +344,7 @@ def _std_se(asked: _Question, _: Submission, m: Measured, claim: float) -> Item:
     return _judge(asked, claim, found, _error_tolerance("std_se", found), mistakes)
 
 
-def _invalid(asked: _Question, _: Submission, m: Measured, claim: float) -> Item:
+def _invalid(asked: _Question, _: Submission, m: AtDistance, claim: float) -> Item:
     """The part of all samples (pixels times frames) that have no depth."""
     found, tolerance = m.invalid.value, _tolerance("invalid", m.invalid.se)
 
@@ -359,7 +364,7 @@ def _invalid(asked: _Question, _: Submission, m: Measured, claim: float) -> Item
     return _judge(asked, claim, found, tolerance, mistakes)
 
 
-JUDGES: dict[str, tuple[str, Callable[[_Question, Submission, Measured, float], Item]]] = {
+JUDGES: dict[str, tuple[str, Callable[[_Question, Submission, AtDistance, float], Item]]] = {
     "bias": ("depth_bias_mm", _bias),
     "bias_se": ("depth_bias_se_mm", _bias_se),
     "std": ("depth_std_mm", _std),
@@ -579,7 +584,7 @@ def _judge_interval(
     topic, rule = asked.topic, grading_rules()["tolerance"]
     half = (found[1] - found[0]) / 2
     tolerance = rule["standard_errors"] * rule["error_of_an_error"] * half + _half_digit(topic)
-    unit = UNITS[topic]
+    unit = UNIT_OF[topic]
     one, two = (" to ".join(_digits(topic, end) for end in ends) for ends in (claim, found))
     says = (
         f"{asked.name}: you say {one}{unit}, your raw depths say {two}{unit} "
@@ -664,7 +669,7 @@ def _conclusion(asked: _Question, submission: Submission, found: Recomputed) -> 
 
 
 def _at_mounting(
-    submission: Submission, known: Sequence[Measured], z: float, frames: int
+    submission: Submission, known: Sequence[AtDistance], z: float, frames: int
 ) -> tuple[float, float, float, float]:
     """Bias, its error, noise of the mean of `frames` frames and its error at z, mm.
 
@@ -760,7 +765,7 @@ def _log_se(law: NoiseFit, i: int, widened: bool = True) -> float:
 
 def _shown(topic: str, value: float) -> str:
     """A value with its unit."""
-    return _digits(topic, value) + UNITS.get(topic, " mm")
+    return _digits(topic, value) + UNIT_OF.get(topic, " mm")
 
 
 def _digits(topic: str, value: float) -> str:

@@ -39,12 +39,12 @@ from coursekit.submission.rubric import shortcomings
 from coursekit.words import counted
 
 MEASURED = "studio_1.measured"  # in results/
-CHECKPOINTS = "depth_noise."  # what the names of the lesson's checkpoints and exercises begin with
+LESSON_PREFIX = "depth_noise."  # of its checkpoints and exercises
 COLUMNS = (
     *("depth_bias_mm", "depth_bias_se_mm", "depth_std_mm", "depth_std_se_mm"),
     "invalid_fraction",
 )
-UNITS = {  # of a quantity that is handed in, and what one of it is in the table's own
+TABLE_UNITS = {  # of a quantity that is handed in, and what one of it is in the table's own
     "depth_bias": {"mm": 1.0, "m": 1e3},
     "depth_std": {"mm": 1.0, "m": 1e3},
     "invalid": {"1": 1.0, "%": 0.01},
@@ -66,14 +66,14 @@ class CannotHandIn(ValueError):
 
 
 P = ParamSpec("P")
-T = TypeVar("T")
+Returned = TypeVar("Returned")
 
 
-def _in_one_line(function: Callable[P, T]) -> Callable[P, T]:
+def _in_one_line(function: Callable[P, Returned]) -> Callable[P, Returned]:
     """The function, with its ValueErrors turned into `CannotHandIn`."""
 
     @wraps(function)
-    def wrapped(*args: P.args, **kwargs: P.kwargs) -> T:
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> Returned:
         try:
             return function(*args, **kwargs)
         except Refused as refused:  # what is wrong; the cure is for whoever grades
@@ -249,8 +249,8 @@ def outcomes() -> dict[str, Outcome]:
     """How the checkpoints and exercises of notebook 02 stand that were attempted, by name."""
     return {
         name: Outcome(any(a.get("kind") == "right" for a in attempts), len(attempts))
-        for name, attempts in progress.read().items()
-        if name.startswith(CHECKPOINTS)
+        for name, attempts in progress.read_attempts().items()
+        if name.startswith(LESSON_PREFIX)
     }
 
 
@@ -279,7 +279,7 @@ def _row(distance_m: float, quantities: Mapping[str, results.Quantity]) -> Table
         quantity = quantities.get(full)
         if quantity is None:
             return None, None
-        units = UNITS[name]
+        units = TABLE_UNITS[name]
         wanted = f"Quantity(value, {next(iter(units))!r}, standard error)"
         want(isinstance(quantity, results.Quantity), full, quantity, wanted)
         unit = quantity.unit

@@ -15,6 +15,7 @@ import time
 import urllib.request
 
 import pytest
+from playwright.sync_api import expect
 
 import coursekit as ck
 from coursekit.lessons.questions import Choice
@@ -24,17 +25,12 @@ pytestmark = pytest.mark.browser
 
 NAMES = [f"{number:02d}_{lesson}" for number, lesson in enumerate(ck.lessons.LESSONS, start=1)]
 SCREENSHOTS = build_notebooks.ROOT / "build" / "screenshots"
-CHROMIUM = next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-)
-QUIET = "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-sync"
-NO_NEWS = "--disable-background-networking --disable-component-update"
 SETTINGS = {
     "@jupyterlab/apputils-extension:notification": {"fetchNews": "false", "checkForUpdates": False},
     "@jupyterlab/notebook-extension:tracker": {"windowingMode": "none"},  # all cells are in the DOM
 }
-STARTUP_S = 60
-NOTEBOOK_MS = 180_000
+PATIENCE_MS = 1_800_000  # so that a hang ends; no page takes minutes
+expect.set_options(timeout=PATIENCE_MS)
 
 
 @pytest.fixture(scope="module", params=NAMES)
@@ -44,12 +40,8 @@ def name(request):
 
 
 @pytest.fixture(scope="module")
-def server_at(tmp_path_factory):
+def server_at(browser, tmp_path_factory):
     """Where a JupyterLab of its own serves copies of the notebooks; {} is the notebook's name."""
-    if CHROMIUM is None and os.environ.get("CI") == "true":
-        pytest.fail("no Chromium, and CI must run this test")
-    if CHROMIUM is None:
-        pytest.skip("not run: no Chromium")
     home = tmp_path_factory.mktemp("home")
     served = tmp_path_factory.mktemp("served")
     (home / "overrides.json").write_text(json.dumps(SETTINGS), encoding="utf-8")
@@ -69,7 +61,7 @@ def server_at(tmp_path_factory):
         yield f"http://127.0.0.1:{port}/lab/workspaces/{{0}}/tree/{{0}}.ipynb?token={token}"
     finally:
         server.terminate()
-        server.wait(20)
+        server.wait()
 
 
 def free_port():
@@ -79,10 +71,9 @@ def free_port():
 
 
 def wait_for(url, server, log):
-    deadline = time.monotonic() + STARTUP_S
-    while time.monotonic() < deadline and server.poll() is None:
+    while server.poll() is None:
         try:
-            urllib.request.urlopen(url, timeout=5).close()
+            urllib.request.urlopen(url).close()
             return
         except OSError:  # not listening yet
             time.sleep(0.2)
@@ -90,23 +81,12 @@ def wait_for(url, server, log):
 
 
 @pytest.fixture(scope="module")
-def browser():
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        arguments = f"{QUIET} {NO_NEWS}".split()
-        launched = playwright.chromium.launch(executable_path=CHROMIUM, args=arguments)
-        yield launched
-        launched.close()
-
-
-@pytest.fixture(scope="module")
 def opened(server_at, browser, name):
     """The page with the notebook as it opens, before anything has run."""
     page = browser.new_page(viewport={"width": 1280, "height": 900})
-    page.set_default_timeout(20_000)
+    page.set_default_timeout(PATIENCE_MS)
     page.goto(server_at.format(name))
-    page.locator(".jp-CodeCell").last.wait_for(state="attached", timeout=NOTEBOOK_MS)
+    page.locator(".jp-CodeCell").last.wait_for(state="attached")
     page.locator(".jp-KernelName", has_text="Python 3").wait_for()  # idle until then, too
     page.locator(".jp-Notebook-ExecutionIndicator[data-status=idle]").wait_for()
     yield page
@@ -124,13 +104,11 @@ def stop_kernel(page):
 @pytest.fixture(scope="module")
 def page(opened, name):
     """The page after Run All Cells."""
-    from playwright.sync_api import expect
-
     opened.get_by_role("menuitem", name="Run", exact=True).click()
     opened.locator("[data-command='runmenu:run-all']").click()
     prompt = opened.locator(".jp-CodeCell .jp-InputArea-prompt").last
     expect(prompt).to_have_text("[*]:")
-    expect(prompt).to_have_text(re.compile(r"\[\d+\]:"), timeout=NOTEBOOK_MS)
+    expect(prompt).to_have_text(re.compile(r"\[\d+\]:"))
     yield opened
     if os.environ.get("CI") != "true":  # nobody looks at them there
         photograph(opened, name)
@@ -174,8 +152,6 @@ def checkpoints(name):
 
 
 def test_answers_are_collapsed_on_load(opened, name):
-    from playwright.sync_api import expect
-
     bars, count = answers(opened, name)
     assert count > 0
     expect(bars).to_have_count(count)
@@ -201,8 +177,6 @@ def test_each_checkpoint_and_figure_becomes_a_widget(page, name):
 
 
 def test_every_checkpoint_explains_wrong_and_right_answers(page, name):
-    from playwright.sync_api import expect
-
     for checkpoint in checkpoints(name):
         cell = cell_with(page, f'"{checkpoint.name}"')
         for give, said in attempts(checkpoint):
@@ -237,10 +211,10 @@ def test_each_slider_redraws_its_figure(page):
             handle.focus()
             handle.press("ArrowRight")
             handle.press("ArrowRight")
-            deadline = time.monotonic() + 20
-            while shown(image) == before and time.monotonic() < deadline:
+            deadline = time.monotonic() + PATIENCE_MS / 1000
+            while shown(image) == before:
+                assert time.monotonic() < deadline, handle
                 page.wait_for_timeout(50)
-            assert shown(image) != before, handle
 
 
 def shown(image):

@@ -1,21 +1,13 @@
 """The static pages in a real browser, opened from disk."""
 
-import os
-import shutil
-
 import pytest
 
 from tools import build_site
 
 pytestmark = pytest.mark.browser
 
-CHROMIUM = next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-)
-QUIET = "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-sync"
-NO_NEWS = "--disable-background-networking --disable-component-update"
-PAGES = [*build_site.page_names().values(), "reference/coursekit.html"]
-PAGES.append("reference/coursekit/cameras.html")
+REFERENCE = ["reference/coursekit.html", "reference/coursekit/cameras.html"]
+PAGES = [*build_site.page_names().values(), *REFERENCE]
 
 
 @pytest.fixture(scope="module")
@@ -25,26 +17,17 @@ def folder(tmp_path_factory):
     return path
 
 
-@pytest.fixture(scope="module")
-def browser():
-    if CHROMIUM is None and os.environ.get("CI") == "true":
-        pytest.fail("no Chromium, and CI must run this test")
-    if CHROMIUM is None:
-        pytest.skip("not run: no Chromium")
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        arguments = f"{QUIET} {NO_NEWS}".split()
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=arguments)
-        yield browser
-        browser.close()
+@pytest.fixture
+def page(browser):
+    opened = browser.new_page()
+    yield opened
+    opened.close()
 
 
 @pytest.mark.parametrize("width", [1280, 390])
 @pytest.mark.parametrize("name", PAGES)
-def test_a_page_opens_from_disk(folder, browser, name, width):
-    page = browser.new_page(viewport={"width": width, "height": 844})
-    page.set_default_timeout(20_000)
+def test_a_page_opens_from_disk(folder, page, name, width):
+    page.set_viewport_size({"width": width, "height": 844})
     asked, failed, errors = [], [], []
     page.on("request", lambda request: asked.append(request.url))
     page.on("requestfailed", lambda request: failed.append(request.url))
@@ -61,36 +44,27 @@ def test_a_page_opens_from_disk(folder, browser, name, width):
     assert page.locator("h1").is_visible()
     for details in page.locator("details:not(.toc details)").all():
         assert details.get_attribute("open") is None
-    page.close()
 
 
-def test_links_lead_through_the_course(folder, browser):
-    page = browser.new_page()
-    page.set_default_timeout(20_000)
+def test_links_lead_through_the_course(folder, page):
     page.goto((folder / "index.html").as_uri())
     titles = page.locator(".card h3").all_text_contents()
     page.locator(".card a").first.click()
     for title in titles[1:]:
         page.locator("a[rel=next]").first.click()
         assert page.locator("h1").text_content() == title
-    page.close()
 
 
-def test_an_answer_opens(folder, browser):
-    page = browser.new_page()
-    page.set_default_timeout(20_000)
+def test_an_answer_opens(folder, page):
     page.goto((folder / PAGES[1]).as_uri())
     answer = page.locator("details.answer").first
     assert not answer.locator("pre").is_visible()
     answer.locator("summary").click()
     assert answer.locator("pre").is_visible()
-    page.close()
 
 
-def test_fences_are_as_high_as_their_matrix(folder, browser):
+def test_fences_are_as_high_as_their_matrix(folder, page):
     """The font that comes along has the table MATH: without one, nothing stretches."""
-    page = browser.new_page()
-    page.set_default_timeout(20_000)
     page.goto((folder / PAGES[1]).as_uri())
     page.evaluate("document.fonts.ready.then(() => true)")
     heights = page.locator("mo:has(+ mtable), mo + mtable").evaluate_all(
@@ -99,4 +73,3 @@ def test_fences_are_as_high_as_their_matrix(folder, browser):
     assert len(heights) >= 6
     for fence, matrix in zip(heights[::2], heights[1::2], strict=True):
         assert fence == pytest.approx(matrix, rel=0.15)
-    page.close()

@@ -35,7 +35,7 @@ def parts_of(path):
 
 SOURCES = {name: parts for path in PATHS for name, parts in parts_of(path).items()}
 WRONG = [
-    pytest.param(name, answer, id=f"{name}, {answer.style}: {answer.attempt.__name__}")
+    pytest.param(name, answer, id=f"{name}, {answer.name}")
     for name in EXERCISES
     for answer in attempts(name)
 ]
@@ -74,12 +74,12 @@ def test_the_answer_is_right(name):
 @pytest.mark.parametrize(("name", "answer"), WRONG)
 def test_a_wrong_answer_gets_its_verdict(name, answer):
     verdict = EXERCISES[name].judge(answer.attempt)
-    assert (verdict.kind, verdict.named) == (answer.kind, answer.named), verdict
+    assert (verdict.kind, verdict.named) == answer.verdict, verdict
 
 
 @pytest.mark.parametrize("name", EXERCISES)
 def test_every_mistake_that_a_check_names_has_a_wrong_answer(name):
-    named = {answer.named for answer in attempts(name)}
+    named = {answer.verdict[1] for answer in attempts(name)}
     assert {mistake.name for mistake in EXERCISES[name].mistakes} <= named
 
 

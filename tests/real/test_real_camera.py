@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,10 +17,8 @@ NAME = "single_depth_color_640x480.bag"
 
 
 @pytest.fixture(scope="module")
-def folder():
-    if not os.environ.get("COURSEKIT_REAL_DATA"):
-        pytest.skip("COURSEKIT_REAL_DATA is not set: it names the folder of real data")
-    return Path(os.environ["COURSEKIT_REAL_DATA"]) / "realsense_d435"
+def folder(real_data):
+    return real_data / "realsense_d435"
 
 
 @pytest.fixture(scope="module")

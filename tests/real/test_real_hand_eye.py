@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -24,17 +21,9 @@ BOARD_M = np.array([0.0975, 0.1028, 0.3256])
 
 
 @pytest.fixture(scope="module")
-def folder():
-    if not os.environ.get("COURSEKIT_REAL_DATA"):
-        pytest.skip("COURSEKIT_REAL_DATA is not set: it names the folder of real data")
-    return Path(os.environ["COURSEKIT_REAL_DATA"]) / "moveit_hand_eye"
-
-
-@pytest.fixture(scope="module")
-def session(folder):
+def session(moveit_poses):
     """Fifty pairs of arm pose and board pose; the camera stands beside the arm."""
-    samples = np.array(json.loads((folder / "pose_samples.json").read_text(encoding="utf-8")))
-    return he.HandEyeSession("eye_to_hand", samples[:, 0], samples[:, 1])
+    return he.HandEyeSession("eye_to_hand", *moveit_poses)
 
 
 @pytest.mark.parametrize("method", he.METHODS)
@@ -73,8 +62,8 @@ def test_forty_poses_predict_the_other_ten(session):
 
 
 @pytest.mark.parametrize(("old_origin", "off_m"), [(True, 0.0), (False, 0.197)])
-def test_the_published_pose_of_the_board_has_the_old_origin(folder, old_origin, off_m):
-    image = cv2.imread(str(folder / "test_charuco_board_detection.jpg"))
+def test_the_published_pose_of_the_board_has_the_old_origin(real_data, old_origin, off_m):
+    image = cv2.imread(str(real_data / "moveit_hand_eye/test_charuco_board_detection.jpg"))
     board = Board("charuco", (5, 7), 0.1971 / 7, 0.0176, "DICT_5X5_250", old_origin=old_origin)
     lens = Intrinsics(
         640, 480, 590.6972, 592.8468, 322.3310, 247.4003,

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
 
-from coursekit import boards, intrinsics
+from coursekit import intrinsics
 from coursekit.boards import Board, Detection, Detections
 
 pytestmark = pytest.mark.real
@@ -25,18 +22,11 @@ PUBLISHED_PER_VIEW_PX = [
 
 
 @pytest.fixture(scope="module")
-def folder():
-    if not os.environ.get("COURSEKIT_REAL_DATA"):
-        pytest.skip("COURSEKIT_REAL_DATA is not set: it names the folder of real data")
-    return Path(os.environ["COURSEKIT_REAL_DATA"])
-
-
-@pytest.fixture(scope="module")
-def published_corners(folder) -> Detections:
+def published_corners(real_data) -> Detections:
     """Corners as OpenCV's sample finds them: an 11 px half window for cornerSubPix."""
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 0.1)
     views = []
-    for path in sorted((folder / "opencv_chessboard").glob("left*.jpg")):
+    for path in sorted((real_data / "opencv_chessboard").glob("left*.jpg")):
         image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         found, corners = cv2.findChessboardCorners(image, CHESSBOARD.corners)
         assert found
@@ -50,16 +40,6 @@ def published(published_corners) -> intrinsics.IntrinsicsResult:
     return intrinsics.calibrate(published_corners, CHESSBOARD, same_focal=True)
 
 
-@pytest.fixture(scope="module")
-def charuco_views(folder) -> Detections:
-    return boards.detect_all(folder / "opencv_charuco", CHARUCO, progress=False)
-
-
-@pytest.fixture(scope="module")
-def own_corners(folder) -> Detections:
-    return boards.detect_all(folder / "opencv_chessboard", CHESSBOARD, progress=False)
-
-
 def test_the_published_fit_comes_out_with_the_published_settings(published):
     """fx = fy held, five coefficients, 11 px window: within 2 % of the stated sigmas."""
     assert published.converged
@@ -69,10 +49,10 @@ def test_the_published_fit_comes_out_with_the_published_settings(published):
     np.testing.assert_allclose(published.per_view_rms_px, PUBLISHED_PER_VIEW_PX, atol=0.002)
 
 
-def test_the_window_moves_f_by_more_than_its_interval(published, own_corners):
+def test_the_window_moves_f_by_more_than_its_interval(published, checkerboards):
     """With windows as wide as the corners allow, view 02 is as good as any and f is another."""
-    assert len(own_corners) == 13
-    ours = intrinsics.calibrate(own_corners, CHESSBOARD, same_focal=True)
+    assert len(checkerboards) == 13
+    ours = intrinsics.calibrate(checkerboards, CHESSBOARD, same_focal=True)
     assert published.per_view_rms_px[1] > 1.1
     assert ours.per_view_rms_px.max() < 0.3
     assert ours.rms_px == pytest.approx(0.195, abs=0.02)
@@ -80,13 +60,13 @@ def test_the_window_moves_f_by_more_than_its_interval(published, own_corners):
     assert published.value("f") - ours.value("f") > 2.2 * published.sigma("f")
 
 
-def test_halves_agree_in_the_middle_and_differ_by_pixels_at_the_edge(own_corners):
-    both = intrinsics.halves(own_corners, CHESSBOARD)
+def test_halves_agree_in_the_middle_and_differ_by_pixels_at_the_edge(checkerboards):
+    both = intrinsics.halves(checkerboards, CHESSBOARD)
     length = both.length_px
     assert length[10:20, 15:25].max() < 0.15
     assert 5 < length.max() < 40
     assert both.expected_px.max() > 5  # and the covariance says so
-    verdict = intrinsics.calibrate(own_corners, CHESSBOARD).verdict()
+    verdict = intrinsics.calibrate(checkerboards, CHESSBOARD).verdict()
     assert verdict.startswith("Not good enough: in 95 % of the image")
     assert "no corners in the outer tenth" in verdict
 
@@ -111,8 +91,8 @@ def test_diagnose_names_the_artefact_in_view_02(published_corners):
     assert "window" in found["spoiled_view"].remedy
 
 
-def test_diagnose_says_that_the_halves_disagree_at_the_edge(own_corners):
-    found = {f.name: f for f in intrinsics.diagnose(own_corners, CHESSBOARD)}
+def test_diagnose_says_that_the_halves_disagree_at_the_edge(checkerboards):
+    found = {f.name: f for f in intrinsics.diagnose(checkerboards, CHESSBOARD)}
     assert "spoiled_view" not in found
     assert "halves_disagree" in found
 

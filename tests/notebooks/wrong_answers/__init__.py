@@ -1,12 +1,18 @@
 """Wrong answers to the exercises, written as students write them: `<lesson>_<exercise>.py`.
 
-Each function below a `@wrong(...)` is one attempt, written without a look at coursekit's own wrong
-models and in the styles that turn up: vectorised, loops over lists, matrix products.
+A solution stands there once in each style that turns up (vectorised, loops over lists, matrix
+products), below it a table of what is replaced in its text, and what must be said then. Attempts
+that are no solution with a mistake in it are functions of their own, below a `@wrong(...)`.
+
+What must be said is the name of a misconception, or a kind of verdict, or None for an attempt that
+is wrong in a way that has no name. All are written without a look at coursekit's own wrong models.
 """
 
 from __future__ import annotations
 
 import importlib
+import inspect
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -16,25 +22,47 @@ Attempt = Callable[..., Any]
 
 @dataclass(frozen=True)
 class WrongAnswer:
-    """An attempt and the verdict that it must get."""
+    """An attempt, and the verdict that it must get: (kind, name of the misconception)."""
 
+    name: str
     attempt: Attempt
-    kind: str
-    named: str | None
-    style: str
+    verdict: tuple[str, str | None]
 
 
-def wrong(named: str | None, style: str, kind: str = "wrong") -> Callable[[Attempt], Attempt]:
-    """Mark a function as an attempt; `named` is the misconception, None where none can be named."""
+def expected(said: str | None) -> tuple[str, str | None]:
+    return (said, None) if said in ("right", "core right", "raised") else ("wrong", said)
+
+
+def wrong(said: str | None) -> Callable[[Attempt], Attempt]:
+    """Mark a function as an attempt of its own style."""
 
     def mark(attempt: Attempt) -> Attempt:
-        attempt.wrong_answer = WrongAnswer(attempt, kind, named, style)
+        attempt.wrong_answers = [WrongAnswer(attempt.__name__, attempt, expected(said))]
         return attempt
 
     return mark
 
 
+def changed(solution: Attempt, changes: dict[str, str | None]) -> None:
+    """Make attempts of a right solution: {"old -> new and old -> new": what must be said}.
+
+    Each old expression must stand exactly once in the solution's text.
+    """
+    solution.wrong_answers = [WrongAnswer(solution.__name__, solution, ("right", None))]
+    for change, said in changes.items():
+        text = inspect.getsource(solution)
+        for one in change.split(" and "):
+            old, _, new = one.partition(" -> ")
+            assert text.count(old) == 1, f"{solution.__name__}: {old!r} of {change!r}"
+            text = text.replace(old, new)
+        namespace = {"math": math} | solution.__globals__
+        exec(text, namespace)
+        attempt = namespace[solution.__name__]
+        name = f"{solution.__name__}, {change}"
+        solution.wrong_answers.append(WrongAnswer(name, attempt, expected(said)))
+
+
 def attempts(exercise: str) -> list[WrongAnswer]:
-    """The wrong answers to the exercise `lesson.function`."""
+    """The wrong answers to the exercise `lesson.function`, and the solutions they come from."""
     module = importlib.import_module(f"wrong_answers.{exercise.replace('.', '_')}")
-    return [f.wrong_answer for f in vars(module).values() if hasattr(f, "wrong_answer")]
+    return [one for f in vars(module).values() for one in getattr(f, "wrong_answers", ())]
