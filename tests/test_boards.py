@@ -22,7 +22,7 @@ BOTH = pytest.mark.parametrize("board", [CHECKERBOARD, CHARUCO], ids=lambda boar
 OLD = Board("charuco", (9, 6), 0.025, old_origin=True)
 DARK, BRIGHT, AROUND = 30.0, 200.0, 110.0
 FOCAL = 600.0
-OVER = 3  # samples a pixel each way
+OVER = 4  # samples a pixel each way
 
 
 def pose(board, tilt_deg=25.0, roll_deg=10.0, z_m=0.5, shift_m=(0.0, 0.0), axis_deg=30.0):
