@@ -85,9 +85,9 @@ def test_the_old_charuco_origin_is_only_another_frame():
 
 
 def test_light_agrees_with_a_warp_of_the_print_by_opencv(monkeypatch):
-    """OpenCV warps and distorts the print at six times the size, then takes means of 6x6."""
+    """OpenCV warps and distorts the print at four times the size, then takes means of 4x4."""
     monkeypatch.setattr(board_images, "LAMP_FROM_MIDDLE_M", (0.0, 0.0, -1e6))  # even light
-    T, times = pose(CHARUCO, TILTED), 6
+    T, times = pose(CHARUCO, TILTED), 4
     grey = render_board(CHARUCO, T, LENS, None).astype(float)
     light = (grey - board_images.NO_LIGHT_GREY) / LIGHT_GREY
     expected, inside = warped(T, times)
@@ -314,19 +314,14 @@ def test_the_shipped_session_is_small_and_every_board_is_found():
 @pytest.mark.skipif(not NIGHTLY, reason="COURSEKIT_NIGHTLY is not 1: six minutes")
 def test_intervals_of_a_hundred_rendered_sessions_hold_the_truth():
     """95 % intervals from rendered and detected images; at least 90 % must hold the truth."""
-    held = np.array([_interval_holds(1000 + seed) for seed in range(100)])
-    assert held.mean(axis=0).min() >= 0.90, held.mean(axis=0)
-
-
-def _interval_holds(seed):
-    """Whether the intervals of fx, fy, cx, cy, k1 of one session hold the truth, (5,)."""
-    rng = np.random.default_rng([seed, 0])
-    views = []
-    for T in view_poses(CHARUCO, LENS, rng, 20, Effects()):
-        view = see(render_board(CHARUCO, T, LENS, rng), CHARUCO)
-        if view is not None:  # it may be too far for its markers in this noise
-            views.append(view)
-    result = calibrate(views, CHARUCO, LENS.size, model="k1k2p1p2")
     truth = {"fx": LENS.fx, "fy": LENS.fy, "cx": LENS.cx, "cy": LENS.cy, "k1": LENS.coeffs[0]}
-    intervals = {name: result.interval(name) for name in truth}
-    return [intervals[name][0] <= truth[name] <= intervals[name][1] for name in truth]
+    held = np.zeros(len(truth))
+    for seed in range(1000, 1100):
+        rng = np.random.default_rng([seed, 0])
+        poses = view_poses(CHARUCO, LENS, rng, 20, Effects())
+        views = [see(render_board(CHARUCO, T, LENS, rng), CHARUCO) for T in poses]
+        views = [view for view in views if view is not None]  # too far for its markers in the noise
+        result = calibrate(views, CHARUCO, LENS.size, model="k1k2p1p2")
+        low, high = np.transpose([result.interval(name) for name in truth])
+        held += (low <= list(truth.values())) & (list(truth.values()) <= high)
+    assert held.min() >= 90, held
