@@ -497,6 +497,7 @@ def _arrays() -> Kinds:
         "an array's magic only": b"\x93NUMPY\x01\x00",
         "version 2 of NumPy's format": npy(version=b"\x02\x00"),
         "version 3 of NumPy's format": npy(version=b"\x03\x00"),
+        "a header of Python 2": npy(shape="(3L, 4L, 5L)"),
         "code in a header": npy(shape=code),
         "code for a dtype": npy(descr=code),
         "a header of a list of 300 lists": npy(shape="[" * 300 + "]" * 300),

@@ -16,6 +16,7 @@ import math
 import re
 import struct
 import unicodedata
+import warnings
 import zipfile
 import zlib
 from collections.abc import Iterable
@@ -518,7 +519,8 @@ def _array(name: str, content: bytes, dtype: str, rank: int) -> AnyArray:
     file = io.BytesIO(content)
     try:
         version = np.lib.format.read_magic(file)
-        found = np.lib.format.read_array_header_1_0(file, max_header_size=MAX_HEADER)
+        with warnings.catch_warnings(action="error"):  # of a header as Python 2 wrote it
+            found = np.lib.format.read_array_header_1_0(file, max_header_size=MAX_HEADER)
     except Exception:  # a stranger's bytes: the parser may trip over anything
         raise Refused("bad_array", f"{name} is no NumPy array of format 1.0") from None
     shape, fortran, kind = found
