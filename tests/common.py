@@ -10,6 +10,7 @@ from coursekit.boards import Board
 from coursekit.geometry import Intrinsics
 
 NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
+nightly = pytest.mark.skipif(not NIGHTLY, reason="COURSEKIT_NIGHTLY is not 1")
 CHARUCO = Board("charuco", (9, 6), 0.025)
 CHECKERBOARD = Board("checkerboard", (10, 7), 0.025)  # 9 x 6 inner corners
 WIDE = Intrinsics(

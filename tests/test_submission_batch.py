@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from pathlib import Path
@@ -55,6 +55,14 @@ def quick(folder: Path, names: Iterable[str]) -> Path:
 def graded(folder: Path, out: Path, workers: int = 1, **options) -> batch.Summary:
     """`grade_folder` with one process and without a progress bar."""
     return batch.grade_folder(folder, out, workers, progress=False, **options)
+
+
+@pytest.fixture(autouse=True)
+def ctrl_c_is_heard() -> Iterator[None]:
+    """A shell lets what it starts in the background, and its children, ignore SIGINT."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +153,7 @@ def test_every_hostile_bundle_is_a_row_with_its_reason(tmp_path):
         (folder / f"{i:03d}.zip").write_bytes(data)
     summary = graded(folder, out, workers=2)
     assert (summary.graded, summary.refused, summary.failed) == (0, len(cases), 0)
-    assert len(cases) == 193
+    assert len(cases) == 194
     assert [row["status"] for row in table(out)] == [f"not graded: {reason}" for reason, _ in cases]
 
 
@@ -287,7 +295,7 @@ def test_what_failed_is_tried_again(tmp_path, monkeypatch):
 @pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C goes another way there")
 def test_ctrl_c_keeps_what_is_done_and_the_same_command_goes_on(tmp_path, capsys):
     folder, out = quick(tmp_path / "in", ()), tmp_path / "out"
-    for i in range(400):  # some ten seconds of work
+    for i in range(400):  # more than is graded before it is looked at
         (folder / f"{i:03d}.zip").write_bytes((SAMPLES / "ada_good.zip").read_bytes())
     command = ["grade", str(folder), "--out", str(out)]
     here = [sys.executable, "-m", "coursekit.cli", *command, "--workers", "2"]

@@ -316,7 +316,8 @@ def work_through(
     """`work` of each bundle, in processes, as it is finished; never an exception of one.
 
     A bundle that ends its process, or takes too long, has a line that says so. When the pool itself
-    breaks, what was in it is tried once more in a new one.
+    breaks, what was in it is tried once more in a new one, never two such bundles at a time: which
+    of them breaks a pool again is then known.
     Raises ChildProcessError when no process can be started.
     """
     left, again, tried = iter(bundles), list[Bundle](), set[str]()
@@ -324,7 +325,7 @@ def work_through(
         running: dict[Future[Graded], Bundle] = {}
         with _pool(limits) as pool, contextlib.suppress(BrokenProcessPool):
             while True:
-                while len(running) < (1 + AHEAD) * limits.workers:
+                while len(running) < (1 if again else (1 + AHEAD) * limits.workers):
                     bundle = again.pop() if again else next(left, None)
                     if bundle is None:
                         break

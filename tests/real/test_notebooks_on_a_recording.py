@@ -7,6 +7,7 @@ from pathlib import Path
 
 import nbformat
 import pytest
+from common import nightly
 
 from tools import build_notebooks
 
@@ -27,7 +28,11 @@ HONEST = {  # what two frames of one scene cannot give, by cell
 }
 
 
-@pytest.mark.parametrize("path", PATHS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(  # the later ones take little more than a name from the camera
+    "path",
+    [*PATHS[:2], *(pytest.param(path, marks=nightly) for path in PATHS[2:])],
+    ids=lambda path: path.stem,
+)
 def test_every_cell_runs_on_the_recording_and_says_what_it_is(path: Path, tmp_path: Path) -> None:
     bag = Path(os.environ["COURSEKIT_REAL_DATA"], "realsense_d435/single_depth_color_640x480.bag")
     environment = build_notebooks.kernel_environment(tmp_path) | {"COURSEKIT_CAMERA": str(bag)}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from common import nightly
 from scipy.spatial.transform import Rotation
 
 from coursekit.geometry import invert_transform
@@ -39,7 +40,10 @@ def test_millimetres(moveit_poses) -> None:
         assert diagnose(*given).names == ("millimetres",)
 
 
-@pytest.mark.parametrize("kind", ["rotation vectors", "xyz", "XYZ"])
+@pytest.mark.parametrize(
+    "kind",
+    ["rotation vectors", "xyz", pytest.param("XYZ", marks=nightly)],  # half a minute
+)
 def test_degrees(moveit_poses, kind: str) -> None:
     arm, seen = moveit_poses
     turns = Rotation.from_matrix(arm[:, :3, :3])
