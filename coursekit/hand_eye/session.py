@@ -31,7 +31,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import f as f_distribution
 
-from coursekit.arm import Arm, FkErrors, widowx
+from coursekit.arm import Arm, FkErrors, fk_covariance, widowx
 from coursekit.arrays import ArrayLike, Floats, Integers
 from coursekit.boards import Board, Detection, Detections, detect_all
 from coursekit.boards.board import Skipped
@@ -60,6 +60,7 @@ PLACE = ("x", "y", "z")
 TURN = ("qx", "qy", "qz", "qw")
 JOINTS = tuple(f"q{joint}" for joint in range(6))
 OPTIONAL = {"times": ("time",), "q": JOINTS, "dq": tuple(f"d{name}" for name in JOINTS)}
+BELONGS = 0.03  # rad and m, between an arm pose and that of its joint angles: an arm may err so
 UNIT_TOLERANCE = 1e-3  # of a quaternion's length: four digits
 
 
@@ -133,6 +134,14 @@ class HandEyeSession:
         if isinstance(self.seen, Detections):
             return np.stack([pose.T_camera_board for pose in self.board_poses])
         return self.seen
+
+    @property
+    def has_its_joints(self) -> bool:
+        """Whether the joint angles are those of the arm poses, roughly; not of another arm."""
+        if self.q is None:
+            return False
+        off = np.abs(self.arm.forward(self.q) - self.T_base_gripper).max(axis=(1, 2))
+        return float(np.median(off)) < BELONGS
 
     @property
     def corner_sigma_px(self) -> float:
@@ -425,12 +434,14 @@ def solve(
     if method != "refine":
         return HandEyeResult(X, Y, method, session, measured)
     arm, q = (session.arm, session.q) if free_offsets else (None, None)
-    seen: views.Views = views.PoseViews(measured, np.zeros((0, 6, 6)))
-    fit = refinement.refine_poses
+    seen: views.Views = views.PoseViews.exact(measured)
     if session.detections is not None:
-        seen, fit = session.corners(session.corner_sigma_px), refinement.refine_pixels
+        seen = session.corners(session.corner_sigma_px)
+    guessed = fk is None and session.has_its_joints
+    if guessed:
+        fk = replace(e := fk_covariance(session.q, arm=session.arm), each=0 * e.each)
     given = session.T_base_gripper, session.mount, seen
-    best = fit(refinement.Problem(*given, free_scale, arm, q, fk), X, Y)
+    best = refinement.refine(refinement.Problem(*given, free_scale, arm, q, fk, guessed), X, Y)
     return HandEyeResult(best.state.X, best.state.Y, method, session, measured, best)
 
 
