@@ -26,6 +26,8 @@ from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.stats import norm as normal
+from scipy.stats import t as student
 
 from coursekit.arm import Arm, FkErrors
 from coursekit.arrays import Floats
@@ -41,6 +43,7 @@ SCATTER_ROUNDS, SCORING_STEPS = 6, 40  # of estimating how much poses scatter, a
 SETTLED = 1e-2  # of a variance: it is estimated
 LEAST_SCATTER = np.repeat([1e-7, 1e-7], 3)  # rad, m: far below any arm's
 LEAST_FACTOR = 1e-4  # of guessed variances
+BEYOND_CHANCE = 3.3  # sigmas of a correlation: 1 in 2,000 sessions
 FEWEST_TOLD = 5  # poses: with fewer nothing tells how far arm and images disagree
 TWIST = ("rx", "ry", "rz", "tx", "ty", "tz")
 JOINT_OFFSET = "offset of "  # how `arm.fk_covariance` names joint offsets
@@ -429,6 +432,11 @@ class _Scatter:
                 break
         return now
 
+    @property
+    def whitened(self) -> Floats:
+        """The rows (n, 6) in units of their sigmas."""
+        return np.einsum("nji,nj->ni", np.linalg.cholesky(self._inverse), self.rows)
+
     @cached_property
     def _unsure(self) -> Floats:
         """The covariance (k, k) of the sizes."""
@@ -447,7 +455,7 @@ class _Scatter:
         """Degrees of freedom (g,) that the variance of each of the shared unknowns rests on."""
         grows = np.einsum("ab,kbc,ca->ka", self._known, self._by_size, self._known, optimize=True)
         spread = np.einsum("ka,kl,la->a", grows, self._unsure, grows)
-        return 2 * np.diag(self._known) ** 2 / np.maximum(spread, 1e-300)
+        return np.maximum(2 * np.diag(self._known) ** 2 / np.maximum(spread, 1e-300), 1.0)
 
 
 # --- the fit ---
@@ -457,18 +465,22 @@ class _Scatter:
 class Refined:
     """Where the refinement ended.
 
-    covariance (g, g): of the shared unknowns `problem.names`. dof (g,): degrees of freedom of each.
-    sizes (k,): how much poses scatter about and along each axis, rad and m: the gripper's turn and
-    shift, and where only poses are known of the board the board's; then the factor of what fk shares
-    where it was guessed. converged: whether another step
-    would change anything.
+    covariance (g, g): of the shared unknowns `problem.names`, widened for what so few poses leave
+    unknown of their own errors: 1.96 of its sigmas are Student's 95 % interval, infinite below
+    `FEWEST_TOLD` poses. sizes (k,): how much poses scatter about and along each axis, rad and m: the
+    gripper's turn and shift, and where only poses are known of the board the board's; then the
+    factor on the sigmas of what fk shares where it was guessed. alike: correlation of successive
+    poses' own errors, 0 unless it is beyond chance; the covariance is wider for it. far (n,): the
+    size of each pose's own error, in sigmas of an axis. converged: whether another step would
+    change anything.
     """
 
     problem: Problem
     state: State
     covariance: Floats
-    dof: Floats
     sizes: Floats
+    alike: float
+    far: Floats
     converged: bool
 
 
@@ -488,8 +500,20 @@ def refine(problem: Problem, X: Floats, Y: Floats) -> Refined:
         scatter = _Scatter.of(problem, state, scatter.sizes)
         if np.allclose(before, scatter.sizes, rtol=0.02, atol=0):
             break
-    sizes = np.sqrt(scatter.sizes)
-    return Refined(problem, state, scatter.covariance, scatter.dof, sizes, converged)
+    far = scatter.whitened
+    alike = _alike(far)
+    wider = student.ppf(0.975, scatter.dof) / normal.ppf(0.975) * np.sqrt((1 + alike) / (1 - alike))
+    covariance = scatter.covariance * np.outer(wider, wider)
+    if n < FEWEST_TOLD:
+        covariance = np.diag(np.full(len(wider), np.inf))
+    sizes, far = np.sqrt(scatter.sizes), np.sqrt(np.mean(far**2, axis=1))
+    return Refined(problem, state, covariance, sizes, alike, far, converged)
+
+
+def _alike(errors: Floats) -> float:
+    """The correlation of successive rows (n, 6), each of unit variance; 0 where chance does it."""
+    along = float(np.sum(errors[1:] * errors[:-1]) / max(np.sum(errors**2), 1e-300))
+    return along if along * np.sqrt(errors.size) > BEYOND_CHANCE else 0.0
 
 
 def _minimise(problem: Problem, state: State) -> tuple[State, bool]:
