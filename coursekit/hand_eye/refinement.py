@@ -33,7 +33,7 @@ from coursekit.arm import Arm, FkErrors
 from coursekit.arrays import Floats
 from coursekit.geometry import cross_matrix, turned
 from coursekit.hand_eye.poses import Mount, by_arm_twist, by_X_and_Y, camera_board
-from coursekit.hand_eye.views import PoseViews, Views
+from coursekit.hand_eye.views import PixelViews, PoseViews, Views
 from coursekit.intrinsics.derivatives import scaled_inverse
 
 GAUSS_NEWTON_STEPS, STEP_HALVINGS = 50, 10
@@ -337,6 +337,8 @@ class _Scatter:
         stated, parts = problem.own_parts(state)
         shared = np.arange(len(at.prior)) >= len(at.prior) - problem.shared.shape[2]
         guessed = shared * float(problem.guessed)
+        if isinstance(problem.views, PixelViews):
+            parts = np.concatenate([parts, image[None]])
         image = image + stated + np.diag(LEAST_SCATTER**2)
         values, prior = problem.with_prior(state), np.where(shared, 1.0, at.prior)
         return cls(rows, columns, image, parts, prior, guessed, values, sizes)
@@ -416,11 +418,16 @@ class _Scatter:
         trace -= np.einsum("ab,kba->k", self._known, self._by_size)
         return (squares - trace) / 2
 
+    @cached_property
+    def _least(self) -> Floats:
+        """Of the sizes, (k,): smaller ones are none."""
+        least = np.full(len(self.sizes), LEAST_SCATTER[0] ** 2)
+        least[len(self.parts) :] = LEAST_FACTOR
+        return least
+
     def estimated(self) -> _Scatter:
         """With the most likely sizes: Fisher scoring; a size that wants to be negative is least."""
-        now, least = self, np.full(len(self.sizes), LEAST_SCATTER[0] ** 2)
-        if self.guessed.any():
-            least[-1] = LEAST_FACTOR
+        now, least = self, self._least
         for _ in range(SCORING_STEPS):
             slope, step = now._slope(), np.zeros(len(least))
             free = (now.sizes > least) | (slope > 0)
@@ -439,8 +446,11 @@ class _Scatter:
 
     @cached_property
     def _unsure(self) -> Floats:
-        """The covariance (k, k) of the sizes."""
-        return determined_inverse(self._of_sizes)
+        """The covariance (k, k) of the sizes; one that is nothing is known to be."""
+        some = self.sizes > 2 * self._least
+        unsure = np.zeros_like(self._of_sizes)
+        unsure[np.ix_(some, some)] = determined_inverse(self._of_sizes[np.ix_(some, some)])
+        return unsure
 
     @cached_property
     def covariance(self) -> Floats:
@@ -490,7 +500,8 @@ def refine(problem: Problem, X: Floats, Y: Floats) -> Refined:
     state = State(X, Y, 1.0, np.zeros(6), np.zeros(k), np.zeros((n, 6)))
     scatter = _Scatter.of(problem, state, np.zeros(0))
     turn_shift = np.mean(scatter.rows.reshape(n, 2, 3) ** 2, axis=(0, 2))
-    sizes = np.resize(turn_shift / (len(scatter.parts) / 2), len(scatter.parts))
+    sizes = np.resize(turn_shift / 2, len(scatter.parts))
+    if isinstance(problem.views, PixelViews): sizes[-1]=1.0
     scatter = replace(scatter, sizes=np.append(sizes, [1.0] * problem.guessed))
     for _ in range(SCATTER_ROUNDS):
         before, scatter = scatter.sizes, scatter.estimated()
