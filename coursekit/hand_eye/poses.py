@@ -44,7 +44,7 @@ WRITTEN_TOLERANCE = 1e-4  # of R R^T: poses are often written with five digits
 SCATTER = np.repeat([np.radians(0.1), 0.5e-3], 3)
 LEVER_M = 0.3  # a rotation of X counts by what it does this far in front of the camera
 IN_METRES = np.array([LEVER_M, LEVER_M, LEVER_M, 1.0, 1.0, 1.0])  # times (omega, v)
-# Arm poses no farther apart, (omega, v) in rad and m, are one pose, if the board is not seen to move.
+# Arm poses no farther apart, rad and m, are one pose, if the board is not seen to move by more.
 SAME_POSE, SAME_SIGHT = (np.radians(0.1), 1e-3), (np.radians(3.0), 0.01)
 FREE_M = 0.03  # a direction known no better than this is free: nobody would mount a camera so
 

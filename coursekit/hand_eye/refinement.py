@@ -7,10 +7,11 @@ those seven numbers. Gauss-Newton with halved steps does the rest.
 
 An arm is not where it says. What belongs to the unit (`arm.FkErrors`: joint offsets, links) moves
 all poses together; where it is stated it is unknown, with Gaussian priors. What is drawn anew at
-each pose (repeatability, gear play, an arm that still swings) is there in every session, stated or
-not: a turn and a shift of the gripper, and where only poses are known of the board of those too. A
-view of 54 corners is one witness of one pose, so the size of these own errors decides how much is
-known. `_Scatter` estimates it. They are six numbers a pose, and each touches one view only: they
+each pose (repeatability, gear play, an arm that still swings, a board that is not flat) is there in
+every session, stated or not: a turn and a shift of the gripper, and of the camera an error like
+that of its corners' noise, or a turn of the board where only its poses are known. A view of 54
+corners is one witness of one pose, so the size of these own errors decides how much is known.
+`_Scatter` estimates it. They are six numbers a pose, and each touches one view only: they
 are eliminated view by view (Schur complement).
 
 Sources: Triggs et al., "Bundle adjustment: a modern synthesis" (2000), sections 4 and 6. The sizes,
@@ -31,7 +32,7 @@ from scipy.stats import t as student
 
 from coursekit.arm import Arm, FkErrors
 from coursekit.arrays import Floats
-from coursekit.geometry import cross_matrix, turned
+from coursekit.geometry import cross_matrix, pose_difference, turned
 from coursekit.hand_eye.poses import Mount, by_arm_twist, by_X_and_Y, camera_board
 from coursekit.hand_eye.views import PixelViews, PoseViews, Views
 from coursekit.intrinsics.derivatives import scaled_inverse
@@ -41,8 +42,8 @@ NEGLIGIBLE_DECREASE = 1e-8  # of the sum of squares by a step: 1e-4 standard dev
 UNDETERMINED = 1e-13  # of the largest eigenvalue of the scaled information: nobody moves along it
 SCATTER_ROUNDS, SCORING_STEPS = 6, 40  # of estimating how much poses scatter, and within a round
 SETTLED = 1e-2  # of a variance: it is estimated
-LEAST_SCATTER = np.repeat([1e-7, 1e-7], 3)  # rad, m: far below any arm's
-LEAST_FACTOR = 1e-4  # of guessed variances
+LEAST_OWN = 1e-14 * np.eye(6)  # rad^2, m^2: a pose's own error of which nothing is known
+LEAST_FACTOR, MOST_FACTOR = 1e-4, 4.0  # of guessed variances: no unit is twice as bad as most
 BEYOND_CHANCE = 3.3  # sigmas of a correlation: 1 in 2,000 sessions
 FEWEST_TOLD = 5  # poses: with fewer nothing tells how far arm and images disagree
 TWIST = ("rx", "ry", "rz", "tx", "ty", "tz")
@@ -170,12 +171,12 @@ class Problem:
         """Of what the own errors may be: the stated covariance (n, 6, 6), and that of each size.
 
         The latter (k, n, 6, 6) is for a size of 1 rad or m about and along each axis: a turn and a
-        shift of the gripper, and where only poses are known a turn and a shift of the board.
+        shift of the gripper, and where only poses are known a turn of the board.
         """
         by_arm = by_arm_twist(self._arm_poses(state), state.X, state.Y, self.mount)
         halves = [by_arm[..., :3], by_arm[..., 3:]]
-        if isinstance(self.views, PoseViews):
-            halves += [np.broadcast_to(half, (len(by_arm), 6, 3)) for half in np.eye(6).reshape(6, 2, 3).swapaxes(0, 1)]
+        if isinstance(self.views, PoseViews):  # a shift of the board is one of the gripper
+            halves.append(np.broadcast_to(np.eye(6, 3), by_arm[..., :3].shape))
         stated = np.zeros_like(by_arm)
         if self.fk is not None:
             stated = by_arm @ self.fk.each @ np.swapaxes(by_arm, 1, 2)
@@ -300,7 +301,7 @@ class Equations:
 
 def determined_inverse(matrix: Floats) -> Floats:
     """The pseudo-inverse that leaves alone what the data say nothing about."""
-    scale = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
+    scale = np.sqrt(np.where(np.diag(matrix) > 0, np.diag(matrix), 1.0))
     units = np.outer(scale, scale)
     return np.linalg.pinv(matrix / units, rcond=UNDETERMINED, hermitian=True) / units
 
@@ -339,7 +340,7 @@ class _Scatter:
         guessed = shared * float(problem.guessed)
         if isinstance(problem.views, PixelViews):
             parts = np.concatenate([parts, image[None]])
-        image = image + stated + np.diag(LEAST_SCATTER**2)
+        image = image + stated + LEAST_OWN
         values, prior = problem.with_prior(state), np.where(shared, 1.0, at.prior)
         return cls(rows, columns, image, parts, prior, guessed, values, sizes)
 
@@ -355,7 +356,7 @@ class _Scatter:
 
     @cached_property
     def _inverse(self) -> Floats:
-        return np.linalg.inv(self.image + self.own)
+        return np.asarray(np.linalg.inv(self.image + self.own))
 
     @cached_property
     def _weighted(self) -> Floats:
@@ -421,7 +422,7 @@ class _Scatter:
     @cached_property
     def _least(self) -> Floats:
         """Of the sizes, (k,): smaller ones are none."""
-        least = np.full(len(self.sizes), LEAST_SCATTER[0] ** 2)
+        least = np.full(len(self.sizes), LEAST_OWN[0, 0])
         least[len(self.parts) :] = LEAST_FACTOR
         return least
 
@@ -433,6 +434,7 @@ class _Scatter:
             free = (now.sizes > least) | (slope > 0)
             step[free] = determined_inverse(now._of_sizes[np.ix_(free, free)]) @ slope[free]
             sizes = np.clip(now.sizes + step, np.maximum(now.sizes / 10, least), 10 * now.sizes)
+            sizes[len(self.parts) :] = np.minimum(sizes[len(self.parts) :], MOST_FACTOR)
             settled = np.allclose(sizes, now.sizes, rtol=SETTLED, atol=0)
             now = replace(now, sizes=sizes)
             if settled:
@@ -477,9 +479,10 @@ class Refined:
 
     covariance (g, g): of the shared unknowns `problem.names`, widened for what so few poses leave
     unknown of their own errors: 1.96 of its sigmas are Student's 95 % interval, infinite below
-    `FEWEST_TOLD` poses. sizes (k,): how much poses scatter about and along each axis, rad and m: the
-    gripper's turn and shift, and where only poses are known of the board the board's; then the
-    factor on the sigmas of what fk shares where it was guessed. alike: correlation of successive
+    `FEWEST_TOLD` poses. sizes (k,): how much poses scatter about and along each axis: the gripper's
+    turn and shift, rad and m; of images the error beyond their corners' noise in units of that
+    noise, or of poses the board's turn, rad; and, where they were guessed, the factor on the sigmas
+    of what fk shares. alike: correlation of successive
     poses' own errors, 0 unless it is beyond chance; the covariance is wider for it. far (n,): the
     size of each pose's own error, in sigmas of an axis. converged: whether another step would
     change anything.
@@ -494,22 +497,28 @@ class Refined:
     converged: bool
 
 
-def refine(problem: Problem, X: Floats, Y: Floats) -> Refined:
-    """The most probable state of a problem, from a start X, Y that is roughly right."""
+def refine(problem: Problem, X: Floats, Y: Floats, measured: Floats) -> Refined:
+    """The most probable state of a problem, from a start X, Y that is roughly right.
+
+    measured (n, 4, 4): T_camera_board as each view by itself says, where the own errors start from.
+    """
     n, _, k = problem.shared.shape
     state = State(X, Y, 1.0, np.zeros(6), np.zeros(k), np.zeros((n, 6)))
-    scatter = _Scatter.of(problem, state, np.zeros(0))
-    turn_shift = np.mean(scatter.rows.reshape(n, 2, 3) ** 2, axis=(0, 2))
-    sizes = np.resize(turn_shift / 2, len(scatter.parts))
-    if isinstance(problem.views, PixelViews): sizes[-1]=1.0
-    scatter = replace(scatter, sizes=np.append(sizes, [1.0] * problem.guessed))
+    own = pose_difference(problem.camera_board(state), measured)
+    problem = replace(problem, own_root=np.tile(np.eye(6), (n, 1, 1)))
+    scatter = _Scatter.of(problem, replace(state, own=own), np.zeros(0))
+    scatter = replace(
+        scatter, sizes=_first_sizes(own, scatter, isinstance(problem.views, PixelViews))
+    )
     for _ in range(SCATTER_ROUNDS):
         before, scatter = scatter.sizes, scatter.estimated()
-        own = scatter.own + problem.own_parts(state)[0] + np.diag(LEAST_SCATTER**2)
-        problem = replace(problem, own_root=np.linalg.cholesky(own), factor=scatter.factor)
-        state, converged = _minimise(problem, replace(state, own=np.zeros((n, 6))))
-        scatter = _Scatter.of(problem, state, scatter.sizes)
-        if np.allclose(before, scatter.sizes, rtol=0.02, atol=0):
+        covariance = scatter.own + problem.own_parts(state)[0] + LEAST_OWN
+        root = np.asarray(np.linalg.cholesky(covariance))
+        problem = replace(problem, own_root=root, factor=scatter.factor)
+        state = replace(state, own=np.linalg.solve(root, own[..., None])[..., 0])
+        state, converged = _minimise(problem, state)
+        own, scatter = problem.own_twists(state), _Scatter.of(problem, state, scatter.sizes)
+        if np.allclose(before, scatter.sizes, rtol=2 * SETTLED, atol=0):
             break
     far = scatter.whitened
     alike = _alike(far)
@@ -519,6 +528,13 @@ def refine(problem: Problem, X: Floats, Y: Floats) -> Refined:
         covariance = np.diag(np.full(len(wider), np.inf))
     sizes, far = np.sqrt(scatter.sizes), np.sqrt(np.mean(far**2, axis=1))
     return Refined(problem, state, covariance, sizes, alike, far, converged)
+
+
+def _first_sizes(own: Floats, scatter: _Scatter, of_pixels: bool) -> Floats:
+    """Sizes (k,) to start from, given how far each view is from where it should be, (n, 6)."""
+    turn_shift = np.mean(own.reshape(-1, 2, 3) ** 2, axis=(0, 2)) / 2 + LEAST_OWN[0, 0]
+    last = 1.0 if of_pixels else turn_shift[0]
+    return np.array([*turn_shift, last, *[1.0] * bool(scatter.guessed.any())])
 
 
 def _alike(errors: Floats) -> float:

@@ -25,7 +25,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -186,8 +186,10 @@ class HandEyeSession:
         counts = self.first_alike == np.arange(len(self))
         if counts.all():
             return self
-        repeats = [Skipped(self.names[i], f"{REPEATS} {self.names[self.first_alike[i]]}")
-                   for i in np.flatnonzero(~counts)]
+        repeats = [
+            Skipped(self.names[i], f"{REPEATS} {self.names[self.first_alike[i]]}")
+            for i in np.flatnonzero(~counts)
+        ]
         return replace(self.pick(np.flatnonzero(counts)), skipped=(*self.skipped, *repeats))
 
     @property
@@ -415,7 +417,7 @@ def solve(
     *,
     free_scale: bool = False,
     free_offsets: bool = False,
-    fk: FkErrors | None = None,
+    fk: FkErrors | Literal["usual"] | None = "usual",
     guess: ArrayLike | None = None,
 ) -> HandEyeResult:
     """Where the camera is, from arm poses and what the camera saw at each.
@@ -430,10 +432,13 @@ def solve(
     where no detections are given), "closed_form" (rotation first, then translation), OpenCV's
     "tsai", "park", "horaud", "andreff", "daniilidis", and its robot-world "shah", "li".
 
-    With "refine" only: free_scale also estimates how much larger the board is than it says;
-    free_offsets also estimates the offsets of the session's joint angles; fk weighs the arm's
-    errors (`arm.fk_covariance` at the session's q). guess (4, 4): an X to start from, in place of
-    the closed form.
+    How far arm and images disagree from pose to pose is estimated, and is in every interval; equal
+    or nearly equal pairs count once. With "refine" only: free_scale also estimates how much larger
+    the board is than it says; free_offsets also estimates the offsets of the session's joint
+    angles. fk: what the arm errs by in all poses alike: errors whose sizes are known
+    (`arm.fk_covariance` at the session's q), None for none, or "usual": those of `ArmErrors`, as
+    large as the session shows them to be, where the arm poses are those of its joint angles. guess
+    (4, 4): an X to start from, in place of the closed form.
 
     Raises ValueError that names the argument for fewer than three poses and for images without a
     pose; NotDetermined where the arm did not turn about two axes; SolverFailed where a solver's
@@ -445,17 +450,18 @@ def solve(
     array([0., 0., 0.])
     """
     choice("method", method, METHODS)
-    asked = {"free_scale": free_scale, "free_offsets": free_offsets, "fk": fk, "guess": guess}
+    stated = fk if isinstance(fk, FkErrors) else None
+    asked = {"free_scale": free_scale, "free_offsets": free_offsets, "fk": stated, "guess": guess}
     for name, value in asked.items():
         refined = value is None or value is False or method == "refine"
         want(refined, "method", method, f"'refine' with {name}: a closed form has none")
     want(not free_offsets or session.q is not None, "q", None, "joint angles, to free_offsets")
-    if fk is not None:
+    if stated is not None:
         n = len(session)
         want(session.detections is not None, "seen", "poses", "detections, to weigh fk against")
-        want(fk.each.shape == (n, 6, 6), "fk", fk.each.shape, f"({n}, 6, 6), one an arm pose")
-        rows = session.first_alike == np.arange(n)
-        fk = replace(fk, shared=fk.shared[rows], each=fk.each[rows])
+        want(stated.each.shape == (n, 6, 6), "fk", stated.each.shape, f"({n}, 6, 6), one a pose")
+        counts = session.first_alike == np.arange(n)
+        stated = replace(stated, shared=stated.shared[counts], each=stated.each[counts])
     session = session.once
     n = len(session)
     want(n >= FEWEST_POSES, "T_base_gripper", n, f"at least {FEWEST_POSES} poses that differ")
@@ -467,12 +473,13 @@ def solve(
     seen: views.Views = views.PoseViews.exact(measured)
     if session.detections is not None:
         seen = session.corners(session.corner_sigma_px)
-    guessed = fk is None and session.has_its_joints
-    if guessed:
-        fk = fk_covariance(session.q, arm=session.arm)  # type: ignore[arg-type]
-        fk = replace(fk, each=np.zeros_like(fk.each))  # estimated
+    usual = fk == "usual" and not free_offsets and session.has_its_joints
+    if usual:
+        stated = fk_covariance(session.q, arm=session.arm)  # type: ignore[arg-type]
+        stated = replace(stated, each=np.zeros_like(stated.each))  # estimated
     given = session.T_base_gripper, session.mount, seen
-    best = refinement.refine(refinement.Problem(*given, free_scale, arm, q, fk, guessed), X, Y)
+    problem = refinement.Problem(*given, free_scale, arm, q, stated, usual)
+    best = refinement.refine(problem, X, Y, measured)
     return HandEyeResult(best.state.X, best.state.Y, method, session, measured, best)
 
 
@@ -754,7 +761,8 @@ class HandEyeResult(Estimate):
         corners = pixels = ""
         if detections is not None:
             corners = f", {sum(len(seen.ids) for seen in detections)} corners"
-            pixels = f"{self.rms_px:.2f} px, "
+            behind = "the board would be behind the camera, "
+            pixels = f"{self.rms_px:.2f} px, " if math.isfinite(self.rms_px) else behind
         unsure = "" if self.judgement.trusted else "; NOT TO BE TRUSTED, see verdict()"
         lines = [
             f"{self.mount}, {self.method}, {len(self.session)} poses{corners}{unsure}",
@@ -803,7 +811,8 @@ class HandEyeResult(Estimate):
 
     @property
     def _untold(self) -> str:
-        return f"how far off that is cannot be told from {len(self.session)} poses"
+        poses, least = len(self.session), refinement.FEWEST_TOLD
+        return f"how far off it is cannot be told from {poses} poses, {least} is the least"
 
     def verdict(self) -> str:
         """In words: how far to trust X, and what to do about what is weak."""
@@ -822,7 +831,7 @@ class HandEyeResult(Estimate):
         if not judged.trusted:
             return f"{judged.grade}: the intervals hold for sessions without such faults only."
         if math.isinf(judged.worst_mm):
-            return f"{judged.grade}: {self._untold}."
+            return f"{judged.grade} how good it is: {self._untold}."
         return (
             f"{judged.grade}: a point {1e3 * LEVER_M:.0f} mm in front of the camera is placed "
             f"within ± {judged.worst_mm:.1f} mm (95 %, worst direction), as far as the mount goes."
