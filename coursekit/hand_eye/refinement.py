@@ -515,8 +515,8 @@ def refine(problem: Problem, X: Floats, Y: Floats, measured: Floats) -> Refined:
         covariance = scatter.own + problem.own_parts(state)[0] + LEAST_OWN
         root = np.asarray(np.linalg.cholesky(covariance))
         problem = replace(problem, own_root=root, factor=scatter.factor)
-        state = replace(state, own=np.linalg.solve(root, own[..., None])[..., 0])
-        state, converged = _minimise(problem, state)
+        u = np.asarray(np.linalg.solve(root, own[..., None]))[..., 0]
+        state, converged = _minimise(problem, replace(state, own=u))
         own, scatter = problem.own_twists(state), _Scatter.of(problem, state, scatter.sizes)
         if np.allclose(before, scatter.sizes, rtol=2 * SETTLED, atol=0):
             break

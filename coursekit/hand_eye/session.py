@@ -518,7 +518,7 @@ GOOD_TURN_DEG = 15.0  # rms about the second axis: +-25 deg or so
 
 
 @dataclass(frozen=True)
-class Judgement:
+class Trust:
     """How far to trust a result: what its repr, its `verdict()` and `diagnose` have in common.
 
     worst_mm: the 95 % interval, worst direction, of where X puts a point `LEVER_M` in front of the
@@ -533,7 +533,7 @@ class Judgement:
     broken: tuple[str, ...] = ()
 
     @property
-    def trusted(self) -> bool:
+    def given(self) -> bool:
         """Whether the intervals hold what they should."""
         return not self.broken
 
@@ -709,7 +709,7 @@ class HandEyeResult(Estimate):
         return observability(self.session.T_base_gripper, self.mount).free
 
     @cached_property
-    def judgement(self) -> Judgement:
+    def trust(self) -> Trust:
         """How far to trust X, and why; of a closed form only what its poses and residuals say."""
         known = observability(self.session.T_base_gripper, self.mount)
         weak = [f"{direction}: the poses do not determine it." for direction in known.free]
@@ -728,7 +728,7 @@ class HandEyeResult(Estimate):
                 "intervals are wider for it."
             )
         worst = self.quantile() * self.reach_sigma_mm if self.refined is not None else math.inf
-        return Judgement(worst, tuple(weak), self._disagreement(), tuple(self._broken()))
+        return Trust(worst, tuple(weak), self._disagreement(), tuple(self._broken()))
 
     def _disagreement(self) -> str:
         """That arm and images disagree by more than arms that stand still do, or ""."""
@@ -763,7 +763,7 @@ class HandEyeResult(Estimate):
             corners = f", {sum(len(seen.ids) for seen in detections)} corners"
             behind = "the board would be behind the camera, "
             pixels = f"{self.rms_px:.2f} px, " if math.isfinite(self.rms_px) else behind
-        unsure = "" if self.judgement.trusted else "; NOT TO BE TRUSTED, see verdict()"
+        unsure = "" if self.trust.given else "; NOT TO BE TRUSTED, see verdict()"
         lines = [
             f"{self.mount}, {self.method}, {len(self.session)} poses{corners}{unsure}",
             self._pose_line(name_X, self.X, 0),
@@ -807,7 +807,7 @@ class HandEyeResult(Estimate):
     @property
     def _level(self) -> str:
         """What an interval holds, said only where it does."""
-        return " (95 %)" if self.judgement.trusted else ""
+        return " (95 %)" if self.trust.given else ""
 
     @property
     def _untold(self) -> str:
@@ -816,7 +816,7 @@ class HandEyeResult(Estimate):
 
     def verdict(self) -> str:
         """In words: how far to trust X, and what to do about what is weak."""
-        judged = self.judgement
+        judged = self.trust
         reasons = [*([judged.large] if judged.large else []), *judged.broken, *judged.weak]
         return "\n".join(map(wrapped, [self._head(), *(f"- {reason}" for reason in reasons)]))
 
@@ -827,8 +827,8 @@ class HandEyeResult(Estimate):
                 f"Uncertain: {self.method} says nothing about its own error. Solve with 'refine' "
                 "for an interval."
             )
-        judged = self.judgement
-        if not judged.trusted:
+        judged = self.trust
+        if not judged.given:
             return f"{judged.grade}: the intervals hold for sessions without such faults only."
         if math.isinf(judged.worst_mm):
             return f"{judged.grade} how good it is: {self._untold}."
