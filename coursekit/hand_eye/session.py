@@ -29,7 +29,6 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import f as f_distribution
 
 from coursekit.arm import Arm, FkErrors, widowx
 from coursekit.arrays import ArrayLike, Floats, Integers
@@ -640,7 +639,9 @@ class HandEyeResult(Estimate):
 
         With `fk` it is rough: how much play a unit has differs from unit to unit.
         """
-        return float(f_distribution.sf(self.excess, *self._degrees))
+        from scipy.stats import f  # two seconds to load; a camera's first frame needs none of it
+
+        return float(f.sf(self.excess, *self._degrees))
 
     # --- in words ---
 
