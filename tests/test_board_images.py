@@ -4,7 +4,7 @@ COURSEKIT_NIGHTLY=1 renders, detects and calibrates a hundred sessions.
 """
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import cv2
@@ -185,7 +185,8 @@ def test_a_rolling_shutter_moves_corners_as_predicted_for_each_row():
     error = found.pixels - moved[found.ids]
     assert np.sqrt((error**2).mean()) < 0.025
     points = transform_points(T, board.points)
-    theirs = rolling_shutter(points, velocity, readout_s, LENS.height, LENS.K, LENS.dist)
+    see = partial(project, K=LENS.K, dist=LENS.dist)
+    theirs = rolling_shutter(points, velocity, readout_s, LENS.height, see)
     np.testing.assert_allclose(np.asarray(theirs)[..., :2].reshape(-1, 2), moved, atol=0.02)
 
 

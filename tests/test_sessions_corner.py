@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from simulated_corners import CHARUCO, CHECKERBOARD, LENS
 
 from coursekit.boards import Board
-from coursekit.geometry import Intrinsics
+from coursekit.geometry import Intrinsics, project
 from coursekit.simulation.corner_sessions import Effects, bowed, corner_session, rolling_shutter
 
 BOWED, LARGER = bowed(CHECKERBOARD, 1e-3), 1.03 * CHECKERBOARD.points
@@ -171,5 +171,8 @@ test_what_cannot_be_is_refused = refusals(
     *named(Effects, inner_only=[0.4], blur_share=[1.5], square_scale=[0.0]),
     *named(session, views=[0], noise_px=[-1]),
     ("board: 3.000 x 2.100 m does not fit", lambda: session(replace(CHECKERBOARD, square_m=0.3))),
-    ("velocity: 500 m/s", lambda: rolling_shutter(FAR, FAST, 0.02, 480, LENS.K, None)),
+    (
+        "velocity: 500 m/s",
+        lambda: rolling_shutter(FAR, FAST, 0.02, 480, lambda p: project(p, LENS.K)),
+    ),
 )
