@@ -42,12 +42,12 @@ def fit(board: Board, seed: int, **session) -> intrinsics.IntrinsicsResult:
 
 
 def ordinary_session(seed: int, **more) -> tuple[Detections, Truth, Board]:
-    """Both kinds of board, four lenses, 15 to 40 views and noise of 0.04 to 0.2 px in turn.
+    """Both kinds of board, four lenses, 15 to 40 views and noise of 0.04 to 0.15 px in turn.
 
     more: fields of Effects, what else the session has.
     """
     board, lens = BOARDS[seed % 2], LENSES[(seed // 2) % 4]
-    noise_px = 0.04 * 5 ** ((seed % 11) / 10)
+    noise_px = 0.04 * 4 ** ((seed % 11) / 10)
     effects = replace(ordinary(seed), **more)
     views = 15 + (7 * seed) % 26
     return *corner_session(board, lens, seed, views, noise_px, effects), board

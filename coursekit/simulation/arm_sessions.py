@@ -205,12 +205,12 @@ def hand_eye_session(
     truth, q, dq = _poses(mount, seed, n, arm_errors, mistakes or HandEyeMistakes())
     board, effects, street = truth.setup.board, images or Effects(), _stream(seed, b"street")
     points = printed(board, effects, street) * truth.mistakes.square_scale
-    rng, found = _stream(seed, b"corners"), []
+    rng, ids, found = _stream(seed, b"corners"), np.arange(len(points)), []
     for view in range(len(q)):
-        scale = np.exp(effects.noise_spread * street.normal())
-        noise = corner_noise(rng, len(points), scale * corner_noise_px)
-        noise = with_street_errors(noise, board, np.arange(len(points)), effects, street, scale)
-        found.append(_corners(truth, view, points, noise, effects.claimed * corner_noise_px))
+        sigma_px = corner_noise_px * np.exp(effects.noise_spread * street.normal())
+        noise = corner_noise(rng, len(points), sigma_px)
+        noise = with_street_errors(noise, sigma_px, board, ids, effects, street)
+        found.append(_corners(truth, view, points, noise, effects.claimed * sigma_px))
     return _reported(truth, q, dq, Detections(found)), truth
 
 
