@@ -66,7 +66,7 @@ class RealSense(Camera):
         if (serial is None) == (path is None):
             raise ValueError("serial, path: got both or neither, want exactly one")
         self._rs = load_librealsense()
-        self._path, self._pipeline, self._infrared = path, None, infrared
+        self._path, self._running, self._infrared = path, None, infrared
         self._what = f"the RealSense {serial}"
         self.source, self.serial, self.can_place = "live", serial or "", path is None
         if path is not None:
@@ -96,11 +96,7 @@ class RealSense(Camera):
             pipeline = self._rs.pipeline()
             config = self._playback_config(pipeline) if self._path else self._live_config()
             self._profile = pipeline.start(config)
-            if self._path:
-                # resume() waits for the reading thread, and for 10 s if that reaches the end of a
-                # short or damaged file first; so it waits in a thread of its own.
-                playback = self._profile.get_device().as_playback()
-                threading.Thread(target=playback.resume, daemon=True).start()
+            playback = self._profile.get_device().as_playback() if self._path else None
         except CameraError:
             raise
         except RuntimeError as error:
@@ -111,7 +107,8 @@ class RealSense(Camera):
                 f"{self._what} cannot be read: it is damaged, incomplete or not from a RealSense; "
                 f"copy it again or record it anew (librealsense says: {reason})"
             ) from error
-        self._pipeline = pipeline
+        self._running = _Running(pipeline, playback)
+        self._stop = weakref.finalize(self, self._running.stop)
 
     def _live_config(self) -> Any:
         rs, config = self._rs, self._rs.config()
@@ -156,7 +153,7 @@ class RealSense(Camera):
         return {p.stream_index() for p in grey if p.stream_type() == rs.stream.infrared} >= {1, 2}
 
     def _check_open(self) -> None:
-        if self._pipeline is None:
+        if self._running is None:
             raise CameraError(f"{self._what} is closed: open it again with open_camera()")
 
     def _depth_sensor(self) -> Any:
@@ -164,12 +161,9 @@ class RealSense(Camera):
 
     def close(self) -> None:
         """Stop the camera, or close the file; a second call does nothing."""
-        pipeline, self._pipeline = self._pipeline, None
-        if pipeline is not None:
-            if self._path is not None:
-                _halt(pipeline, self._profile.get_device().as_playback())
-            with contextlib.suppress(RuntimeError):  # an unplugged camera cannot be stopped
-                pipeline.stop()
+        running, self._running = self._running, None
+        if running is not None:
+            self._stop()
 
     # --- what the device says about itself -----------------------------------------------------
 
@@ -250,14 +244,14 @@ class RealSense(Camera):
         """The next group of images; None once a recording has ended."""
         ended = False
         for _ in range(MOST_POLLS):
-            if self._pipeline is None:
-                raise CameraError(f"{self._what} was closed while it was giving frames")
             try:
-                arrived, frameset = self._pipeline.try_wait_for_frames(POLL_MS)
+                arrived, frameset = self._running.poll() if self._running else (None, None)
             except RuntimeError as error:
                 raise CameraError(
                     f"{self._what} stopped giving frames ({error}): {UNPLUGGED}"
                 ) from error
+            if arrived is None:
+                raise CameraError(f"{self._what} was closed while it was giving frames")
             if arrived:
                 return frameset
             if ended:
@@ -396,17 +390,59 @@ class RealSense(Camera):
         )
 
 
-def _halt(pipeline: Any, playback: Any) -> None:
-    """Bring a playback's reading thread to rest, so that the pipeline can be stopped.
+class _Running:
+    """A pipeline that runs, and for a recording the thread that wakes its playback and, at the end,
+    brings it to rest.
 
-    At the end of the file that thread stops the sensors itself; when the pipeline stops them at the
-    same moment, librealsense frees its callbacks twice and may end the process (its issue 9446).
-    pause() returns once the thread rests, which it does only while somebody takes its images.
+    `stop` must have been called before the interpreter ends: a thread that is still inside
+    librealsense then, in resume() or waiting for frames, ends the process with an abort.
+    playback: of a pipeline that was started with its playback paused; None of a live camera.
     """
-    pause = threading.Thread(target=playback.pause, daemon=True)
-    pause.start()
-    while pause.is_alive():  # at most librealsense's own 10 s
-        pipeline.try_wait_for_frames(1)
+
+    def __init__(self, pipeline: Any, playback: Any) -> None:
+        self._pipeline = pipeline
+        self._using, self._ending = threading.RLock(), threading.Event()
+        self._attendant: threading.Thread | None = None
+        if playback is not None:
+            attend = functools.partial(_attend, playback, self._ending)
+            self._attendant = threading.Thread(target=attend, daemon=True)
+            self._attendant.start()
+
+    def poll(self) -> tuple[bool | None, Any]:
+        """Whether images came within POLL_MS, and these; None and None once it is stopped."""
+        with self._using:
+            if self._ending.is_set():
+                return None, None
+            return self._pipeline.try_wait_for_frames(POLL_MS)  # type: ignore[no-any-return]
+
+    def stop(self) -> None:
+        """Bring everything to rest: a thread that polls, the playback, the pipeline.
+
+        At the end of its file a playback's reading thread stops the sensors itself; when the
+        pipeline stops them at the same moment, librealsense frees its callbacks twice and may end
+        the process (its issue 9446). So that thread has to rest first, which pause() waits for; and
+        it comes to rest only while somebody takes its images.
+        """
+        self._ending.set()
+        attendant = self._attendant  # may itself be where Python collects a forgotten camera
+        alive = attendant is not None and attendant is not threading.current_thread()
+        with self._using, contextlib.suppress(RuntimeError):  # an unplugged camera cannot be stopped
+            try:
+                while alive and attendant.is_alive():  # at most 10 s, librealsense's own patience
+                    self._pipeline.try_wait_for_frames(1)
+            finally:
+                self._pipeline.stop()
+
+
+def _attend(playback: Any, ending: threading.Event) -> None:
+    """Wake a paused playback, and pause it again when it is to end.
+
+    One thread does both, so that they come in this order: resume() returns only when the reading
+    thread has come so far.
+    """
+    playback.resume()
+    ending.wait()
+    playback.pause()
 
 
 # --- images ------------------------------------------------------------------------------------

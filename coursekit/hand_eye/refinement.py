@@ -27,8 +27,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import norm as normal
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from coursekit.arm import Arm, FkErrors
 from coursekit.arrays import Floats
@@ -522,7 +521,8 @@ def refine(problem: Problem, X: Floats, Y: Floats, measured: Floats) -> Refined:
             break
     far = scatter.whitened
     alike = _alike(far)
-    wider = student.ppf(0.975, scatter.dof) / normal.ppf(0.975) * np.sqrt((1 + alike) / (1 - alike))
+    student = stdtrit(scatter.dof, 0.975) / stdtrit(np.inf, 0.975)
+    wider = student * np.sqrt((1 + alike) / (1 - alike))
     covariance = scatter.covariance * np.outer(wider, wider)
     if n < FEWEST_TOLD:
         covariance = np.diag(np.full(len(wider), np.inf))
