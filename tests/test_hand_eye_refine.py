@@ -232,7 +232,7 @@ def test_an_arm_that_errs_is_in_the_intervals():
     plain, weighed, usual = known.solve(fk=None), known.solve(fk=known.fk), known.solve()
     for result in (plain, weighed, usual):
         assert "(95 %)" in repr(result)
-        assert result.trust.given
+        assert result.judgement.trusted
         assert "errs" not in result.verdict()
     assert plain.spread_gripper_mm > 1.0
     assert plain.sigma_mm.max() > 5 * arm_session(14).solve(fk=None).sigma_mm.max()

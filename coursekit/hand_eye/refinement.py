@@ -33,7 +33,7 @@ from coursekit.arm import Arm, FkErrors
 from coursekit.arrays import Floats
 from coursekit.geometry import cross_matrix, pose_difference, turned
 from coursekit.hand_eye.poses import Mount, by_arm_twist, by_X_and_Y, camera_board
-from coursekit.hand_eye.views import PixelViews, PoseViews, Views
+from coursekit.hand_eye.views import PoseViews, Views
 from coursekit.intrinsics.derivatives import scaled_inverse
 
 GAUSS_NEWTON_STEPS, STEP_HALVINGS = 50, 10
@@ -151,6 +151,22 @@ class Problem:
         if self.own_root is None:
             return np.zeros((len(self.T_base_gripper), 6))
         return np.einsum("nij,nj->ni", self.own_root, state.own)
+
+    def weighed(self, own: Floats) -> Problem:
+        """With each pose's own error of this covariance (n, 6, 6): beside pixels six unknowns more,
+        and where only poses are known what they are weighed with."""
+        if isinstance(self.views, PoseViews):
+            return replace(
+                self, views=replace(self.views, information=np.asarray(np.linalg.inv(own)))
+            )
+        return replace(self, own_root=np.asarray(np.linalg.cholesky(own)))
+
+    def with_own(self, state: State, twists: Floats) -> State:
+        """The state with each pose's own error such that it does what twists (n, 6) say."""
+        if self.own_root is None:
+            return state
+        u = np.linalg.solve(self.own_root, twists[..., None])
+        return replace(state, own=np.asarray(u[..., 0]))
 
     def reported(self, state: State) -> Floats:
         """T_base_gripper (n, 4, 4) of the reported joints with the offsets put right."""
@@ -331,13 +347,15 @@ class _Scatter:
     def of(cls, problem: Problem, state: State, sizes: Floats) -> _Scatter:
         """The equations of a problem at a state."""
         at = problem.equations(state)
-        image = np.linalg.inv(at.information[:, :6, :6])
+        image = np.asarray(np.linalg.inv(at.information[:, :6, :6]))
         rows = np.einsum("nij,nj->ni", image, at.gradient[:, :6]) + problem.own_twists(state)
         columns = image @ (at.information[:, :6] @ at.shared)
         stated, parts = problem.own_parts(state)
         shared = np.arange(len(at.prior)) >= len(at.prior) - problem.shared.shape[2]
         guessed = shared * float(problem.guessed)
-        if isinstance(problem.views, PixelViews):
+        if problem.own_root is None:
+            image = np.zeros_like(image)
+        else:
             parts = np.concatenate([parts, image[None]])
         image = image + stated + LEAST_OWN
         values, prior = problem.with_prior(state), np.where(shared, 1.0, at.prior)
@@ -503,38 +521,30 @@ def refine(problem: Problem, X: Floats, Y: Floats, measured: Floats) -> Refined:
     """
     n, _, k = problem.shared.shape
     state = State(X, Y, 1.0, np.zeros(6), np.zeros(k), np.zeros((n, 6)))
-    own = pose_difference(problem.camera_board(state), measured)
-    problem = replace(problem, own_root=np.tile(np.eye(6), (n, 1, 1)))
-    scatter = _Scatter.of(problem, replace(state, own=own), np.zeros(0))
-    scatter = replace(
-        scatter, sizes=_first_sizes(own, scatter, isinstance(problem.views, PixelViews))
-    )
+    off = pose_difference(problem.camera_board(state), measured)
+    problem = problem.weighed(np.tile(np.eye(6), (n, 1, 1)))
+    scatter = _Scatter.of(problem, problem.with_own(state, off), np.zeros(0))
+    turn_shift = np.mean(off.reshape(n, 2, 3) ** 2, axis=(0, 2)) / 2 + LEAST_OWN[0, 0]
+    sizes = [*turn_shift, 1.0 if problem.own_root is not None else turn_shift[0]]
+    scatter = replace(scatter, sizes=np.array(sizes + [1.0] * problem.guessed))
     for _ in range(SCATTER_ROUNDS):
         before, scatter = scatter.sizes, scatter.estimated()
-        covariance = scatter.own + problem.own_parts(state)[0] + LEAST_OWN
-        root = np.asarray(np.linalg.cholesky(covariance))
-        problem = replace(problem, own_root=root, factor=scatter.factor)
-        u = np.asarray(np.linalg.solve(root, own[..., None]))[..., 0]
-        state, converged = _minimise(problem, replace(state, own=u))
-        own, scatter = problem.own_twists(state), _Scatter.of(problem, state, scatter.sizes)
+        own = scatter.own + problem.own_parts(state)[0] + LEAST_OWN
+        problem = replace(problem.weighed(own), factor=scatter.factor)
+        state, converged = _minimise(problem, problem.with_own(state, off))
+        off, scatter = problem.own_twists(state), _Scatter.of(problem, state, scatter.sizes)
         if np.allclose(before, scatter.sizes, rtol=2 * SETTLED, atol=0):
             break
-    far = scatter.whitened
-    alike = _alike(far)
+    far, turns = scatter.whitened, problem.camera_board(state)[:, :3, :3]
+    in_board = np.einsum("nji,nkj->nki", turns, far.reshape(n, 2, 3)).reshape(n, 6)
+    alike = max(map(_alike, (far, in_board)))  # a camera that sinks, or a board that slides
     student = stdtrit(scatter.dof, 0.975) / stdtrit(np.inf, 0.975)
     wider = student * np.sqrt((1 + alike) / (1 - alike))
     covariance = scatter.covariance * np.outer(wider, wider)
     if n < FEWEST_TOLD:
         covariance = np.diag(np.full(len(wider), np.inf))
-    sizes, far = np.sqrt(scatter.sizes), np.sqrt(np.mean(far**2, axis=1))
-    return Refined(problem, state, covariance, sizes, alike, far, converged)
-
-
-def _first_sizes(own: Floats, scatter: _Scatter, of_pixels: bool) -> Floats:
-    """Sizes (k,) to start from, given how far each view is from where it should be, (n, 6)."""
-    turn_shift = np.mean(own.reshape(-1, 2, 3) ** 2, axis=(0, 2)) / 2 + LEAST_OWN[0, 0]
-    last = 1.0 if of_pixels else turn_shift[0]
-    return np.array([*turn_shift, last, *[1.0] * bool(scatter.guessed.any())])
+    each = np.sqrt(np.mean(far**2, axis=1))
+    return Refined(problem, state, covariance, np.sqrt(scatter.sizes), alike, each, converged)
 
 
 def _alike(errors: Floats) -> float:

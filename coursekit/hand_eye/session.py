@@ -470,7 +470,7 @@ def solve(
     if method != "refine":
         return HandEyeResult(X, Y, method, session, measured)
     arm, q = (session.arm, session.q) if free_offsets else (None, None)
-    seen: views.Views = views.PoseViews.exact(measured)
+    seen: views.Views = views.PoseViews(measured, np.zeros((n, 6, 6)))
     if session.detections is not None:
         seen = session.corners(session.corner_sigma_px)
     usual = fk == "usual" and not free_offsets and session.has_its_joints
@@ -533,7 +533,7 @@ class Trust:
     broken: tuple[str, ...] = ()
 
     @property
-    def given(self) -> bool:
+    def trusted(self) -> bool:
         """Whether the intervals hold what they should."""
         return not self.broken
 
@@ -709,7 +709,7 @@ class HandEyeResult(Estimate):
         return observability(self.session.T_base_gripper, self.mount).free
 
     @cached_property
-    def trust(self) -> Trust:
+    def judgement(self) -> Trust:
         """How far to trust X, and why; of a closed form only what its poses and residuals say."""
         known = observability(self.session.T_base_gripper, self.mount)
         weak = [f"{direction}: the poses do not determine it." for direction in known.free]
@@ -763,7 +763,7 @@ class HandEyeResult(Estimate):
             corners = f", {sum(len(seen.ids) for seen in detections)} corners"
             behind = "the board would be behind the camera, "
             pixels = f"{self.rms_px:.2f} px, " if math.isfinite(self.rms_px) else behind
-        unsure = "" if self.trust.given else "; NOT TO BE TRUSTED, see verdict()"
+        unsure = "" if self.judgement.trusted else "; NOT TO BE TRUSTED, see verdict()"
         lines = [
             f"{self.mount}, {self.method}, {len(self.session)} poses{corners}{unsure}",
             self._pose_line(name_X, self.X, 0),
@@ -807,7 +807,7 @@ class HandEyeResult(Estimate):
     @property
     def _level(self) -> str:
         """What an interval holds, said only where it does."""
-        return " (95 %)" if self.trust.given else ""
+        return " (95 %)" if self.judgement.trusted else ""
 
     @property
     def _untold(self) -> str:
@@ -816,7 +816,7 @@ class HandEyeResult(Estimate):
 
     def verdict(self) -> str:
         """In words: how far to trust X, and what to do about what is weak."""
-        judged = self.trust
+        judged = self.judgement
         reasons = [*([judged.large] if judged.large else []), *judged.broken, *judged.weak]
         return "\n".join(map(wrapped, [self._head(), *(f"- {reason}" for reason in reasons)]))
 
@@ -827,8 +827,8 @@ class HandEyeResult(Estimate):
                 f"Uncertain: {self.method} says nothing about its own error. Solve with 'refine' "
                 "for an interval."
             )
-        judged = self.trust
-        if not judged.given:
+        judged = self.judgement
+        if not judged.trusted:
             return f"{judged.grade}: the intervals hold for sessions without such faults only."
         if math.isinf(judged.worst_mm):
             return f"{judged.grade} how good it is: {self._untold}."
