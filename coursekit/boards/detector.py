@@ -33,7 +33,9 @@ MOST_PIXELS, MOST_BYTES = 250_000_000, 2_000_000_000  # more is no photograph
 RANGE = 12, 243  # grey levels of a hundredth and of 99 hundredths of a scaled image
 SESSION = "session.json"  # written beside the images by the course itself
 JPEG, PNG = b"\xff\xd8", b"\x89PNG"
-FRAMES = [bytes([0xC0 + k]) for k in range(16) if k not in (4, 8, 12)]  # JPEG: they hold the size
+SIZE_SEGMENTS = [
+    bytes([0xC0 + k]) for k in range(16) if k not in (4, 8, 12)
+]  # JPEG: they hold the size
 ALPHA = (b"\4", b"\6")  # PNG: kinds of colour with transparency
 AS_STORED = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
 NO_IMAGE = "not an image that OpenCV can read: save it as PNG or JPEG, or take it out of the folder"
@@ -299,7 +301,7 @@ def _header(data: bytes) -> tuple[tuple[int, int], bool]:
     at, size = 2, (0, 0)
     while data[at : at + 1] == b"\xff" and data[at + 1 : at + 2] != b"\xda":
         length, _, height, width = struct.unpack(">HBHH", data[at + 2 : at + 9].rjust(7, b"\0"))
-        if data[at + 1 : at + 2] in FRAMES:
+        if data[at + 1 : at + 2] in SIZE_SEGMENTS:
             size = (width, height)
         at += 2 + length
     return size, b"\xff\xd9" not in data[at:]
@@ -312,6 +314,8 @@ def _of_one_size(views: list[Detection], skipped: list[Skipped], names: list[str
     for view in views:
         if view.size != common:
             reason = "{}x{} px, where most are {}x{}: one calibration is for one size"
+            if view.size == common[::-1]:
+                reason += "; give the pixels as the sensor has them, not turned"
             skipped.append(Skipped(view.name, reason.format(*view.size, *common)))
     skipped.sort(key=lambda skip: names.index(skip.name))
     return Detections([view for view in views if view.size == common], skipped)

@@ -47,7 +47,6 @@ FEWEST_ON_PLAN = 6  # markers: any four lie on some plan
 MOST_SQUARES = 20  # each way that are tried
 OFF_PLAN = 0.1  # squares: markers of the right board lie on its plan within this
 SHARE_ON_PLAN = 0.95  # a board with the other origin has 8 of 9 in the right place
-OFF_SIDE = 0.06  # squares: a marker's side is as stated within this
 SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], np.float32)
 FAR = 8.0  # half sides of a marker: its neighbours on a board are nearer
 CUT = 0.25  # of the corners in the line beyond a checkerboard are real: something hides the others
@@ -246,9 +245,6 @@ def _other_charuco(markers: _Markers, board: Board, seen: str) -> str:
     if changes:
         size = "{}x{} squares".format(*plan.squares)
         return f"{seen} as on a board of {size} or more: use {', '.join(changes)}"
-    side = _side(markers, plan)
-    if abs(side - plan.marker_share) > OFF_SIDE:
-        return f"{seen} that are {side:.2f} squares wide: use marker_m={side * plan.square_m:.3g}"
     return ""
 
 
@@ -312,12 +308,3 @@ def _on_plan(markers: _Markers, board: Board) -> bool:
         return False
     off = off_homography(markers.centres[known], plan[numbers[known]], OFF_PLAN)
     return bool((off < 3 * OFF_PLAN).mean() >= SHARE_ON_PLAN)
-
-
-def _side(markers: _Markers, board: Board) -> float:
-    """The side of the markers on this plan, in squares."""
-    known = np.isin(markers.ids - board.first_marker, np.arange(len(board.marker_centres)))
-    plan = board.marker_centres[markers.ids[known] - board.first_marker]
-    H, _ = cv2.findHomography(markers.centres[known], plan, cv2.RANSAC, OFF_PLAN)
-    boxes = cv2.perspectiveTransform(markers.corners[known], H)
-    return float(np.median(np.linalg.norm(np.roll(boxes, 1, axis=1) - boxes, axis=2)))

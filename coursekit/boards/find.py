@@ -70,7 +70,7 @@ def on_plane(
     if len(ids) <= 4:  # any four corners lie on a plane
         return np.ones(len(ids), bool)
     plane = board.points[ids, :2] / board.square_m
-    rays = (pixels - (np.array(size) - 1) / 2) / (0.5 * np.hypot(*size))
+    rays = (pixels - (np.array(size) - 1) / 2) / (0.5 * np.hypot(size[0], size[1]))
     best = np.zeros(len(ids), bool)
     for k in LENSES:
         straight = rays / (1 + k * (rays**2).sum(axis=1, keepdims=True))
