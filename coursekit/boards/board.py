@@ -55,6 +55,9 @@ class Board:
     odd number of rows old and new boards are the same print, and only the one who reads the pose
     can know which origin is meant.
 
+    first_marker: the number of a ChArUco board's first marker; boards that are seen together have
+    different ones.
+
     Raises ValueError for fields that make no board.
 
     >>> board = Board("charuco", (9, 6), 0.025)
@@ -68,6 +71,7 @@ class Board:
     marker_m: float | None = None
     dictionary: str = "DICT_5X5_250"
     old_origin: bool = False
+    first_marker: int = 0
 
     def __post_init__(self) -> None:
         fewest = FEWEST_SQUARES[choice("kind", self.kind, get_args(BoardKind))]
@@ -83,12 +87,14 @@ class Board:
         if self.kind == "checkerboard":
             extras = (self.marker_m, self.old_origin)
             want(extras == (None, False), "marker_m, old_origin", extras, "none on a checkerboard")
+            want(self.first_marker == 0, "first_marker", self.first_marker, "0 on a checkerboard")
             return
         default = round(MARKER_SHARE * self.square_m, 9)  # 0.01875, not 0.018750000000000003
         marker_m = _side("marker_m", default if self.marker_m is None else self.marker_m)
         object.__setattr__(self, "marker_m", marker_m)
         want(marker_m < self.square_m, "marker_m", marker_m, f"less than {self.square_m} m")
-        held, needed = len(_dictionary(self.dictionary).bytesList), int(self.white.sum())
+        first = whole("first_marker", self.first_marker, "a whole number from 0 on", least=0)
+        held, needed = len(_dictionary(self.dictionary).bytesList), first + int(self.white.sum())
         want(
             needed <= held,
             "dictionary",
@@ -192,7 +198,8 @@ class Board:
         margin = 0.5 * (1.0 - self.marker_share)
         markers = []
         for marker_id, (row, column) in enumerate(np.argwhere(self.white).tolist()):
-            image = cv2.aruco.generateImageMarker(dictionary, marker_id, n, borderBits=1)
+            number = self.first_marker + marker_id
+            image = cv2.aruco.generateImageMarker(dictionary, number, n, borderBits=1)
             markers.append((column + margin, row + margin, (image > 0).astype(float)))
         return tuple(markers)
 
@@ -205,8 +212,9 @@ class Board:
         """The `cv2.aruco.CharucoBoard` of this board; ValueError for a checkerboard."""
         if self.marker_m is None:
             raise ValueError("kind: a checkerboard has no cv2.aruco.CharucoBoard")
+        numbers = self.first_marker + np.arange(self.white.sum())
         board = cv2.aruco.CharucoBoard(
-            self.squares, self.square_m, self.marker_m, _dictionary(self.dictionary)
+            self.squares, self.square_m, self.marker_m, _dictionary(self.dictionary), numbers
         )
         board.setLegacyPattern(self.old_origin)
         return board
