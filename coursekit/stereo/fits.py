@@ -196,9 +196,9 @@ def fit_noise(
 
     distances_m (K,): m, in any order; a distance may come again. stds_m (K,): std over time of one
     pixel's depth as measured, rounding included, m; NaN is left out. baseline_m: None for a camera
-    that has none: its std is fitted over distance, and there is no sigma_d. dof (K,) or one number: independent squares in each, as
-    `WindowStats.pixel_dof` says. depth_scale_m: the depth unit, to correct for; None leaves the
-    rounding in. exponent: 2 to hold it, None to fit it.
+    that has none: its std is fitted over distance, and there is no sigma_d. dof (K,) or one number:
+    independent squares in each, as `WindowStats.pixel_dof` says. depth_scale_m: the depth unit, to
+    correct for; None leaves the rounding in. exponent: 2 to hold it, None to fit it.
 
     Model: dof_i s_i^2 / V_i is chi-squared with dof_i, V_i = `rounded_variance` of the law; so
     ln s_i has known mean and variance (digamma, trigamma) and the fit is weighted least squares
@@ -405,8 +405,8 @@ def fit_bias(
 ) -> BiasFit:
     """Scale error and disparity offset from depths against the tape, widths against the caliper.
 
-    distances_m (K,): by tape, m, in any order, repeats welcome. depths_m, widths_m (K,): as measured by the camera,
-    with standard errors; either or both. width_m: by caliper. tape_m: standard uncertainty of each
+    distances_m (K,): by tape, m, in any order, repeats welcome. depths_m, widths_m (K,): as
+    measured by the camera, with standard errors; either or both. width_m: by caliper. tape_m: standard uncertainty of each
     tape reading. priors: what else is not exact.
 
     Model: measured depth and width follow the room's formulas, with Gaussian errors of the stated

@@ -162,7 +162,8 @@ class WindowStats:
         if self.n_mismatches:
             text += f", {counted(self.n_mismatches, 'mismatch', 'mismatches')} left out"
         if self.not_gaussian:
-            text += f"; not one Gaussian noise, so the interval is wider: {'; '.join(self.not_gaussian)}"
+            why = "; ".join(self.not_gaussian)
+            text += f"; not one Gaussian noise, so the interval is wider: {why}"
         said = f"{text}; {self.rounding}" if self.rounding else text
         return wrapped(said, 84, indent="    ")
 
@@ -268,14 +269,15 @@ def _not_gaussian(
     elif excess < -limit:
         words.append("pixels jump between two depths")
         left.append(min(dof, n - 1.0))
-    rows = [np.array_split(half, 3, axis=1) for half in np.array_split(own, 3, axis=0)]
-    parts = [float(np.nanmean(part)) for row in rows for part in row if np.isfinite(part).any()]
-    times = [float(np.nanmean(part)) for part in np.array_split(square, 5) if np.isfinite(part).any()]
-    for variances, most, where in (
+    rows = [np.array_split(third, 3, axis=1) for third in np.array_split(own, 3)]
+    parts = [rms([np.sqrt(part)]) for row in rows for part in row]
+    times = [rms([np.sqrt(part)]) for part in np.array_split(square, 5)]
+    for stds, most, where in (
         (parts, PARTS_APART, "parts of the window"),
         (times, TIMES_APART, "times in the stack"),
     ):
-        v = np.maximum(np.array(variances) / np.mean(variances), 1e-4)
+        v = np.square([s for s in stds if np.isfinite(s)])
+        v = np.maximum(v / v.mean(), 1e-4)
         apart = math.sqrt(v.max() / v.min())
         if apart > most * math.exp(3 / math.sqrt(2 * dof / len(v))):
             words.append(f"it differs by a factor of {apart:.1f} between {where}")
