@@ -49,9 +49,10 @@ class Frame:
     """One depth image and the images taken with it.
 
     depth (H, W) uint16: counts of `depth_scale_m` metres, 0 invalid; the largest count, where they
-    end, is made 0. color (h, w, 3) uint8 RGB or None. time_s: the camera's clock. T_color_depth (4, 4): depth frame to colour frame. infrared:
-    what the depth was matched from, left and right, each (H, W) uint8 and with the pixels of the
-    depth image on the left; None where the camera does not give it.
+    end, is made 0. color (h, w, 3) uint8 RGB or None. time_s: the camera's clock. T_color_depth
+    (4, 4): depth frame to colour frame. infrared: what the depth was matched from, left and right,
+    each (H, W) uint8 and with the pixels of the depth image on the left; None where the camera does
+    not give it.
     """
 
     depth: NDArray[np.uint16]

@@ -406,8 +406,8 @@ def fit_bias(
     """Scale error and disparity offset from depths against the tape, widths against the caliper.
 
     distances_m (K,): by tape, m, in any order, repeats welcome. depths_m, widths_m (K,): as
-    measured by the camera, with standard errors; either or both. width_m: by caliper. tape_m: standard uncertainty of each
-    tape reading. priors: what else is not exact.
+    measured by the camera, with standard errors; either or both. width_m: by caliper. tape_m:
+    standard uncertainty of each tape reading. priors: what else is not exact.
 
     Model: measured depth and width follow the room's formulas, with Gaussian errors of the stated
     sizes; what is common to several distances is a parameter with a Gaussian prior, or, for the
