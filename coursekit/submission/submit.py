@@ -142,6 +142,9 @@ def measured(
         f"{len(stacks)}: one number in mm for each distance",
     )
     free = fit.exponent if fit.exponent_interval is not None else None
+    sigma_d = interval = None
+    if fit.baseline_m is not None:  # else there is no disparity
+        sigma_d, interval = fit.sigma_d_px, fit.sigma_d_interval_px
     stds = [row.depth_std_mm for row in rows if row.depth_std_mm is not None]
     predicted = None if predicted_mm is None else tuple(predicted_mm)
     figure = None
@@ -162,7 +165,7 @@ def measured(
         tape_sigma_m=tape_sigma_m,
         caliper_m=caliper_m,
         stacks=stacks,
-        claims=Claims(rows, fit.sigma_d_px, fit.sigma_d_interval_px, free, fit.exponent_interval),
+        claims=Claims(rows, sigma_d, interval, free, fit.exponent_interval),
         plot=figure,
         conclusion=Conclusion(),
         outcomes={},
