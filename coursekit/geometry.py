@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from coursekit import kernels
 from coursekit.arrays import ArrayLike, Floats, NDArray
 from coursekit.checks import array, instance, number, positive, transform, transforms, want, whole
-from coursekit.formats import lens
+from coursekit.formats.lens import read_lens
 
 DISTORTION_MODELS = ("none", "brown_conrady", "inverse_brown_conrady", "modified_brown_conrady")
 # What others call Brown-Conrady; ROS's rational_polynomial is that where k4 to k6 are zero
@@ -93,7 +93,12 @@ class Intrinsics:
         from scipy.optimize import least_squares
 
         known = "none, brown_conrady or inverse_brown_conrady"
-        want(self.model != "modified_brown_conrady" or not any(self.coeffs), "model", self.model, known)
+        want(
+            self.model != "modified_brown_conrady" or not any(self.coeffs),
+            "model",
+            self.model,
+            known,
+        )
         if self.model != "inverse_brown_conrady" and (k3 or not self.coeffs[4]):
             return self
         rays, seen = self._rays()
@@ -145,7 +150,7 @@ class Intrinsics:
         OpenCV's that has none. which: of several cameras, such as "cam0". Raises ValueError in a
         sentence for a damaged file, one of another kind, and a lens that is not Brown-Conrady.
         """
-        fields = lens.read(path, size, which)
+        fields = read_lens(path, size, which)
         try:
             return cls(**fields)
         except ValueError as error:
