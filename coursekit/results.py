@@ -289,13 +289,18 @@ def export(
     return Exported(text, path, notes)
 
 
+def placement(result: Any) -> Placement:
+    """The camera's place as `hand_eye.solve` found it, with the usual names of the two frames."""
+    known = None if result.refined is None else result.covariance[:6, :6]
+    return Placement(PARENTS[result.mount], OPTICAL, result.mount, result.X, known)
+
+
 def _exportable(what: Any) -> Intrinsics | Placement:
     """The lens or the place in a result, in a file or in what a notebook calls it."""
     if isinstance(what, (Intrinsics, Placement)):
         return what
     if hasattr(what, "X") and hasattr(what, "mount"):
-        known = what.covariance[:6, :6] if what.refined is not None else None
-        return Placement(PARENTS[what.mount], OPTICAL, what.mount, what.X, known)
+        return placement(what)
     if hasattr(what, "intrinsics"):
         return checks.instance("what", what.intrinsics, Intrinsics)
     want(isinstance(what, (str, os.PathLike)), "what", what, "a result, or the path of a file")
@@ -359,14 +364,6 @@ def _place_text(
 
 
 # --- files ---
-
-
-def save_arrays(lesson: str, **arrays: Any) -> Path:
-    """Write the raw measurements behind a result to `results/<lesson>.npz`, in one step."""
-    path = _path(lesson).with_suffix(".npz")
-    with _whole(path) as part, part.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **arrays)
-    return path
 
 
 def write_json(path: Path, content: Any) -> None:
