@@ -11,6 +11,7 @@ names, kinds and what is written stand in texts.toml.
 from __future__ import annotations
 
 import codecs
+import itertools
 import math
 import os
 import re
@@ -27,6 +28,7 @@ from coursekit.checks import want
 FORMAT_TEXTS = tomllib.loads((Path(__file__).parent / "texts.toml").read_text("utf-8"))
 LARGEST, LARGEST_TREE = 2 << 20, 256 << 10  # bytes of a table, of YAML, JSON or XML
 MOST_NODES, DEEPEST = 50_000, 12
+BRACKET = re.compile(r"[\[\]{}]")
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_./-]*")  # of a frame or a camera, safe in all formats
 
 
@@ -73,6 +75,9 @@ def tree(text: str, name: str, wanted: str) -> Any:
             return _xml(text)
         # OpenCV's first line is no YAML, nor are the tabs that JSON may be indented with
         plain = re.sub(r"\A%YAML:.*", "", text).replace("\t", " ")
+        opened = itertools.accumulate(1 if m[0] in "[{" else -1 for m in BRACKET.finditer(plain))
+        if any(depth > DEEPEST for depth in opened):  # the loader takes time with the square
+            raise ValueError(f"is deeper than {DEEPEST} levels")
         loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
         nodes = list(yaml.compose_all(plain, Loader=loader))
         return _plain(nodes[0], 0, iter(range(MOST_NODES))) if nodes and nodes[0] else None

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from coursekit.checks import want
-from coursekit.formats import FORMAT_TEXTS, fill, kind_of, numbers, read_text, one_number, tree
+from coursekit.formats import FORMAT_TEXTS, fill, kind_of, numbers, one_number, read_text, tree
 
 WANTED = (
     "K and lens as ROS (camera_info), OpenCV (FileStorage), Kalibr (camchain), COLMAP "

@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from coursekit.arrays import Floats
 from coursekit.checks import choice, transform, want
-from coursekit.formats import FORMAT_TEXTS, fill, kind_of, numbers, read_text, one_number, tree
+from coursekit.formats import FORMAT_TEXTS, fill, kind_of, numbers, one_number, read_text, tree
 
 PLACE, TURN, THREE = ("x", "y", "z"), ("qx", "qy", "qz", "qw"), ("rx", "ry", "rz")
 JOINTS = tuple(f"q{joint}" for joint in range(6))
