@@ -312,9 +312,8 @@ def _table(
 ) -> tuple[dict[str, dict[str, Any]], list[Skipped]]:
     """The usable rows of poses.csv by their file, and what is wrong with the others."""
     path = folder / POSES
-    want(
-        path.exists(), "folder", "no " + POSES, f"a folder that has {POSES}, the table of arm poses"
-    )
+    if not path.exists():
+        raise ValueError(f"folder: has no {POSES}, the table of arm poses")
     table, read = pose_files.read_table(path, **notation)
     columns = set(table.places)
     files = sorted((p for p in folder.rglob("*") if p.is_file()), key=natural)
