@@ -210,7 +210,7 @@ def _sources(images: Any) -> list[tuple[str, Any]]:
         files = [p for p in files if p.name != SESSION and not p.name.startswith(".")]
         if not files:
             raise ValueError(f"images: {os.fspath(images)!r} holds no files")
-        return [(path.name, path) for path in sorted(files, key=_natural)]
+        return [(path.name, path) for path in sorted(files, key=natural)]
     if not isinstance(images, Iterable):
         kind = type(images).__name__
         raise ValueError(f"images: got a {kind}, want a folder, or paths, arrays or frames")
@@ -235,7 +235,7 @@ def _named(number: int, item: Any) -> tuple[str, Any]:
     )
 
 
-def _natural(path: Path) -> list[Any]:
+def natural(path: Path) -> list[Any]:
     """A key that sorts view2 before view10."""
     parts = re.split(r"(\d+)", path.name.lower())
     return [int(part) if part.isdecimal() else part for part in parts]

@@ -19,7 +19,7 @@ import numpy as np
 from coursekit import results
 from coursekit.cameras import Camera, Frames
 from coursekit.checks import want
-from coursekit.lessons import progress
+from coursekit.lessons import questions
 from coursekit.stereo import NoiseFit
 from coursekit.submission.format import (
     CameraFacts,
@@ -100,7 +100,7 @@ class Handed:
 
     def _repr_html_(self) -> str:
         kind = "not attempted" if self.path is None else "wrong" if self.says else "right"
-        return progress.Verdict("submit", kind, self.headline, self.says)._repr_html_()  # type: ignore[arg-type]
+        return questions.Verdict("submit", kind, self.headline, self.says)._repr_html_()  # type: ignore[arg-type]
 
 
 def stack(frames: Frames, window: tuple[int, int, int, int], distance_m: float) -> Stack:
@@ -252,7 +252,7 @@ def outcomes() -> dict[str, Outcome]:
     """How the checkpoints and exercises of notebook 02 stand that were attempted, by name."""
     return {
         name: Outcome(any(a.get("kind") == "right" for a in attempts), len(attempts))
-        for name, attempts in progress.read_attempts().items()
+        for name, attempts in questions.read_attempts().items()
         if name.startswith(LESSON_PREFIX)
     }
 
