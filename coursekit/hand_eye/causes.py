@@ -182,11 +182,14 @@ class Fit:
         """Its typical residual in words: "0.4 mm and 0.05 deg"."""
         return f"{1e3 * self.shift_m:.1f} mm and {np.degrees(self.turn_rad):.2f} deg"
 
+    @property
+    def size(self) -> float:
+        """Of the residuals, the geometric mean of rotation and position, rad and m."""
+        return float(np.sqrt((self.turn_rad + LEAST_RAD) * (self.shift_m + LEAST_M)))
+
     def better_than(self, other: Fit) -> float:
         """How many times smaller the residuals are, the geometric mean of rotation and position."""
-        turn = (other.turn_rad + LEAST_RAD) / (self.turn_rad + LEAST_RAD)
-        shift = (other.shift_m + LEAST_M) / (self.shift_m + LEAST_M)
-        return float(np.sqrt(turn * shift))
+        return other.size / self.size
 
 
 def robust_fit(pairs: PosePairs, start: tuple[Floats, Floats] | None = None) -> Fit:

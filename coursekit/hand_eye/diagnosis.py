@@ -147,14 +147,16 @@ class _Case:
     def readings(self) -> None:
         """Another pairing, convention or unit of angles with which arm and camera agree."""
         given = self.pairs.fit
-        other = misread.other_pairing(self.pairs)
-        better = misread.better_readings(given, other, misread.PAIRING_SHIFT_LEFT)
+        pairing = misread.other_pairing(self.pairs, self.session.names)
+        if pairing is not None:
+            self.pairs = pairing.mended
+            self.add(pairing.name, reading=pairing.says, **_change(given, self.pairs.fit))
+            return
+        either = misread.inverted(self.pairs)
+        better = misread.better_reading(given, either, misread.PAIRING_SHIFT_LEFT)
         if better:
-            self.pairs = better[0].fit.pairs
-        if better and better[0].name.startswith("off_by_one"):
-            self.add("off_by_one", reading=better[0].says, **_change(given, better[0].fit))
-        elif better:
-            options = misread.candidates(better[0].fit, self.session, misread.INVERTED)
+            self.pairs = better.fit.pairs
+            options = misread.candidates(better.fit, self.session, misread.INVERTED)
             if self._off_joints(self.session.T_base_gripper, self.q) < AS_COMPUTED_M:
                 against = (*options[0].against, "the arm poses are those of the joint angles")
                 options[0] = replace(options[0], against=against)
@@ -162,7 +164,7 @@ class _Case:
                 arm, mount = given.pairs.T_base_gripper, misread.other_mount(given.pairs.mount)
                 self.pairs = replace(self.pairs, T_base_gripper=arm, mount=mount)
             words = {"candidates": _listed(options), "choice": _choice(options)}
-            self.add("inconsistent_convention", **words, **_change(given, better[0].fit))
+            self.add("inconsistent_convention", **words, **_change(given, better.fit))
         elif given.turn_rad > POOR_RAD:
             self._rotations(given)
         elif given.shift_m < POOR_M:
@@ -182,8 +184,8 @@ class _Case:
                 continue
             fit = pairs.fit
             other = misread.other_rotations(pairs)
-            better = misread.better_readings(fit, other, misread.ROTATION_SHIFT_LEFT)
-            reading = better[0] if better else misread.undo_degrees(fit, places.expected)
+            reading = misread.better_reading(fit, other, misread.ROTATION_SHIFT_LEFT)
+            reading = reading or misread.undo_notation(fit, places.expected)
             if reading is None:
                 continue
             evidence = f"the {side}'s positions agree with the other side (within "
