@@ -196,7 +196,8 @@ def _in_order(
     orders.append(Pairing(pairs, own[::-1], "off_by_one", "the images run backwards"))
     by = Counter((rows[moved] - moved).tolist()).most_common(1)[0][0]
     orders += [_shifted_from(pairs, first, by, names[first]) for first in range(n - 1)]
-    best = min(orders, key=lambda o: off[own, np.where(o.rows < 0, own, o.rows)].mean())
+    missing = np.median(off[own, rows]) + 2 * np.log(WITHIN)  # better than to fit another's row
+    best = min(orders, key=lambda o: np.where(o.rows < 0, missing, off[own, o.rows]).mean())
     if (best.rows[moved] == rows[moved]).mean() > MOST_FIT:
         return best
     couples = [f"{names[i]} and {names[j]}" for i, j in enumerate(rows) if i < j and rows[j] == i]
