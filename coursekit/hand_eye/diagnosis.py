@@ -331,6 +331,10 @@ def _figures(
     if test.cause == causes.ARM_ERROR:
         size = np.degrees(model.offsets[test.at])
         return {"joint": test.at, "size": size, "half": np.degrees(half)}
+    if test.cause == causes.DRIFT:
+        turn, shift = step.before.over_session(test)
+        what = ("the camera on its mount", "the board on its stand")[test.at]
+        return {"what": what, "turn": np.degrees(turn), "shift": 1e3 * shift}
     turn, shift = causes.turn_and_shift(test)
     name = session.names[step.before.fit.pairs.view[test.at]]  # the odd one, or the first after
     return {"name": name, "turn": np.degrees(turn), "shift": 1e3 * shift}

@@ -88,8 +88,13 @@ def better_reading(
     """
     fits = [Reading(name, says, pairs.fit) for name, says, pairs in readings]
     left = most_shift * given.shift_m + LEAST_M
-    return best(r for r in fits if r.fit.better_than(given) > CLEARLY_BETTER
-        and r.fit.shift_m < left and r.fit.turn_rad < given.turn_rad / 2)
+    return best(
+        r
+        for r in fits
+        if r.fit.better_than(given) > CLEARLY_BETTER
+        and r.fit.shift_m < left
+        and r.fit.turn_rad < given.turn_rad / 2
+    )
 
 
 def best(readings: Iterable[Reading]) -> Reading | None:
@@ -109,7 +114,11 @@ def other_rotations(pairs: PosePairs) -> Iterator[tuple[str, str, PosePairs]]:
     quaternions = R.as_quat()
     for order, places in (("(w, x, y, z)", [1, 2, 3, 0]), ("(x, y, z, w)", [3, 0, 1, 2])):
         words = f"quaternions {order} read in another order; the data fit {order}"
-        yield "notation", words, with_rotations(pairs, Rotation.from_quat(quaternions[:, places]).as_matrix())
+        yield (
+            "notation",
+            words,
+            with_rotations(pairs, Rotation.from_quat(quaternions[:, places]).as_matrix()),
+        )
     words = "rotations transposed, the positions left; the data fit R.T"
     yield "notation", words, with_rotations(pairs, R.inv().as_matrix())
 
@@ -403,7 +412,9 @@ class Misreading:
                 axis = same / max(np.linalg.norm(same), 1e-12)
                 tried = same + turns[:, None] * axis
             else:
-                lists = [a[np.abs(a) < ROUNDED * np.pi * self.factor] for a in same[:, None] + turns]
+                lists = [
+                    a[np.abs(a) < ROUNDED * np.pi * self.factor] for a in same[:, None] + turns
+                ]
                 tried = np.stack(np.meshgrid(*lists, indexing="ij"), axis=-1).reshape(-1, 3)
             found.append(tried[self.written.inside(tried / self.factor)] / self.factor)
         return self.written.rotations(np.concatenate(found))
