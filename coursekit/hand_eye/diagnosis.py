@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from coursekit.arm import Arm, ArmErrors, pose_difference, widowx
+from coursekit.arm import Arm, ArmErrors, pose_difference
 from coursekit.arrays import Floats
 from coursekit.causes import Accepted, CauseSearch, DiagnosisTexts
 from coursekit.checks import want
@@ -41,9 +41,10 @@ def diagnose(
 ) -> Findings:
     """What is wrong with a session, the gravest first; empty when nothing is.
 
-    arm: whose joint angles the session has, the WidowX unless given. errors: what is normal for
+    arm: whose joint angles the session has, `session.arm` unless given. errors: what is normal for
     it, the sizes of `ArmErrors` unless given.
-    A healthy session gets a finding in at most 2 of 100 cases. Raises ValueError for fewer pairs
+    A healthy session gets a wrong cause in at most 2 of 100 cases; equal pairs count once. Where no
+    cause explains what `HandEyeResult.judgement` calls large, the finding is that. Raises ValueError for fewer pairs
     than any solver takes.
 
     >>> still = np.tile(np.eye(4), (8, 1, 1))
@@ -51,18 +52,20 @@ def diagnose(
     ('millimetres', 'pure_translation')
     """
     want(len(session) >= FEWEST_POSES, "session", len(session), f"at least {FEWEST_POSES} pairs")
-    case = _Case(session, arm or widowx(), errors, PosePairs.of(session), session.q)
+    given, session = session, session.once if len(session.once) >= FEWEST_POSES else session
+    case = _Case(session, arm or session.arm, errors, PosePairs.of(session), session.q)
     case.units()
     case.joints_in_degrees()
     if case.design():
         return case.findings("design")
     case.readings()
     case.ambiguous_boards()
+    repeats = ["repeats"] * (session is not given)
     if len(case.pairs) < causes.FEWEST_PAIRS:
-        return case.findings("few")
+        return case.findings("few", *repeats)
     if case.hopeless:
-        return case.findings("residuals")
-    return case.residuals()
+        return case.findings("residuals", *repeats)
+    return case.findings(*case.residuals(), *repeats)
 
 
 @dataclass(eq=False)
@@ -83,7 +86,8 @@ class _Case:
 
     def findings(self, *unseen: str) -> Findings:
         """What was found, with what could not be tested."""
-        reasons = [_TEXTS.not_tested[key].format(pairs=causes.FEWEST_PAIRS) for key in unseen]
+        figures = {"pairs": causes.FEWEST_PAIRS, "repeated": self.session.repeated}
+        reasons = [_TEXTS.not_tested[key].format(**figures) for key in unseen]
         return Findings(self.found, _TEXTS.looked_for, reasons)
 
     # --- units ---
@@ -172,6 +176,15 @@ class _Case:
             others = [other for other in others if not other.against]
             if asked.against and others:
                 self.add("two_that_cancel", asked=asked.says(), candidates=_listed(others))
+            elif self.session.detections is None:
+                self._camera_axes()
+
+    def _camera_axes(self) -> None:
+        """Board poses in a camera frame whose z does not look forward; X absorbs that."""
+        axis, share, ahead = misread.looking_along(self.pairs.T_camera_board)
+        if axis != "z" and ahead < 1 - misread.SHARE_IN_VIEW < misread.SHARE_IN_VIEW < share:
+            what, cure = misread.CAMERA_AXES.get(axis, misread.OTHER_AXES)
+            self.add("camera_axes", axis=axis, share=100 * share, what=what, cure=cure)
 
     def _rotations(self, given: Fit) -> None:
         """Rotations of one side that contradict the other although the positions agree."""
@@ -201,7 +214,9 @@ class _Case:
             return
         if given.turn_rad > HOPELESS_RAD:
             self.hopeless = True
-            self.add("nothing_fits", left=given.says())
+            computed = self._off_joints(self.session.T_base_gripper, self.q) < AS_COMPUTED_M
+            key = "computed_for_another_arm" if computed else "nothing_fits"
+            self.add(key, left=given.says(), arm=self.arm.name)
 
     def _off_joints(self, T_base_gripper: Floats, q: Floats | None) -> float:
         """How far arm poses (n, 4, 4) are from those of joint angles q (n, 6), in any entry."""
@@ -228,15 +243,30 @@ class _Case:
             chosen[row] = both[match.argmax()]
         self.pairs = replace(self.pairs, T_camera_board=chosen)
 
-    def residuals(self) -> Findings:
-        """Causes that the residuals speak for."""
+    def residuals(self) -> list[str]:
+        """Causes that the residuals speak for; returns what could not be tested."""
         q, pairs = self.q, self.pairs
         if q is not None and self._off_joints(pairs.T_base_gripper, q[pairs.row]) > BELONGS_M:
-            q = None
+            q = self._joints_that_fit(q)
         velocity = self._velocity(q)
         search = causes.search_pairs(self.pairs, Arms(self.arm, self.errors, q, velocity))
         self.found += _from_residuals(search, self.session)
-        return self.findings(*["motion"] * (velocity is None), *["joints"] * (q is None))
+        judged = self.session.solve().judgement if not self.found else None
+        if judged is not None and (judged.large or judged.broken):
+            self.add("unexplained", why=" ".join([judged.large, *judged.broken]).strip())
+        return [*["motion"] * (velocity is None), *["joints"] * (q is None)]
+
+    def _joints_that_fit(self, q: Floats) -> Floats | None:
+        """Joint angles that give other poses than the arm's: None, and a finding if they do not fit.
+
+        Poses of another tool on the same arm fit the images as well as the arm's own.
+        """
+        given = self.pairs.fit
+        computed = replace(self.pairs, T_base_gripper=self.arm.forward(q[self.pairs.row])).fit
+        if given.better_than(computed) > misread.CLEARLY_BETTER:
+            words = {"arm": self.arm.name, "given": given.says(), "computed": computed.says()}
+            self.add("joints_of_another_arm", **words)
+        return None
 
     def _velocity(self, q: Floats | None) -> Floats | None:
         """The gripper's twist rates (n, 6) of the session's views, None where unknown."""

@@ -48,6 +48,19 @@ FIXED, MOVING = (
     ("ZYX", "XYZ", "YZX", "ZXY", "XZY", "YXZ"),
 )
 TWICE = ("ZYZ", "ZXZ", "zyz", "zxz")  # about the first axis once more
+# Camera frames that do not look along z: what they are, and what brings them to the optical one.
+_TO_OPTICAL = "T_camera_board = F @ T, F[:3, :3] = "
+CAMERA_AXES = {
+    "x": (
+        "x forward, y left, z up (ROS' camera_link, and every body frame of REP 103)",
+        _TO_OPTICAL + "[[0, -1, 0], [0, 0, -1], [1, 0, 0]]; in tf ask for camera_optical_frame",
+    ),
+    "-z": (
+        "x right, y up, z backward (OpenGL, Blender)",
+        _TO_OPTICAL + "np.diag([1, -1, -1])",
+    ),
+}
+OTHER_AXES = ("none that is common", _TO_OPTICAL + "the camera's own axes, seen from the optical")
 CAMERA_ON_GRIPPER_M = 0.4  # no wrist carries a camera farther away
 BOARD_IN_GRIPPER_M = 0.5  # nor a board
 ROOM_M = 4.0  # from the base to a camera or a board that it works with
@@ -167,7 +180,7 @@ def other_pairing(pairs: PosePairs, names: Sequence[str]) -> Pairing | None:
     orders = [*_text_orders(n), np.arange(n)[::-1]]
     tried += [replace(pairs, T_base_gripper=pairs.T_base_gripper[order]) for order in orders]
     found = [_fitting_rows(part.fit, pairs) for part in tried]
-    cost, rows, off = min(found, key=lambda one: one[0])
+    _, rows, off = min(found, key=lambda one: one[0])
     moved = np.flatnonzero(rows != np.arange(n))
     if len(moved) < 2:
         return None
@@ -547,6 +560,18 @@ def candidates(fit: Fit, session: HandEyeSession, names: tuple[str, ...]) -> lis
             against.append("the board's poses were computed here from the images")
         found.append(Candidate(name.format(other=other), mount, X_, Y_, tuple(against)))
     return found
+
+
+def looking_along(T_camera_board: Floats) -> tuple[str, float, float]:
+    """The axis of the camera's frame near which boards (n, 4, 4) are seen: "z", "-x" and so on.
+
+    And the share of the images for which that is so, and that of those with the board ahead (z).
+    """
+    place = T_camera_board[:, :3, 3]
+    along = place / np.linalg.norm(place, axis=1, keepdims=True)
+    shares = (np.hstack([along, -along]) > np.cos(np.radians(WIDE_DEG))).mean(axis=0)
+    best = int(shares.argmax())
+    return "-" * (best > 2) + "xyz"[best % 3], float(shares[best]), float(shares[2])
 
 
 def other_mount(mount: Mount) -> Mount:

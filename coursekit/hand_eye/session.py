@@ -210,6 +210,8 @@ class HandEyeSession:
         lines = [f"{self.mount}: {len(self)} arm poses and {', '.join(known)}"]
         if self.board is not None:
             lines.append(f"  {self.board.text}, squares of {1e3 * self.board.square_m:g} mm")
+        if self.q is not None and np.allclose(self.arm.forward(self.q), self.T_base_gripper):
+            lines.append(f"  poses computed with the {self.arm.name}'s kinematics")
         return "\n".join([*lines, *(f"  not used: {skip!r}" for skip in self.skipped)])
 
     # --- a folder ---
