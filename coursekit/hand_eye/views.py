@@ -27,6 +27,7 @@ HOPELESS = 20.0  # times the better start's sum of squares: such a start is not 
 # The two poses of a flat board are told apart where the worse one's sum of squares, in units of
 # the better one's variance, is larger by more than this: odds of 1 to 4,000.
 TOLD_APART = 2 * np.log(4000.0)
+WRITTEN_RAD, WRITTEN_M = 1e-6, 1e-6  # what poses are exact to: six digits
 ONE_POSE_RAD = np.radians(0.1)  # nearer than this two fits are one pose that was reached twice
 
 
@@ -110,6 +111,12 @@ class PoseViews:
 
     poses: Floats
     information: Floats
+
+    @classmethod
+    def exact(cls, poses: Floats) -> PoseViews:
+        """Poses that scatter, by an amount that is to be found, about what is written here."""
+        digits = np.diag(np.repeat([WRITTEN_RAD, WRITTEN_M], 3) ** -2.0)
+        return cls(poses, np.broadcast_to(digits, (len(poses), 6, 6)))
 
     @property
     def observations(self) -> int:
