@@ -405,8 +405,8 @@ def _check_columns(columns: set[str]) -> None:
     if missing and not columns.issuperset(JOINTS):
         raise ValueError(
             f"folder: {POSES} has no column {missing[0]!r}, and not all of {', '.join(JOINTS)} "
-            "either: want a pose (x, y, z with a quaternion or rx, ry, rz), or the WidowX AI's joint "
-            "angles (rad); those of another arm tell nothing here, its poses do"
+            "either: want a pose (x, y, z with a quaternion or rx, ry, rz), or joint angles of the "
+            "WidowX AI (rad); those of another arm tell nothing here, its poses do"
         )
 
 
