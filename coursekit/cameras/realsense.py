@@ -1,4 +1,5 @@
-"""RealSense cameras on USB, recordings of them, and sets of recordings, which a folder holds.
+"""RealSense cameras on USB, recordings of them, and what a folder holds: a set of recordings, or
+depth images of any other camera.
 
 Cameras and recordings are one class, because librealsense plays both.
 """
@@ -17,12 +18,13 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from coursekit import specifications
+from coursekit import checks, results, specifications
 from coursekit.arrays import AnyArray, Image
 from coursekit.cameras.camera import Camera
 from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Description, Frame
 from coursekit.cameras.librealsense import device_info, load_librealsense, start_problem
 from coursekit.cameras.recording import (
+    INTRINSICS,
     Index,
     RecordedScene,
     check_depth_scale,
@@ -31,6 +33,7 @@ from coursekit.cameras.recording import (
     depth_frame_numbers,
 )
 from coursekit.geometry import Intrinsics, make_transform
+from coursekit.words import counted
 
 DEPTH_SIZE, COLOR_SIZE = (848, 480), (640, 480)
 WARM_UP_FRAMES = 30  # automatic exposure settles in about a second
@@ -66,7 +69,8 @@ class RealSense(Camera):
         if (serial is None) == (path is None):
             raise ValueError("serial, path: got both or neither, want exactly one")
         self._rs = load_librealsense()
-        self._path, self._running, self._infrared = path, None, infrared
+        self._running: _Running | None = None
+        self._path, self._infrared = path, infrared
         self._what = f"the RealSense {serial}"
         self.source, self.serial, self.can_place = "live", serial or "", path is None
         if path is not None:
@@ -107,8 +111,8 @@ class RealSense(Camera):
                 f"{self._what} cannot be read: it is damaged, incomplete or not from a RealSense; "
                 f"copy it again or record it anew (librealsense says: {reason})"
             ) from error
-        self._running = _Running(pipeline, playback)
-        self._stop = weakref.finalize(self, self._running.stop)
+        self._running = running = _Running(pipeline, playback)
+        self._stop = weakref.finalize(self, running.stop)
 
     def _live_config(self) -> Any:
         rs, config = self._rs, self._rs.config()
@@ -413,7 +417,7 @@ class _Running:
         with self._using:
             if self._ending.is_set():
                 return None, None
-            return self._pipeline.try_wait_for_frames(POLL_MS)  # type: ignore[no-any-return]
+            return self._pipeline.try_wait_for_frames(POLL_MS)
 
     def stop(self) -> None:
         """Bring everything to rest: a thread that polls, the playback, the pipeline.
@@ -424,11 +428,12 @@ class _Running:
         it comes to rest only while somebody takes its images.
         """
         self._ending.set()
-        attendant = self._attendant  # may itself be where Python collects a forgotten camera
-        alive = attendant is not None and attendant is not threading.current_thread()
-        with self._using, contextlib.suppress(RuntimeError):  # an unplugged camera cannot be stopped
+        attendant = self._attendant
+        if attendant is threading.current_thread():  # where Python collects a forgotten camera
+            attendant = None
+        with self._using, contextlib.suppress(RuntimeError):  # an unplugged one cannot be stopped
             try:
-                while alive and attendant.is_alive():  # at most 10 s, librealsense's own patience
+                while attendant and attendant.is_alive():  # at most librealsense's own 10 s
                     self._pipeline.try_wait_for_frames(1)
             finally:
                 self._pipeline.stop()
@@ -513,7 +518,7 @@ def specified(name: str) -> specifications.Device | None:
     return specifications.device(found) if found else None
 
 
-# --- sets of recordings ------------------------------------------------------------------------
+# --- folders --------------------------------------------------------------------------------------
 
 
 class RecordedSet(Camera):
@@ -568,3 +573,70 @@ class RecordedSet(Camera):
 
     def stream(self) -> Generator[Frame, None, None]:
         return self._played.stream()
+
+
+class ImageFolder(Camera):
+    """Depth images of any camera in a folder: 16-bit PNGs, in the order of the numbers in their
+    names, beside an intrinsics.json.
+
+    That file holds the fields of `Intrinsics` and depth_scale_m (metres a count), and may hold
+    baseline_m (of a stereo camera), name and frames_per_s. There is no colour. Raises CameraError
+    for a folder without both, or with a file that is damaged.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        path, self._what = folder / INTRINSICS, f"the folder {folder.name}"
+        numbers = re.compile(r"(\d+)")  # a text's odd parts: img_2 comes before img_10
+        self._images = sorted(
+            folder.glob("*.png"),
+            key=lambda png: [int(t) if i % 2 else t for i, t in enumerate(numbers.split(png.stem))],
+        )
+        if not self._images or not path.exists():
+            missing = INTRINSICS if self._images else "16-bit PNGs"
+            raise CameraError(
+                f"{self._what} lacks {missing}: to be a camera it holds 16-bit PNGs of depth and "
+                f"{INTRINSICS} with width, height, fx, fy, cx, cy (px) and depth_scale_m"
+            )
+        try:
+            given = results.read_json(path)
+            self.depth_scale_m = check_depth_scale(given.pop("depth_scale_m", None))
+            self.baseline_m = given.pop("baseline_m", None)
+            if self.baseline_m is not None:
+                self.baseline_m = checks.positive("baseline_m", self.baseline_m)
+            self.name = str(given.pop("name", "Depth camera"))
+            self._frames_per_s = checks.positive(
+                "frames_per_s", given.pop("frames_per_s", FRAMES_PER_S)
+            )
+            given["coeffs"] = tuple(given.get("coeffs", (0.0,) * 5))
+            self.depth = Intrinsics(**given)
+        except (TypeError, ValueError) as error:
+            raise CameraError(f"{path} cannot be used ({error}): correct it") from error
+        self.source, self.serial, self.color, self.T_color_depth = "recorded", "", None, None
+
+    def __repr__(self) -> str:
+        baseline = "none" if self.baseline_m is None else f"{1000 * self.baseline_m:.1f} mm"
+        return (
+            f"{self.name} ({self._what}, {counted(len(self._images), 'image')}): depth "
+            f"{self.depth.width}x{self.depth.height}, no colour, baseline {baseline}, depth unit "
+            f"{1000 * self.depth_scale_m:g} mm"
+        )
+
+    def stream(self) -> Generator[Frame, None, None]:
+        import cv2
+
+        size = (self.depth.height, self.depth.width)
+        for number, path in enumerate(self._images, start=1):
+            data = np.fromfile(path, np.uint8)  # imread takes no accents on Windows
+            image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+            if image is None or image.dtype != np.uint16 or image.shape != size:
+                got = "no image" if image is None else f"{image.dtype} {image.shape}"
+                wanted = f"16-bit grey of {size}, as {INTRINSICS} says"
+                raise CameraError(f"{path} is {got}: want {wanted}")
+            depth, time_s = image.astype(np.uint16), number / self._frames_per_s
+            yield Frame(depth, None, self.depth_scale_m, time_s, number, self.depth)
+
+    def lock(self) -> str:
+        return "Images in a folder cannot be changed: exposure and focus are as they were."
+
+    def close(self) -> None:
+        pass  # no file stays open
