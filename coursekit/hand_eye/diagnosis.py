@@ -41,8 +41,8 @@ def diagnose(
 ) -> Findings:
     """What is wrong with a session, the gravest first; empty when nothing is.
 
-    arm: whose joint angles the session has, `session.arm` unless given. errors: what is normal for
-    it, the sizes of `ArmErrors` unless given.
+    arm: whose joint angles the session has, `session.arm` unless given. errors: what is normal
+    for it, the sizes of `ArmErrors` unless given.
     A healthy session gets a wrong cause in at most 2 of 100 cases; equal pairs count once. Where no
     cause explains what `HandEyeResult.judgement` calls large, the finding is that. Raises ValueError for fewer pairs
     than any solver takes.
@@ -257,7 +257,7 @@ class _Case:
         return [*["motion"] * (velocity is None), *["joints"] * (q is None)]
 
     def _joints_that_fit(self, q: Floats) -> Floats | None:
-        """Joint angles that give other poses than the arm's: None, and a finding if they do not fit.
+        """None for joint angles of other poses than the arm's, and a finding if they do not fit.
 
         Poses of another tool on the same arm fit the images as well as the arm's own.
         """
