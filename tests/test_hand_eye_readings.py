@@ -76,10 +76,10 @@ def as_text(given: HandEyeSession, first: int, inverse: bool) -> HandEyeSession:
 
 
 def drifting(given: HandEyeSession, seed: int) -> HandEyeSession:
-    """The camera, or the board, turns by 1.5 deg and moves by 10 mm in all."""
+    """The camera, or the board, turns by 2 deg and moves by 15 mm in all."""
     rng = np.random.default_rng([seed, 8])
     way = rng.normal(size=(2, 3))
-    way *= np.array([[np.radians(1.5)], [0.01]]) / np.linalg.norm(way, axis=1, keepdims=True)
+    way *= np.array([[np.radians(2.0)], [0.015]]) / np.linalg.norm(way, axis=1, keepdims=True)
     time = np.linspace(-0.5, 0.5, len(given))
     return replace(given, seen=turned(given.seen, time[:, None] * way.ravel()))
 

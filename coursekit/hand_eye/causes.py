@@ -70,6 +70,7 @@ CAMERA_RAD, CAMERA_M = np.radians(0.02), 1e-4  # what imperfect intrinsics do to
 ARM_FACTORS = (1.0, 2.0, 4.0)
 OWN_FACTORS = (0.1, 0.2, 0.35, 0.6, 1.0, 1.5)
 SHARES_ALIKE, NEAR = (0.0, 0.5, 0.9), 2.0  # of the own errors' variance; of two medians
+OWN_SIZES = 4  # poses' worth of numbers that X, Y and the sizes along the axes take
 AXIS_POSES = 5.0  # that the mean of three axes counts for, in the size along each
 SHORTEST_SEGMENT = 3  # pairs on either side of a slip
 FEWEST_PAIRS = 6  # below which one odd pose cannot be told from 24 odd numbers
@@ -288,7 +289,11 @@ class MendedPairs:
         residuals = self.fit.twists.ravel()
         along = [h.columns for h in self._suspects if (h.cause, h.at) in self.smooth]
         columns = np.hstack([self.fit.columns.reshape(len(residuals), -1), *along])
-        return likelihood_ratios(residuals, columns, hypotheses, self.covariances())
+        tests = likelihood_ratios(residuals, columns, hypotheses, self.covariances())
+        # Sizes that come from the residuals themselves are too small by chance, most of few poses.
+        n = len(self.fit.pairs)
+        sure = max(n - OWN_SIZES, 1) / n
+        return [replace(t, log_p=sure * t.log_p, strength=sure * t.strength) for t in tests]
 
     def matters(self, test: Tested) -> bool:
         """Whether the effect is larger than what careful people have."""

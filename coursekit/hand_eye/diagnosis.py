@@ -41,8 +41,8 @@ def diagnose(
 ) -> Findings:
     """What is wrong with a session, the gravest first; empty when nothing is.
 
-    arm: whose joint angles the session has, `session.arm` unless given. errors: what is normal for
-    it, the sizes of `ArmErrors` unless given.
+    arm: whose joint angles the session has, `session.arm` unless given. errors: what is normal
+    for it, the sizes of `ArmErrors` unless given.
     A healthy session gets a wrong cause in at most 2 of 100 cases; equal pairs count once. Where no
     cause explains what `HandEyeResult.judgement` calls large, the finding is that. Raises
     ValueError for fewer pairs than any solver takes.

@@ -125,13 +125,15 @@ def other_rotations(pairs: PosePairs) -> Iterator[tuple[str, str, PosePairs]]:
     """The arm's rotations with a slip of their nine or four numbers; the positions stay."""
     R = Rotation.from_matrix(pairs.T_base_gripper[:, :3, :3])
     quaternions = R.as_quat()
-    for order, places in (("(w, x, y, z)", [1, 2, 3, 0]), ("(x, y, z, w)", [3, 0, 1, 2])):
-        words = f"quaternions {order} read in another order; the data fit {order}"
-        yield (
-            "notation",
-            words,
-            with_rotations(pairs, Rotation.from_quat(quaternions[:, places]).as_matrix()),
-        )
+    for words, places in (
+        (
+            "(w, x, y, z) read as (x, y, z, w); the data fit from_quat(q[[1, 2, 3, 0]])",
+            [1, 2, 3, 0],
+        ),
+        ("(x, y, z, w) read as (w, x, y, z); the data fit Rotation.from_quat(q)", [3, 0, 1, 2]),
+    ):
+        other = Rotation.from_quat(quaternions[:, places]).as_matrix()
+        yield "notation", f"quaternions {words}", with_rotations(pairs, other)
     words = "rotations transposed, the positions left; the data fit R.T"
     yield "notation", words, with_rotations(pairs, R.inv().as_matrix())
 
@@ -179,19 +181,29 @@ def other_pairing(pairs: PosePairs, names: Sequence[str]) -> Pairing | None:
         tried += [part.keep(np.arange(len(part)) >= len(part) - half) for part in tried[1:3]]
     orders = [*_text_orders(n), np.arange(n)[::-1]]
     tried += [replace(pairs, T_base_gripper=pairs.T_base_gripper[order]) for order in orders]
+    names, own = [names[view] for view in pairs.view], np.arange(n)
     found = [_fitting_rows(part.fit, pairs) for part in tried]
-    _, rows, off = min(found, key=lambda one: one[0])
-    moved = np.flatnonzero(rows != np.arange(n))
-    if len(moved) < 2:
+    rows, off = min(found, key=_left_over)
+    if (rows != own).sum() < 2:
         return None
-    return _in_order(pairs, rows, moved, off, [names[view] for view in pairs.view])
+    # X and Y of a few pairs may fit those by chance: all of them must say the same
+    rows, off = _fitting_rows(_in_order(pairs, rows, off, names).mended.fit, pairs)
+    moved = np.flatnonzero(rows != own)
+    better = found[0][1][moved, moved] - off[moved, rows[moved]]  # than as given, logarithms
+    if len(moved) < 2 or better.mean() < 2 * np.log(CLEARLY_BETTER):
+        return None
+    return _in_order(pairs, rows, off, names)
 
 
-def _fitting_rows(fit: Fit, pairs: PosePairs) -> tuple[float, NDArray[np.intp], Floats]:
-    """What is left over; the row (n,) that each image fits, its own if that does or none does.
+def _left_over(fitting: tuple[NDArray[np.intp], Floats]) -> float:
+    rows, off = fitting
+    return float(off[np.arange(len(rows)), rows].mean())
 
-    The last (n, n) is the logarithm of what each image and row would leave over, by X and Y of the
-    fit; the first its mean at those rows.
+
+def _fitting_rows(fit: Fit, pairs: PosePairs) -> tuple[NDArray[np.intp], Floats]:
+    """The row (n,) that each image fits, its own if that does or none does.
+
+    And the logarithm (n, n) of what each image and row would leave over, by X and Y of the fit.
     """
     arm = camera_board(pairs.T_base_gripper, fit.X, fit.Y[0], pairs.mount)
     apart = pose_difference(arm[None], pairs.T_camera_board[:, None])
@@ -202,18 +214,18 @@ def _fitting_rows(fit: Fit, pairs: PosePairs) -> tuple[float, NDArray[np.intp], 
     moved = (far[own, best] < WITHIN) & (far[own, own] > WITHIN)
     moved &= far[own, own] > FARTHER * far[own, best]
     moved &= np.bincount(best, minlength=len(own))[best] == 1
-    rows = np.where(moved, best, own)
-    return float(off[own, rows].mean()), rows, off
+    return np.where(moved, best, own), off
 
 
 def _in_order(
-    pairs: PosePairs, rows: NDArray[np.intp], moved: NDArray[np.intp], off: Floats, names: list[str]
+    pairs: PosePairs, rows: NDArray[np.intp], off: Floats, names: Sequence[str]
 ) -> Pairing:
     """What was done to images that fit other rows: shifted, sorted otherwise, or exchanged.
 
-    moved: those images; names (n,): of all; off (n, n): see `_fitting_rows`.
+    names (n,): of the images; rows (n,), off (n, n): see `_fitting_rows`.
     """
     n, own = len(rows), np.arange(len(rows))
+    moved = np.flatnonzero(rows != own)
     orders = [Pairing(pairs, order, "text_order", TEXT_ORDER) for order in _text_orders(n)]
     orders.append(Pairing(pairs, own[::-1], "off_by_one", "the images run backwards"))
     by = Counter((rows[moved] - moved).tolist()).most_common(1)[0][0]
