@@ -1,4 +1,4 @@
-"""Files of others as they came: a robot's poses in millimetres and degrees, a lens, MoveIt's pairs."""
+"""Files of others as they came: a robot's poses in mm and degrees, a lens, MoveIt's pairs."""
 
 from __future__ import annotations
 
