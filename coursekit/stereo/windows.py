@@ -248,13 +248,14 @@ def _not_gaussian(
     mean (h, w), drift (N,): of the stack. std, dof: of a pixel, as for one Gaussian noise. A
     variance from samples of excess kurtosis k has 1 + k / 2 times the variance of a Gaussian one's;
     that of parts which differ is known no better than by how much they differ, and pixels that jump
-    between two depths are taken to jump together. Fewer than 8 frames, and noise that the depth
-    unit hides, say nothing.
+    between two depths, or lie on two surfaces, count as one pixel. Fewer than 8 frames, and noise
+    that the depth unit hides, say nothing.
     """
     n, words = len(z), []
     gap = _two_surfaces(mean, max(JUMP_SIGMAS * np.nan_to_num(std), step or 0.0))
     if gap > 0:
         words.append(f"two surfaces, {1e3 * gap:.1f} mm apart: move the window off the edge")
+        dof = min(dof, n - 1.0)
     if n < 8 or not std > (step or 0.0) or not dof > 0:
         return dof, gap, tuple(words)
     square = np.square(z - mean - drift[:, None, None])
