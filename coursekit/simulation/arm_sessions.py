@@ -26,8 +26,8 @@ from scipy.spatial.transform import Rotation
 from coursekit.arm import ArmErrors, SimulatedArm, widowx
 from coursekit.arrays import Floats, Grey
 from coursekit.boards import Board, BoardNotFound, Detection, Detections, detect
+from coursekit.boards.board import seen
 from coursekit.boards.detector import FEWEST_CORNERS, SESSION
-from coursekit.boards.view import seen
 from coursekit.checks import choice, number, positive, want, whole
 from coursekit.geometry import (
     invert_transform,

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from coursekit.arrays import Bools, Floats, Integers
 from coursekit.boards import Board, Detection, Detections
-from coursekit.boards.view import BORDER_PX, seen, slide_into_view
+from coursekit.boards.board import BORDER_PX, seen, slide_into_view
 from coursekit.checks import array, number, positive, whole
 from coursekit.geometry import Intrinsics, project, transform_points
 
