@@ -25,13 +25,15 @@ LENSES = [
     Intrinsics(1280, 720, 918, 917, 642, 362, "brown_conrady", (0.12, -0.25, 8e-4, 4e-4, 0.1)),
 ]
 BOARDS = [Board("charuco", (9, 6), 0.025), Board("checkerboard", (10, 7), 0.025)]
-# Fisheyes of 120 to 160 degrees across the diagonal, and a wide lens that is a quotient of
-# polynomials: five coefficients leave 0.1 to 0.4 px of them, where the corners' noise is 0.08.
+# Fisheyes of 120 to 160 degrees across the diagonal, and wide lenses that are a quotient of two
+# polynomials, which grows all the way: five coefficients leave two to eight times the noise.
+QUOTIENT = {"model": "brown_conrady", "coeffs": (0.12, 0.0, 0.0, 0.0, 0.0)}
 BEYOND = [
     (replace(LENSES[1], fx=300, fy=300), Effects(fisheye=True)),
     (replace(LENSES[1], fx=250, fy=251), Effects(fisheye=True)),
     (Intrinsics(1280, 720, 520, 521, 642, 362), Effects(fisheye=True)),
-    (replace(LENSES[1], fx=300, fy=300), Effects(rational=(0.3, 0.0, 0.0))),
+    (replace(LENSES[1], fx=300, fy=300, **QUOTIENT), Effects(rational=(0.4, 0.0, 0.0))),
+    (Intrinsics(1280, 720, 560, 561, 642, 362, **QUOTIENT), Effects(rational=(0.4, 0.0, 0.0))),
 ]
 
 

@@ -56,8 +56,8 @@ class Effects:
     as noise_spread, from corner to corner of a view, which makes the noise's tails heavy. shake_px:
     std of the length of the motion blur in every view. claimed: what the detector says of its
     noise, over what it is. rational: k4, k5 and k6 of OpenCV's rational model, after the lens's own
-    coefficients; fisheye: the image grows with the angle (equidistant) instead of its tangent, the
-    lens's coefficients apart.
+    coefficients; the image must grow all the way to its corners, which is not checked. fisheye: it
+    grows with the angle (equidistant) instead of its tangent, the lens's coefficients apart.
     """
 
     bow_m: float = 0.0
