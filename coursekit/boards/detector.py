@@ -41,8 +41,8 @@ RAW = "a camera's raw file: develop it to PNG or TIFF, without correction of the
 FILM = "a film: save single pictures of it as PNG"
 OTHERS = {  # the suffix or the first bytes of what OpenCV cannot read, or only a thumbnail of
     r"\.hei[cf]|....ftyp(hei|hev|mif1|msf1)": "a HEIC photograph: export it as JPEG or PNG",
-    r"\.(cr[23]|ne[fw]|nrw|arw|dng|ra[fw]|orf|rw2|pef|srw)|....ftypcrx|FUJIFILM|II\*\0....CR": RAW,
-    r"\.(mp4|mov|avi|mkv|webm|m4v|wmv|mpg)|....ftyp(iso|mp4|M4V|qt)|RIFF....AVI|\x1aE\xdf": FILM,
+    r"\.(cr[23]|ne[fw]|nrw|arw|dng|ra[fw]|orf|rw2|pef|srw)$|....ftypcrx|FUJIFILM|II\*\0....CR": RAW,
+    r"\.(mp4|mov|avi|mkv|webm|m4v|wmv|mpg)$|....ftyp(iso|mp4|M4V|qt)|RIFF....AVI|\x1aE\xdf": FILM,
     r"\.pdf|%PDF": "a PDF: save its photographs as PNG",
     r"\.(bag|db3|mcap)|#ROSBAG|SQLite format 3": "a recording: ck.open_camera(path) plays it",
     r"\.np[yz]|\x93NUMPY": "arrays: load them and give the arrays",

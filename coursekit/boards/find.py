@@ -154,18 +154,24 @@ def checkerboard_seen(grey: Grey) -> Floats | None:
     OpenCV's search for boards of any size often reports one line too few or too many, so lines of
     corners that are none are dropped, and real ones beyond the last are added.
     """
-    flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
-    found, pixels, meta = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), flags)
-    if not found:
-        return None
-    grid = pixels.reshape(*meta.shape[:2], 2).astype(np.float64)
+    for flags in (cv2.CALIB_CB_LARGER, cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE):
+        found, pixels, meta = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), flags)
+        if found:
+            grid = _fitted(grey, pixels.reshape(*meta.shape[:2], 2).astype(np.float64))
+            if min(grid.shape[:2]) > 2 and _is_whole(grey, grid):
+                return grid
+    return None
+
+
+def _fitted(grey: Grey, grid: Floats) -> Floats:
+    """The corners (rows, columns, 2) without outer lines that are none, and with those beyond."""
     for _ in range(4):  # sides
         while len(grid) > 2 and _is_saddle(grey, grid)[0].mean() <= LEAST_REAL:
             grid = grid[1:]
         while len(grid) < MOST_LINES and real_beyond(grey, grid)[0] >= MOST_BEYOND:
             grid = np.concatenate([2 * grid[:1] - grid[1:2], grid])
         grid = np.rot90(grid)
-    return grid if min(grid.shape[:2]) > 2 and _is_whole(grey, grid) else None
+    return grid
 
 
 def _is_whole(grey: Grey, grid: Floats) -> bool:
