@@ -33,6 +33,7 @@ BELONGS_M = 1e-2  # joint angles that are off by more tell nothing of the arm's 
 POOR_RAD, POOR_M = np.radians(2.0), 0.02  # residuals that no working arm has
 HOPELESS_RAD = np.radians(10.0)  # beyond any slip, delay or wrong zero
 VIDEO_STEP_M, VIDEO_STEP_RAD = 0.1, np.radians(20.0)  # at most, for velocities from positions
+FAR_FROM_MIDDLE = 0.12  # of the image: no camera's principal point is so far off
 _TEXTS = DiagnosisTexts.of("hand_eye")
 
 
@@ -54,6 +55,7 @@ def diagnose(
     want(len(session) >= FEWEST_POSES, "session", len(session), f"at least {FEWEST_POSES} pairs")
     given, session = session, session.once if len(session.once) >= FEWEST_POSES else session
     case = _Case(session, arm or session.arm, errors, PosePairs.of(session), session.q)
+    case.lens()
     case.units()
     case.joints_in_degrees()
     if case.design():
@@ -91,6 +93,24 @@ class _Case:
         return Findings(self.found, _TEXTS.looked_for, reasons)
 
     # --- units ---
+
+    def lens(self) -> None:
+        """Intrinsics of another image size than they say: their principal point tells."""
+        lens = self.session.intrinsics
+        if lens is None or self.session.detections is None:
+            return
+        middle = np.array([lens.cx + 0.5, lens.cy + 0.5]) / lens.size
+        if np.abs(middle - 0.5).max() < FAR_FROM_MIDDLE:
+            return
+        given, factor = self.pairs.fit, float(0.5 / middle.mean())
+        centre = {"cx": (lens.cx + 0.5) * factor - 0.5, "cy": (lens.cy + 0.5) * factor - 0.5}
+        scaled = replace(lens, fx=factor * lens.fx, fy=factor * lens.fy, **centre)
+        mended = PosePairs.of(replace(self.session, intrinsics=scaled))
+        if mended.fit.better_than(given) > 1.0:
+            self.pairs = mended
+        figures = {"cx": lens.cx, "cy": lens.cy, "factor": factor}
+        size = {"width": lens.width, "height": lens.height}
+        self.add("lens_of_another_size", **figures, **size, **_change(given, mended.fit))
 
     def units(self) -> None:
         """Millimetres, by size alone: neither an arm nor a camera reaches 10 m."""

@@ -237,7 +237,7 @@ def _in_order(
     couples = [f"{names[i]} and {names[j]}" for i, j in enumerate(rows) if i < j and rows[j] == i]
     if 2 * len(couples) == len(moved):
         return Pairing(pairs, rows, "exchanged_rows", ", ".join(couples))
-    listed = ", ".join(f"{names[i]} to that of {names[rows[i]]}" for i in moved)
+    listed = ", ".join(f"{names[i]} to that of {names[int(rows[i])]}" for i in moved)
     words = f"images belong to arm poses of others ({listed})"
     taken = np.isin(own, rows[moved]) & (rows == own)
     return Pairing(pairs, np.where(taken, -1, rows), "off_by_one", words)
@@ -512,7 +512,8 @@ def undo_notation(given: Fit, expected: Floats) -> Reading | None:
 
     expected (n, 3, 3): from `places`.
     """
-    G, found = given.pairs.T_base_gripper[:, :3, :3], []
+    G = given.pairs.T_base_gripper[:, :3, :3]
+    found: list[Reading] = []
     for misreading in misreadings():
         if found and misreading.factor > 1:
             break  # the slow ones

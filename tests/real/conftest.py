@@ -53,7 +53,7 @@ def _ur3e(q):
     T = np.tile(np.eye(4), (len(q), 1, 1))
     for angle, (a, alpha, d) in zip(q.T, UR3E, strict=True):
         about_z, about_x = np.tile(np.eye(4), (2, len(q), 1, 1))
-        about_z[:, :3, :3] = Rotation.from_euler("z", angle).as_matrix()
+        about_z[:, :3, :3] = Rotation.from_euler("z", angle[:, None]).as_matrix()
         about_x[:, :3, :3] = Rotation.from_euler("x", alpha, degrees=True).as_matrix()
         about_z[:, 2, 3], about_x[:, 0, 3] = d, a
         T = T @ about_z @ about_x
