@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import itertools
+import json
+import os
 import shutil
 import sqlite3
+import subprocess
+import sys
 import zipfile
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+from common import nightly
 from fake_realsense import ending_after, real_library
 from scipy.spatial.transform import Rotation
 
@@ -493,3 +499,177 @@ def test_a_grey_recording_is_refused(rs, tmp_path, monkeypatch):
     record_raw(monkeypatch, rs, path, RandomCamera(n=2), "y8", pixels)
     with pytest.raises(CameraError, match="colour is stored as y8, want rgb8"):
         open_camera(path)
+
+
+# --- recordings that librealsense cannot play, named for what they are ---
+
+
+def bag(*topics):
+    """The least of a rosbag 2.0: where its index begins, and in it the connections."""
+
+    def record(header, data):
+        fields = b"".join(
+            (len(name) + len(value) + 1).to_bytes(4, "little") + name + b"=" + value
+            for name, value in header
+        )
+        return b"".join(len(part).to_bytes(4, "little") + part for part in (fields, data))
+
+    connections = b"".join(record([(b"topic", t.encode())], b"") for t in topics)
+    magic, empty = b"#ROSBAG V2.0\n", [(b"index_pos", bytes(8))]
+    index = len(magic) + len(record(empty, b" " * 100))
+    start = record([(b"index_pos", index.to_bytes(8, "little"))], b" " * 100)
+    return magic + start + connections
+
+
+def ros2(*topics):
+    def make(path):
+        robot(path)
+        with sqlite3.connect(path) as file:
+            rows = [(i, topic, "", "", "") for i, topic in enumerate(topics)]
+            file.executemany("INSERT INTO topics VALUES (?, ?, ?, ?, ?)", rows)
+
+    return make
+
+
+ORBBEC = ("/tf", "/camera/depth/camera_info", "/camera/depth/image_rect_raw", "/joint_states")
+
+
+@pytest.mark.parametrize(
+    ("name", "make", "topic"),
+    [
+        ("ros2.db3", ros2(*ORBBEC), "/camera/depth/image_rect_raw"),
+        ("arm.db3", ros2("/joint_states", "/tf"), "/joint_states"),
+        ("ros1.bag", lambda path: path.write_bytes(bag(*ORBBEC)), "/camera/depth/image_rect_raw"),
+        ("lidar.bag", lambda path: path.write_bytes(bag("/velodyne_points")), "/velodyne_points"),
+    ],
+)
+def test_a_recording_of_ros_topics_is_named_for_what_it_is(rs, tmp_path, name, make, topic):
+    make(tmp_path / name)
+    what = rf"is a recording of ROS topics \({topic} \.\.\.\), which librealsense cannot play: rec"
+    with pytest.raises(CameraError, match=what):
+        open_camera(tmp_path / name)
+
+
+def test_a_bag_cut_short_is_named_truncated(rs, tmp_path):
+    whole, path = bag(*ORBBEC), tmp_path / "cut.bag"
+    for size in (len(whole) - 3, whole.index(b"/tf") - 20, 120):
+        path.write_bytes(whole[:size])
+        with pytest.raises(CameraError, match=r"is truncated: .* copy it again or record it anew"):
+            open_camera(path)
+
+
+def test_a_recording_cut_short_is_named_truncated(good, tmp_path):
+    path, data = tmp_path / "cut.db3", good.read_bytes()
+    for fraction in (0.001, 0.5, 0.999):
+        path.write_bytes(data[: int(fraction * len(data))])
+        with pytest.raises(CameraError, match=r"cut\.db3 is truncated: "):
+            open_camera(path)
+
+
+# --- a folder of depth images ---
+
+
+def image_folder(folder, baseline_m=None, scale=0.00025, names="depth_{}.png", **changes):
+    """Twelve 16-bit PNGs whose depth is their number, beside an intrinsics.json."""
+    folder.mkdir()
+    for number in range(1, 13):
+        depth = np.full((48, 64), 1000 + number, np.uint16)
+        depth[0] = 65535
+        cv2.imwrite(str(folder / names.format(number)), depth)
+    given = {"width": 64, "height": 48, "fx": 46.0, "fy": 46.0, "cx": 31.5, "cy": 23.5}
+    given |= {"depth_scale_m": scale, "name": "Femto"} | changes
+    if baseline_m is not None:
+        given["baseline_m"] = baseline_m
+    (folder / "intrinsics.json").write_text(json.dumps(given), encoding="utf-8")
+    return folder
+
+
+@pytest.mark.parametrize("names", ["depth_{}.png", "{}.png", "2026-11-29_run2_{:05d}.png"])
+def test_a_folder_of_depth_images_is_a_camera_in_the_order_of_numbers(tmp_path, names):
+    with open_camera(image_folder(tmp_path / "femto", names=names)) as camera:
+        frames = camera.frames(20, progress=False)
+        assert frames.depth[:, 5, 5].tolist() == list(range(1001, 1013))
+        assert (frames.depth[:, 0] == 0).all()  # the largest count is no depth
+        assert np.isnan(frames[0].points()[0]).all()
+        assert frames[2].depth_m[5, 5] == pytest.approx(1003 * 0.00025)
+        assert (camera.baseline_m, camera.color, camera.source) == (None, None, "recorded")
+        assert "Femto (the folder femto, 12 images): depth 64x48" in repr(camera)
+
+
+def test_a_folder_of_depth_images_can_be_recorded(rs, tmp_path):
+    camera = open_camera(image_folder(tmp_path / "stereo", baseline_m=0.095, scale=0.0001))
+    with open_camera(camera.record(tmp_path / "again.db3", 12)) as again:
+        assert again.baseline_m == 0.095
+        assert (again.frames(12).depth == camera.frames(12).depth).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"fx": None}, r"intrinsics\.json cannot be used \(fx: got None"),
+        ({"scale": None}, r"cannot be used \(depth_scale_m: got None"),
+        ({"focal": 3}, "cannot be used .*focal"),
+        ({"baseline_m": -1}, "cannot be used .*baseline_m: got -1"),
+        ({"width": 65}, r"depth_1\.png is uint16 \(48, 64\): want 16-bit grey of \(48, 65\)"),
+    ],
+)
+def test_a_folder_that_is_no_camera_says_why(tmp_path, changes, message):
+    with pytest.raises(CameraError, match=message):
+        open_camera(image_folder(tmp_path / "bad", **changes)).frame()
+
+
+def test_a_folder_with_one_half_only_or_damaged_images_says_so(tmp_path):
+    folder = image_folder(tmp_path / "half")
+    cv2.imwrite(str(folder / "depth_1.png"), np.zeros((48, 64), np.uint8))
+    with pytest.raises(CameraError, match=r"depth_1\.png is uint8"):
+        open_camera(folder).frame()
+    (folder / "depth_1.png").write_bytes(b"")
+    with pytest.raises(CameraError, match=r"depth_1\.png is no image"):
+        open_camera(folder).frame()
+    (folder / "intrinsics.json").unlink()
+    with pytest.raises(CameraError, match=r"lacks intrinsics\.json"):
+        open_camera(folder)
+
+
+# --- what is left open when Python ends ---
+
+LEAVING = """
+import os, sys, threading, time
+import coursekit as ck
+from coursekit.cameras.librealsense import load_librealsense
+load_librealsense()
+FILE, RUNS, KINDS = sys.argv[1], int(sys.argv[2]), {
+    "never read": "c = ck.open_camera(FILE)",
+    "one frame read": "c = ck.open_camera(FILE); c.frame()",
+    "a stream half read": "s = ck.open_camera(FILE).stream(); next(s); next(s)",
+    "an exception": "c = ck.open_camera(FILE); raise SystemExit(0) from ValueError()",
+    "sys.exit": "c = ck.open_camera(FILE); sys.exit(0)",
+    "two": "c, d = ck.open_camera(FILE), ck.open_camera(FILE); d.frame()",
+    "in a thread": "t = threading.Thread(target=lambda: kept.append(ck.open_camera(FILE)));"
+    "t.start(); t.join()",
+    "deleted": "c = ck.open_camera(FILE); del c",
+    "in a cycle": "c = ck.open_camera(FILE); c.itself = c; del c",
+    "reopened": "c = ck.open_camera(FILE); c = ck.open_camera(FILE); c.close()",
+}
+for kind, code in KINDS.items():
+    for _ in range(RUNS):
+        child = os.fork()
+        if child == 0:  # its own interpreter ends, as a script's does
+            kept = []
+            exec(code)
+            sys.exit(0)
+        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        print(kind, status, flush=True)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
+@pytest.mark.parametrize("runs", [1, pytest.param(20, marks=nightly)])
+def test_a_script_that_leaves_a_recording_open_ends_well(tabletop, runs):
+    """A process for each kind; forked, because importing everything takes longer than they do."""
+    command = [sys.executable, "-c", LEAVING, str(tabletop), str(runs)]
+    ended = subprocess.run(command, check=False, capture_output=True, text=True)
+    lines = ended.stdout.splitlines()
+    assert len(lines) == 10 * runs, ended.stderr
+    assert [line for line in lines if not line.endswith(" 0")] == []
+    assert "terminate" not in ended.stderr

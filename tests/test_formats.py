@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -11,8 +12,9 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from common import refusals
+from common import nightly, refusals
 from scipy.spatial.transform import Rotation
+from simulated_hand_eye import arm_session
 
 import coursekit as ck
 from coursekit import results
@@ -26,7 +28,7 @@ from coursekit.geometry import (
     project,
     transform_points,
 )
-from coursekit.hand_eye import HandEyeSession
+from coursekit.hand_eye import HandEyeSession, diagnose
 from coursekit.hand_eye.poses import camera_board
 
 COEFFS = (0.0712345678901, -0.183, 1.2e-5, -0.00213, 0.0911)
@@ -611,6 +613,27 @@ def test_a_wrong_rotation_for_what_the_columns_say(tmp_path) -> None:
         poses.read_table(path, rotation="xyz")
     with pytest.raises(ValueError, match=r"^rotation: got 'rpy', want one of"):
         poses.read_table(path, rotation="rpy")
+
+
+@nightly
+@pytest.mark.parametrize("said", ["rotation_vector", "xyz", "ZYX"])
+@pytest.mark.parametrize("true", ["rotation_vector", "xyz", "ZYX"])
+def test_a_wrong_statement_is_refused_or_found(tmp_path, true, said) -> None:
+    """Of twenty sessions on the simulated arm, by `read_table` or by `diagnose`."""
+    noticed = 0
+    for seed in range(20):
+        mount = "eye_in_hand" if seed % 2 else "eye_to_hand"
+        session = arm_session(seed, mount, 15).session
+        R = Rotation.from_matrix(session.T_base_gripper[:, :3, :3])
+        turns = R.as_rotvec() if true == "rotation_vector" else R.as_euler(true)
+        text = table((*XYZ, *poses.THREE), np.hstack([session.T_base_gripper[:, :3, 3], turns]))
+        path = wrote(tmp_path, "poses.csv", text)
+        arm = arm_of(path, rotation=said, angle="rad")
+        found = diagnose(replace(session, T_base_gripper=arm, q=None))
+        noticed += bool(found.names)
+        with pytest.raises(ValueError, match="no angle is larger"):
+            poses.read_table(path, rotation=said, angle="deg")
+    assert noticed <= 1 if true == said else noticed >= 19
 
 
 # --- samples of other calibrators ---

@@ -187,7 +187,7 @@ def test_quaternion_order_is_named() -> None:
     T[:, :3, :3] = Rotation.from_quat(quaternions[:, [3, 0, 1, 2]]).as_matrix()
     [finding] = diagnose(replace(given, T_base_gripper=T, q=None))
     assert finding.name == "inconsistent_convention"
-    assert "quaternions read as" in finding.evidence
+    assert "quaternions (w, x, y, z) read as" in finding.evidence
 
 
 def test_shuffled_images_fit_nothing_and_it_says_so() -> None:

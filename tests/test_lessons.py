@@ -56,6 +56,13 @@ def test_each_model_gets_its_verdict(exercise: Exercise) -> None:
         assert not re.search(r"\s\s|\n", mistake.says + mistake.ask)
 
 
+@pytest.mark.parametrize("lesson", lessons.LESSONS)
+def test_each_text_about_a_mistake_is_said_by_an_exercise(lesson: str) -> None:
+    ours = [e for e in EXERCISES.values() if e.name.startswith(f"{lesson}.")]
+    said = {mistake.name for exercise in ours for mistake in exercise.mistakes}
+    assert said == set(questions.lesson_texts(lesson)["mistakes"])
+
+
 @each_exercise
 @pytest.mark.parametrize("core", [False, True], ids=["all cases", "core cases"])
 def test_the_cases_separate_every_two_models(exercise: Exercise, core: bool) -> None:

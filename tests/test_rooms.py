@@ -123,8 +123,7 @@ def test_no_module_is_hidden_by_a_name(path: Path) -> None:
 def public_names(tree: ast.Module) -> Iterator[str]:
     for node in tree.body:
         if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
-            if not any(".mistake(" in ast.unparse(mark) for mark in node.decorator_list):
-                yield node.name  # a mistake is named within its exercise
+            yield node.name
         elif isinstance(node, (ast.Assign, ast.AnnAssign)):
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
             found = (part for target in targets for part in ast.walk(target))

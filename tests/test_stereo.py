@@ -6,6 +6,7 @@ three of those to either side are allowed (`about_95_percent`).
 """
 
 import math
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -242,6 +243,96 @@ def test_depth_unit_that_hides_the_noise_is_said():
     assert fine.rounding == ""
 
 
+def around(rng, n=30, more=0.0, times=1.0):
+    """A window on a tilted wall with one Gaussian noise of 0.6 mm, and what is done to it."""
+    return tilted() + 6e-4 * pixel_noise(rng, n, 40, 1.0) * times + more
+
+
+ACROSS, OVER_TIME = np.arange(40), np.arange(30)[:, None, None]
+NOT_ONE_NOISE = {
+    "two surfaces": (
+        r"two surfaces, 4\d\.\d mm apart",
+        lambda r: around(r, more=0.05 * (ACROSS > 19)),
+    ),
+    "a sliver of another": ("two surfaces, ", lambda r: around(r, more=0.05 * (ACROSS > 34))),
+    "near surfaces": ("two surfaces, ", lambda r: around(r, more=0.008 * (ACROSS > 19))),
+    "two depths": (
+        "jump between two depths",
+        lambda r: around(r, more=0.004 * (r.random((30, 40, 40)) < 0.5)),
+    ),
+    "an edge": ("between parts of the window", lambda r: around(r, times=1 + 6.0 * (ACROSS > 31))),
+    "part of it jumps": (
+        "between parts of the window",
+        lambda r: around(r, more=0.004 * (r.random((30, 40, 40)) < 0.5) * (ACROSS < 12)),
+    ),
+    "a light switched off": (
+        "between times in the stack",
+        lambda r: around(r, times=1 + 1.5 * (OVER_TIME > 14)),
+    ),
+    "warming up": ("a drift that all pixels share", lambda r: around(r, more=2e-4 * OVER_TIME)),
+    "tails": ("heavy tails", lambda r: tilted() + 6e-4 * r.standard_t(3, (30, 40, 40))),
+    "sparks": (
+        "heavy tails",
+        lambda r: around(r, times=1 + 4.0 * (r.random((30, 40, 40)) < 0.03)),
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", NOT_ONE_NOISE)
+def test_a_window_that_is_not_one_gaussian_noise_widens_its_interval_and_says_why(kind):
+    says, make = NOT_ONE_NOISE[kind]
+    stats = stereo.window_stats(make(np.random.default_rng(5)), (0, 0, 40, 40))
+    assert re.search(says, "; ".join(stats.not_gaussian)), stats.not_gaussian
+    assert "not one Gaussian noise, so the interval is wider" in " ".join(str(stats).split())
+    assert stats.pixel_dof < (25_000 if "tails" in says else 40)  # of 46,425, and of 650
+    if "surfaces" in says:  # the depth's interval reaches both
+        apart = 0.008 if kind == "near surfaces" else 0.05
+        assert stats.depth_error_m > 0.4 * apart
+
+
+ONE_NOISE = {
+    "correlated": around,
+    "white": lambda r: tilted() + 6e-4 * r.standard_normal((30, 40, 40)),
+    "8 frames": lambda r: around(r, 8),
+    "strongly tilted": lambda r: around(r) + tilted(slope=0.05) - tilted(),
+    "slow noise": lambda r: tilted() + 6e-4 * correlated(pixel_noise(r, 60, 40, 1.0), 0.6),
+    "a pattern": lambda r: around(r, more=8e-4 * pixel_noise(r, 1, 40, 1.0)),
+    "another texture": lambda r: around(r, times=1 + (ACROSS > 19)),
+    "a weak drift": lambda r: around(r, more=2e-4 * correlated(r.standard_normal((30, 1, 1)), 0.9)),
+    "holes": lambda r: np.where(r.random((30, 40, 40)) < 0.2, np.nan, around(r)),
+}
+
+
+@pytest.mark.parametrize("kind", ONE_NOISE)
+def test_an_ordinary_window_is_one_gaussian_noise(kind):
+    found = [
+        stereo.window_stats(ONE_NOISE[kind](np.random.default_rng(seed)), (0, 0, 40, 40))
+        for seed in range(5)
+    ]
+    assert [stats.not_gaussian for stats in found] == [()] * 5
+
+
+def test_the_interval_of_a_noise_with_heavy_tails_covers():
+    hits, rng = 0, np.random.default_rng(6)
+    for _ in range(SESSIONS):
+        stats = stereo.window_stats(0.5 + 1e-3 * rng.laplace(size=(30, 12, 12)), (0, 0, 12, 12))
+        hits += covers(stats.pixel_std_interval_m, 1e-3 * math.sqrt(2))
+    assert hits / SESSIONS >= 0.92 - 3 * math.sqrt(0.92 * 0.08 / SESSIONS)
+
+
+@pytest.mark.parametrize(
+    ("kind", "step"), [(np.uint16, 1e-3), (np.uint16, 2.5e-4), (np.uint8, 0.01)]
+)
+def test_the_largest_count_of_a_type_is_no_depth(kind, step):
+    rng = np.random.default_rng(7)
+    counts = np.round((0.5 + 3 * step * rng.standard_normal((20, 30, 30))) / step).astype(kind)
+    counts[:, :6] = np.iinfo(kind).max
+    stats = stereo.window_stats(counts, (0, 0, 30, 30), step)
+    assert stats.invalid_fraction == pytest.approx(0.2)
+    assert stats.depth_m == pytest.approx(0.5, abs=step / 5)
+    assert stats.n_mismatches == 0
+
+
 def test_one_frame_gives_no_noise_over_time():
     rng = np.random.default_rng(10)
     image = tilted() + 5e-4 * rng.standard_normal((40, 40))
@@ -430,6 +521,64 @@ def test_a_fit_reads_as_a_sentence():
     assert str(fit) == (
         "sigma_d = 0.079 px (95 %: 0.075 to 0.083), exponent 2.00 (1.93 to 2.07), from 6 distances"
     )
+
+
+@pytest.mark.parametrize("scatter", [0.0, 0.1])
+@pytest.mark.parametrize("repeats", [2, 3, (5, 1, 2, 1, 1, 1)])
+def test_repeats_in_any_order_show_the_scatter_from_run_to_run(repeats, scatter):
+    rng, hits = np.random.default_rng(3), np.zeros(2)
+    z = np.repeat(FAR, repeats)
+    for _ in range(SESSIONS):
+        at = rng.permutation(z)
+        stds = stds_of(rng, at, 300) * np.exp(scatter * rng.standard_normal(len(z)))
+        fit = stereo.fit_noise(at, stds, 300, FX, BASELINE)
+        (low, high), (least, most) = fit.sigma_d_interval_px, fit.exponent_interval
+        hits += [low <= 0.08 <= high, least <= 2 <= most]
+        assert fit.n_distances == len(FAR)
+    off = np.abs(hits / SESSIONS - 0.95)  # a scatter from a few repeats is not quite Student's
+    assert (off <= 0.025 + 3 * math.sqrt(0.95 * 0.05 / SESSIONS)).all()
+
+
+def test_a_fit_says_what_its_repeats_say():
+    z = [0.6, 0.4, 0.6, 1.0, 0.4]
+    stds = np.square(z) * np.array([0.090, 0.065, 0.105, 0.085, 0.080]) / FB
+    fit = stereo.fit_noise(z, stds, 5_000, FX, BASELINE)
+    expected = np.hypot(math.log(0.105 / 0.090), math.log(0.080 / 0.065)) / 2
+    assert fit.scatter == pytest.approx(expected, rel=0.02)
+    assert f"repeats at one distance differ by {fit.scatter:.0%} more" in " ".join(str(fit).split())
+    alone = stereo.fit_noise(
+        [0.6, 0.6, 0.6], stds[0] * np.array([0.9, 1.0, 1.1]), 5_000, FX, BASELINE
+    )
+    low, high = alone.sigma_d_interval_px
+    assert math.log(high / low) / 2 == pytest.approx(4.303 * 0.1 / math.sqrt(3), rel=0.05)
+    assert alone.exponent is None
+
+
+def test_the_order_of_distances_changes_nothing():
+    rng = np.random.default_rng(4)
+    stds, at = stds_of(rng, FAR, 300), rng.permutation(len(FAR))
+    one, two = (stereo.fit_noise(FAR[i], stds[i], 300, FX, BASELINE) for i in (slice(None), at))
+    assert two.theta == pytest.approx(one.theta)
+    assert str(two) == str(one)
+    depths = FAR * 1.004
+    one, two = (stereo.fit_bias(FAR[i], FX, BASELINE, depths[i], 1e-3) for i in (slice(None), at))
+    assert two.theta == pytest.approx(one.theta, abs=1e-6)
+
+
+@pytest.mark.parametrize("exponent", [0.0, 1.0])
+def test_without_a_baseline_the_std_is_fitted_over_distance(exponent):
+    rng, dof, hits = np.random.default_rng(8), 400, 0
+    true = 0.002 * FAR**exponent
+    for _ in range(SESSIONS):
+        stds = true * np.sqrt(rng.chisquare(dof, len(FAR)) / dof)
+        fit = stereo.fit_noise(FAR, stds, dof, 126.0, None)
+        hits += covers(fit.exponent_interval, exponent)
+    assert about_95_percent(hits, SESSIONS)
+    assert fit.std_m(FAR)[0] == pytest.approx(true, rel=0.1)
+    assert str(fit).startswith("std of depth at ")
+    assert "no disparity: this is std over distance" in " ".join(str(fit).split())
+    with pytest.raises(ValueError, match=r"^baseline_m: got None: no stereo camera, or a record"):
+        _ = fit.sigma_d_px
 
 
 def test_distances_without_noise_are_left_out_and_named():

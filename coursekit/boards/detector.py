@@ -33,32 +33,20 @@ MOST_PIXELS, MOST_BYTES = 250_000_000, 2_000_000_000  # more is no photograph
 RANGE = 12, 243  # grey levels of a hundredth and of 99 hundredths of a scaled image
 SESSION = "session.json"  # written beside the images by the course itself
 JPEG, PNG = b"\xff\xd8", b"\x89PNG"
-SIZE_SEGMENTS = [
-    bytes([0xC0 + k]) for k in range(16) if k not in (4, 8, 12)
-]  # JPEG: they hold the size
+SIZE_SEGMENTS = b"\xc0\xc1\xc2\xc3\xc5\xc6\xc7\xc9\xca\xcb\xcd\xce\xcf"  # of a JPEG hold its size
 ALPHA = (b"\4", b"\6")  # PNG: kinds of colour with transparency
 AS_STORED = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-NO_IMAGE = "not an image that OpenCV can read: save it as PNG or JPEG, or take it out of the folder"
-OTHERS = (  # suffixes and first bytes of what OpenCV cannot read, or only a thumbnail of
-    (
-        ".heic .heif",
-        rb"....ftyp(hei|hev|mif1|msf1)",
-        "a HEIC photograph: export it as JPEG or PNG, in its full size",
-    ),
-    (
-        ".cr2 .cr3 .nef .nrw .arw .dng .raf .orf .rw2 .pef .srw .raw",
-        rb"....ftypcrx|FUJIFILM|IIRO|IIRS|IIU|II\*\0....CR",
-        "a camera's raw file: develop it to PNG or TIFF, without correction of the lens",
-    ),
-    (
-        ".mp4 .mov .avi .mkv .webm .m4v .wmv .mpg",
-        rb"....ftyp(isom|iso\d|mp4|M4V|qt)|RIFF....AVI|\x1aE\xdf\xa3",
-        "a film: save single pictures of it as PNG",
-    ),
-    (".pdf", rb"%PDF", "a PDF: save its photographs as PNG"),
-    (".bag .db3 .mcap", rb"#ROSBAG|SQLite format 3", "a recording: ck.open_camera(path) plays it"),
-    (".npy .npz", rb"\x93NUMPY", "arrays: load them and give the arrays"),
-)
+NO_IMAGE = "not an image that OpenCV can read: if it is one, save it as PNG or JPEG"
+RAW = "a camera's raw file: develop it to PNG or TIFF, without correction of the lens"
+FILM = "a film: save single pictures of it as PNG"
+OTHERS = {  # the suffix or the first bytes of what OpenCV cannot read, or only a thumbnail of
+    r"\.hei[cf]|....ftyp(hei|hev|mif1|msf1)": "a HEIC photograph: export it as JPEG or PNG",
+    r"\.(cr[23]|ne[fw]|nrw|arw|dng|ra[fw]|orf|rw2|pef|srw)|....ftypcrx|FUJIFILM|II\*\0....CR": RAW,
+    r"\.(mp4|mov|avi|mkv|webm|m4v|wmv|mpg)|....ftyp(iso|mp4|M4V|qt)|RIFF....AVI|\x1aE\xdf": FILM,
+    r"\.pdf|%PDF": "a PDF: save its photographs as PNG",
+    r"\.(bag|db3|mcap)|#ROSBAG|SQLite format 3": "a recording: ck.open_camera(path) plays it",
+    r"\.np[yz]|\x93NUMPY": "arrays: load them and give the arrays",
+}
 
 
 # --- one image ---
@@ -206,7 +194,7 @@ def _sources(images: Any) -> list[tuple[str, Any]]:
     if isinstance(images, (str, os.PathLike)):
         folder = Path(images)
         want(folder.is_dir(), "images", os.fspath(images), "a folder that exists")
-        files = [p for p in folder.iterdir() if p.is_file() or p.is_symlink()]  # also broken ones
+        files = [p for p in folder.iterdir() if p.is_file() or not p.exists()]  # a broken link
         files = [p for p in files if p.name != SESSION and not p.name.startswith(".")]
         if not files:
             raise ValueError(f"images: {os.fspath(images)!r} holds no files")
@@ -249,14 +237,14 @@ def _read(source: Any) -> AnyArray:
         if source.stat().st_size > MOST_BYTES:
             raise BoardNotFound(f"the file has {source.stat().st_size / 1e9:.1f} GB: no photograph")
         data = source.read_bytes()
-    except OSError as error:
-        raise BoardNotFound(f"cannot be read ({error.strerror or error})") from error
+    except (OSError, MemoryError) as error:
+        raise BoardNotFound(f"cannot be read ({getattr(error, 'strerror', error)})") from error
     if not data:
         raise BoardNotFound("the file is empty")
-    if not data.startswith((JPEG, PNG)):  # whatever the name says
-        for suffixes, start, what in OTHERS:
-            if source.suffix.lower() in suffixes.split() or re.match(start, data, re.DOTALL):
-                raise BoardNotFound(what)
+    for pattern, what in OTHERS.items() if not data.startswith((JPEG, PNG)) else ():
+        texts = (source.suffix.lower(), data[:16].decode("latin1"))
+        if any(re.match(pattern, text, re.DOTALL) for text in texts):
+            raise BoardNotFound(what)
     (width, height), cut_off = _header(data)
     if width * height > MOST_PIXELS:  # before it takes its memory
         raise BoardNotFound(f"the picture is {width}x{height} px: too large, make it smaller")

@@ -42,7 +42,7 @@ CURES = {
     "mirrored": "switch the camera's mirror off, or turn the images back: image[:, ::-1]",
     "with white for black": "give the negatives: 255 - image",
 }
-FEWEST_MARKERS = 4
+FEWEST_MARKERS, MANY_MARKERS = 4, 12  # so many are never seen mirrored by mistake
 FEWEST_ON_PLAN = 6  # markers: any four lie on some plan
 MOST_SQUARES = 20  # each way that are tried
 OFF_PLAN = 0.1  # squares: markers of the right board lie on its plan within this
@@ -203,6 +203,8 @@ def _markers(grey: Grey, board: Board) -> _Markers | None:
     detector = cv2.aruco.ArucoDetector(dictionaries)
     best = None
     for way, seen_so in WAYS.items():
+        if best is not None and len(best.ids) >= MANY_MARKERS:
+            break
         corners, ids, _, which = detector.detectMarkersMultiDict(seen_so(grey))
         if len(corners) == 0:
             continue

@@ -32,30 +32,25 @@ def find_corners(grey: Grey, board: Board) -> Corners | None:
     """The board's corners in a grey image: ids (N,) and pixels (N, 2), or None.
 
     A checkerboard is found whole or not at all. OpenCV's older search finds boards that touch
-    other dark things, its newer one (after Duda and Frese 2018) blurred and noisy ones. The older
-    one may take 20 s of a large cluttered image, so it looks at small images, and where its first
-    glance shows nothing it looks again only when all else has failed and no other board is seen.
+    other dark things, its newer one (after Duda and Frese 2018) blurred and noisy ones. In vain,
+    the older one may take 20 s of a large cluttered image: so it looks at small ones alone, and
+    where a first glance or the newer one says that it will find something.
 
     Corners that lie far from where a plane and a lens would have them are left out; where they are
     many, what was found is no board.
     """
-    tried = set()
-    for longest_px, look in LOOKS[board.kind]:
+    for longest_px, looks in LOOKS[board.kind]:
         small = shrunk(grey, longest_px)
-        if (small.shape, look) in tried:
-            continue
-        tried.add((small.shape, look))
-        found = look(small, board)
-        if found is not None:
-            ids, pixels = found
-            near = on_plane(ids, pixels, small.shape[::-1], board, OFF_PLANE[0])
-            if near.any():
-                scale = np.array(grey.shape[::-1]) / small.shape[::-1]
-                return ids[near], (pixels[near] + 0.5) * scale - 0.5
-        if look is _either:
-            other = checkerboard_seen(shrunk(grey, ANY_SIZE_PX))
-            if other is not None and sorted(other.shape[:2]) != sorted(board.corners):
-                break
+        scale = np.array(grey.shape[::-1]) / small.shape[::-1]
+        for look in looks:
+            found = look(small, board)
+            if found is not None:
+                ids, pixels = found
+                near = on_plane(ids, pixels, small.shape[::-1], board, OFF_PLANE[0])
+                if near.any():
+                    return ids[near], (pixels[near] + 0.5) * scale - 0.5
+        if small is grey:
+            break
     return None
 
 
@@ -88,10 +83,7 @@ def off_homography(points: Floats, plane: Floats, most: float) -> Floats:
     H, _ = cv2.findHomography(points, plane, cv2.RANSAC, most)
     if H is None:
         return np.full(len(points), np.inf)
-    mapped = np.c_[points, np.ones(len(points))] @ H.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        off = np.linalg.norm(mapped[:, :2] / mapped[:, 2:] - plane, axis=1)
-    return np.where(np.isfinite(off), off, np.inf)
+    return np.linalg.norm(cv2.perspectiveTransform(points[None], H)[0] - plane, axis=1)
 
 
 def shrunk(grey: Grey, longest_px: int) -> Grey:
@@ -119,8 +111,8 @@ def _charuco(grey: Grey, board: Board) -> Corners | None:
     return numbers[order], pixels.reshape(-1, 2).astype(np.float64)[order]
 
 
-def _quick(grey: Grey, board: Board) -> Corners | None:
-    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
+def _older(grey: Grey, board: Board, glance: int = cv2.CALIB_CB_FAST_CHECK) -> Corners | None:
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | glance
     return _checkerboard(grey, board, *cv2.findChessboardCorners(grey, board.corners, None, flags))
 
 
@@ -129,18 +121,14 @@ def _newer(grey: Grey, board: Board) -> Corners | None:
 
 
 def _either(grey: Grey, board: Board) -> Corners | None:
-    """As the older search has it, but only where the newer one finds the board: it is quicker."""
+    """As the older search has it without its glance, where the newer one finds the board too."""
     found = _newer(grey, board)
-    return found and (_older(grey, board) or found)
+    return found and (_older(grey, board, 0) or found)
 
 
-def _older(grey: Grey, board: Board) -> Corners | None:
-    return _checkerboard(grey, board, *cv2.findChessboardCorners(grey, board.corners))
-
-
-LOOKS = {  # the longest side in px to which an image is made smaller first, and the search
-    "checkerboard": ((1000, _quick), (1000, _either), (2000, _newer), (1000, _older)),
-    "charuco": ((2000, _charuco), (4000, _charuco)),
+LOOKS: dict[str, Any] = {  # the longest side in px to which an image is made smaller, the searches
+    "checkerboard": ((1000, (_older, _either)), (2000, (_newer,))),
+    "charuco": ((2000, (_charuco,)), (4000, (_charuco,))),
 }
 
 

@@ -69,7 +69,8 @@ class RealSense(Camera):
         if (serial is None) == (path is None):
             raise ValueError("serial, path: got both or neither, want exactly one")
         self._rs = load_librealsense()
-        self._running: _Running | None = None
+        self._running = _Running()
+        weakref.finalize(self, self._running.leave)
         self._path, self._infrared = path, infrared
         self._what = f"the RealSense {serial}"
         self.source, self.serial, self.can_place = "live", serial or "", path is None
@@ -96,23 +97,25 @@ class RealSense(Camera):
 
     def _start(self) -> None:
         """Start streaming; of a recording from its beginning."""
-        try:
-            pipeline = self._rs.pipeline()
-            config = self._playback_config(pipeline) if self._path else self._live_config()
-            self._profile = pipeline.start(config)
-            playback = self._profile.get_device().as_playback() if self._path else None
-        except CameraError:
-            raise
-        except RuntimeError as error:
-            if self._path is None:
-                raise CameraError(start_problem(self._what, error)) from error
-            reason = str(error).rsplit("Reason: ", maxsplit=1)[-1]
-            raise CameraError(
-                f"{self._what} cannot be read: it is damaged, incomplete or not from a RealSense; "
-                f"copy it again or record it anew (librealsense says: {reason})"
-            ) from error
-        self._running = running = _Running(pipeline, playback)
-        self._stop = weakref.finalize(self, running.stop)
+        with self._running.turn:
+            if self._running.left:
+                raise CameraError(f"{self._what} was closed while it was giving frames")
+            try:
+                pipeline = self._rs.pipeline()
+                config = self._playback_config(pipeline) if self._path else self._live_config()
+                self._profile = pipeline.start(config)
+                playback = self._profile.get_device().as_playback() if self._path else None
+            except CameraError:
+                raise
+            except RuntimeError as error:
+                if self._path is None:
+                    raise CameraError(start_problem(self._what, error)) from error
+                reason = str(error).rsplit("Reason: ", maxsplit=1)[-1]
+                raise CameraError(
+                    f"{self._what} cannot be read: it is damaged, incomplete or not from a "
+                    f"RealSense; copy it again or record it anew (librealsense says: {reason})"
+                ) from error
+            self._running.run(pipeline, playback)
 
     def _live_config(self) -> Any:
         rs, config = self._rs, self._rs.config()
@@ -157,7 +160,7 @@ class RealSense(Camera):
         return {p.stream_index() for p in grey if p.stream_type() == rs.stream.infrared} >= {1, 2}
 
     def _check_open(self) -> None:
-        if self._running is None:
+        if not self._running:
             raise CameraError(f"{self._what} is closed: open it again with open_camera()")
 
     def _depth_sensor(self) -> Any:
@@ -165,9 +168,7 @@ class RealSense(Camera):
 
     def close(self) -> None:
         """Stop the camera, or close the file; a second call does nothing."""
-        running, self._running = self._running, None
-        if running is not None:
-            self._stop()
+        self._running.stop()
 
     # --- what the device says about itself -----------------------------------------------------
 
@@ -218,8 +219,7 @@ class RealSense(Camera):
 
     def _groups(self) -> Iterator[_Group]:
         """The images as librealsense groups them, until a recording ends."""
-        playback = None if self._path is None else self._profile.get_device().as_playback()
-        while (frameset := self._next_frameset(playback)) is not None:
+        while (frameset := self._next_frameset()) is not None:
             depth, color = frameset.get_depth_frame(), frameset.get_color_frame()
             eyes = (1, 2) if self._infrared else ()
             if depth:
@@ -244,12 +244,12 @@ class RealSense(Camera):
         if last is None:
             raise CameraError(f"{self._what} holds no frames: record it anew")
 
-    def _next_frameset(self, playback: Any) -> Any:
+    def _next_frameset(self) -> Any:
         """The next group of images; None once a recording has ended."""
         ended = False
         for _ in range(MOST_POLLS):
             try:
-                arrived, frameset = self._running.poll() if self._running else (None, None)
+                arrived, frameset, status = self._running.poll()
             except RuntimeError as error:
                 raise CameraError(
                     f"{self._what} stopped giving frames ({error}): {UNPLUGGED}"
@@ -260,7 +260,7 @@ class RealSense(Camera):
                 return frameset
             if ended:
                 return None
-            ended = playback and playback.current_status() == self._rs.playback_status.stopped
+            ended = status is not None and status == self._rs.playback_status.stopped
         silence_s = MOST_POLLS * POLL_MS / 1000
         raise CameraError(f"no frame came from {self._what} for {silence_s:g} s: {UNPLUGGED}")
 
@@ -395,29 +395,49 @@ class RealSense(Camera):
 
 
 class _Running:
-    """A pipeline that runs, and for a recording the thread that wakes its playback and, at the end,
-    brings it to rest.
+    """A pipeline while it runs, and for a recording the thread that wakes its playback and, at the
+    end, brings it to rest.
 
-    `stop` must have been called before the interpreter ends: a thread that is still inside
-    librealsense then, in resume() or waiting for frames, ends the process with an abort.
-    playback: of a pipeline that was started with its playback paused; None of a live camera.
+    A thread that is inside librealsense when the interpreter ends, in resume() or waiting for
+    frames, ends the process with an abort. So a camera calls it in turns, and `leave`, at the
+    interpreter's end, has the last one. True while there is a pipeline.
     """
 
-    def __init__(self, pipeline: Any, playback: Any) -> None:
-        self._pipeline = pipeline
-        self._using, self._ending = threading.RLock(), threading.Event()
+    def __init__(self) -> None:
+        self.turn, self.left = threading.RLock(), False
+        self._pipeline: Any = None
+        self._playback: Any = None
         self._attendant: threading.Thread | None = None
+        self._ending = threading.Event()
+
+    def __bool__(self) -> bool:
+        return self._pipeline is not None
+
+    def run(self, pipeline: Any, playback: Any) -> None:
+        """Take a started pipeline; playback: of one that was started paused, else None."""
+        self._pipeline, self._playback = pipeline, playback
+        self._attendant, self._ending = None, threading.Event()
         if playback is not None:
             attend = functools.partial(_attend, playback, self._ending)
             self._attendant = threading.Thread(target=attend, daemon=True)
             self._attendant.start()
 
-    def poll(self) -> tuple[bool | None, Any]:
-        """Whether images came within POLL_MS, and these; None and None once it is stopped."""
-        with self._using:
-            if self._ending.is_set():
-                return None, None
-            return self._pipeline.try_wait_for_frames(POLL_MS)
+    def poll(self) -> tuple[bool | None, Any, Any]:
+        """Whether images came within POLL_MS, these, and a playback's status when none came.
+
+        All None once it is stopped.
+        """
+        with self.turn:
+            if self._pipeline is None or self.left:
+                return None, None, None
+            arrived, images = self._pipeline.try_wait_for_frames(POLL_MS)
+            ask = self._playback is not None and not arrived
+            return arrived, images, self._playback.current_status() if ask else None
+
+    def leave(self) -> None:
+        """Stop for good: when Python ends, or nobody holds the camera any more."""
+        self.left = True
+        self.stop()
 
     def stop(self) -> None:
         """Bring everything to rest: a thread that polls, the playback, the pipeline.
@@ -427,16 +447,20 @@ class _Running:
         the process (its issue 9446). So that thread has to rest first, which pause() waits for; and
         it comes to rest only while somebody takes its images.
         """
-        self._ending.set()
-        attendant = self._attendant
-        if attendant is threading.current_thread():  # where Python collects a forgotten camera
-            attendant = None
-        with self._using, contextlib.suppress(RuntimeError):  # an unplugged one cannot be stopped
-            try:
-                while attendant and attendant.is_alive():  # at most librealsense's own 10 s
-                    self._pipeline.try_wait_for_frames(1)
-            finally:
-                self._pipeline.stop()
+        with self.turn:
+            pipeline, self._pipeline, self._playback = self._pipeline, None, None
+            if pipeline is None:
+                return
+            self._ending.set()
+            attendant = self._attendant
+            if attendant is threading.current_thread():  # where Python collects a forgotten camera
+                attendant = None
+            with contextlib.suppress(RuntimeError):  # an unplugged camera cannot be stopped
+                try:
+                    while attendant and attendant.is_alive():  # at most librealsense's own 10 s
+                        pipeline.try_wait_for_frames(1)
+                finally:
+                    pipeline.stop()
 
 
 def _attend(playback: Any, ending: threading.Event) -> None:

@@ -169,7 +169,7 @@ def _header(lines: list[str], name: str) -> tuple[int, str]:
 
 def _known(cell: str) -> tuple[str, str, str]:
     """Our name of a column, its plain name, and the unit in it."""
-    plain = re.sub(r"[.\-/]", "_", cell.strip('" ').lower())
+    plain = re.sub(r"[.\-/]", "_", cell[:60].strip('" ').lower())
     found = HEADING.fullmatch(plain)
     if found and found[1] in COLUMN_NAMES:
         return (

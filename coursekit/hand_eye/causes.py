@@ -20,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 
@@ -42,29 +43,35 @@ ROBUST_STEPS, SMALLEST_STEP = 15, 1e-7  # m and rad
 CAUCHY_WIDTH = 3.0  # times the usual residual: from there on a pair counts less and less
 # Below this nobody's residuals are, whatever the arm: 0.005 deg and 0.02 mm.
 LEAST_RAD, LEAST_M = np.radians(0.005), 2e-5
+MEDIAN_1D = 1.4826  # of the size of a standard normal number, one over
 MEDIAN_3D = 1.5382  # the median length of three independent standard normal numbers
 SCALE, LATE, ARM_ERROR = "wrong_square_size", "late_time_stamps", "arm_error"
-SLIP, OUTLIER = "slipping_board", "outlier_pose"
+SLIP, OUTLIER, DRIFT = "slipping_board", "outlier_pose", "slow_drift"
 SMOOTH = (SCALE, LATE, ARM_ERROR)  # one number that acts on all pairs
 # At most 2 % of healthy sessions may get a finding, and five kinds of test at this level make
 # 0.05 %; the rest is for arms whose errors are not quite normal.
 _CHANCE_LEVEL = 1e-4
 # What careful people have, and no finding: squares measured with a ruler, a driver's own delay, a
 # board that settles, a pose in which the arm still swings, a zero that a jig sets.
-NORMAL_SIZE = {SCALE: 0.01, LATE: 5e-3, SLIP: 2e-3, OUTLIER: 5e-3, ARM_ERROR: np.radians(0.6)}
-NORMAL_TURN_RAD = {SLIP: np.radians(0.5), OUTLIER: np.radians(1.0)}
+NORMAL_SIZE = {
+    SCALE: 0.01, LATE: 5e-3, SLIP: 2e-3, OUTLIER: 5e-3, DRIFT: 2e-3, ARM_ERROR: np.radians(0.6)
+}  # fmt: skip
+NORMAL_TURN_RAD = {SLIP: np.radians(0.5), OUTLIER: np.radians(1.0), DRIFT: np.radians(0.25)}
 # Times as much, where no image says how well it knows its board pose, or no joint angles what the
 # arm may be wrong by: some pose of a healthy one is off by four times the typical error.
 ROUGH_DATA = 3.0
 # Times the typical residual, where no joint angles say which errors poses share: those of the arm
 # then look like a slip of their own size.
-OVER_USUAL = {SLIP: 2.5, OUTLIER: 4.0}
+OVER_USUAL = {SLIP: 2.5, OUTLIER: 4.0, DRIFT: 1.0}
 SCALE_WITHOUT_JOINTS = 0.02  # the arm's own shared errors can imitate that much of a scale
 CAMERA_RAD, CAMERA_M = np.radians(0.02), 1e-4  # what imperfect intrinsics do to a board's pose
-# Of the arm's stated errors; one that is worse than the last is itself a mistake. A larger factor
-# also drowns two bad poses, and lets a nonsensical scale explain what is left.
-ARM_FACTORS = (1.0, 1.5, 2.0, 3.0, 5.0)
-FACTORS_WITHOUT_JOINTS = (0.1, 0.2, 0.35, 0.6, 1.0, 1.5)  # of the residuals as they are
+# Of the arm's stated errors, which poses share; one that is worse than the last is itself a
+# mistake. And of the residuals as they are, for what is drawn anew at each pose.
+ARM_FACTORS = (1.0, 2.0, 4.0)
+OWN_FACTORS = (0.1, 0.2, 0.35, 0.6, 1.0, 1.5)
+SHARES_ALIKE, NEAR = (0.0, 0.5, 0.9), 2.0  # of the own errors' variance; of two medians
+OWN_SIZES = 4  # poses' worth of numbers that X, Y and the sizes along the axes take
+AXIS_POSES = 5.0  # that the mean of three axes counts for, in the size along each
 SHORTEST_SEGMENT = 3  # pairs on either side of a slip
 FEWEST_PAIRS = 6  # below which one odd pose cannot be told from 24 odd numbers
 MOST_OUTLIERS = 4  # at most one pair in as many
@@ -182,11 +189,14 @@ class Fit:
         """Its typical residual in words: "0.4 mm and 0.05 deg"."""
         return f"{1e3 * self.shift_m:.1f} mm and {np.degrees(self.turn_rad):.2f} deg"
 
+    @property
+    def size(self) -> float:
+        """Of the residuals, the geometric mean of rotation and position, rad and m."""
+        return float(np.sqrt((self.turn_rad + LEAST_RAD) * (self.shift_m + LEAST_M)))
+
     def better_than(self, other: Fit) -> float:
         """How many times smaller the residuals are, the geometric mean of rotation and position."""
-        turn = (other.turn_rad + LEAST_RAD) / (self.turn_rad + LEAST_RAD)
-        shift = (other.shift_m + LEAST_M) / (self.shift_m + LEAST_M)
-        return float(np.sqrt(turn * shift))
+        return other.size / self.size
 
 
 def robust_fit(pairs: PosePairs, start: tuple[Floats, Floats] | None = None) -> Fit:
@@ -279,7 +289,11 @@ class MendedPairs:
         residuals = self.fit.twists.ravel()
         along = [h.columns for h in self._suspects if (h.cause, h.at) in self.smooth]
         columns = np.hstack([self.fit.columns.reshape(len(residuals), -1), *along])
-        return likelihood_ratios(residuals, columns, hypotheses, self.covariances())
+        tests = likelihood_ratios(residuals, columns, hypotheses, self.covariances())
+        # Sizes that come from the residuals themselves are too small by chance, most of few poses.
+        n = len(self.fit.pairs)
+        sure = max(n - OWN_SIZES, 1) / n
+        return [replace(t, log_p=sure * t.log_p, strength=sure * t.strength) for t in tests]
 
     def matters(self, test: Tested) -> bool:
         """Whether the effect is larger than what careful people have."""
@@ -294,7 +308,7 @@ class MendedPairs:
         usual = OVER_USUAL[test.cause] if self.arms.q is None else 0.0
         least_turn = max(rough * NORMAL_TURN_RAD[test.cause], usual * self.fit.turn_rad)
         least_shift = max(rough * normal, usual * self.fit.shift_m)
-        turn, shift = turn_and_shift(test)
+        turn, shift = self.over_session(test) if test.cause == DRIFT else turn_and_shift(test)
         return shift > least_shift or turn > least_turn
 
     def accept(self, test: Tested) -> MendedPairs | None:
@@ -303,6 +317,11 @@ class MendedPairs:
         if test.cause == OUTLIER:
             left = pairs.keep(np.arange(len(pairs)) != at)
             return replace(self, fit=left.fit, odd=self.odd + 1)
+        if test.cause == DRIFT:
+            effect = (test.hypothesis.columns @ test.coefficients).reshape(-1, 6)
+            straight = replace(pairs, T_camera_board=turned(pairs.T_camera_board, -effect))
+            after = replace(self, smooth=(*self.smooth, (DRIFT, at)), fit=straight.fit)
+            return after if after.fit.better_than(self.fit) > 1.0 else None
         if test.cause == SLIP:
             segment, Y = pairs.segment.copy(), self.fit.Y
             moved = turned(Y[segment[at]], test.coefficients)
@@ -343,6 +362,10 @@ class MendedPairs:
         rows = np.arange(6 * n).reshape(n, 6)
         found += [Hypothesis(OUTLIER, np.eye(6), i, rows[i], tried=n) for i in range(n)]
         by_Y = fit.columns[:, :, 6:].reshape(n, 6, -1, 6).sum(axis=2)
+        time = (pairs.view - pairs.view.mean()) / np.ptp(pairs.view)  # 1 over the whole session
+        for place, columns in enumerate((fit.columns[:, :, :6], by_Y)):
+            steady = (time[:, None, None] * columns).reshape(-1, 6)
+            found.append(Hypothesis(DRIFT, steady, place, tried=2))
         later = {}
         for at in range(1, n):
             mine = np.flatnonzero(pairs.segment == pairs.segment[at])
@@ -354,21 +377,55 @@ class MendedPairs:
             found.append(Hypothesis(SLIP, columns, at, rows[after].ravel(), tried=len(later)))
         return found
 
+    def over_session(self, test: Tested) -> tuple[float, float]:
+        """How far a drift turns, rad, and moves, m, the board as the camera sees it."""
+        effect = (test.hypothesis.columns @ test.coefficients).reshape(-1, 2, 3)
+        turn, shift = np.sqrt(12.0 * (effect**2).sum(axis=2).mean(axis=0))
+        return float(turn), float(shift)
+
     def covariances(self) -> Iterator[Floats]:
-        """Of all residuals, (6 n, 6 n), for each factor of the arm's errors."""
+        """Of all residuals, (6 n, 6 n): for each factor of the arm's errors, and of each pose's."""
         pairs, n = self.fit.pairs, len(self.fit.pairs)
         image = _diagonal(pairs.image + np.diag(np.repeat([CAMERA_RAD**2, CAMERA_M**2], 3)))
+        size, same_axis = self._usual.ravel(), np.eye(6)
+        owns = [np.outer(size, size) * np.kron(alike, same_axis) for alike in self._alike()]
+        arms = [np.zeros((6 * n, 6 * n))]
         if self.arms.q is not None:
             errors = fk_covariance(self._joints(), self.arms.errors, self.arms.arm)
             shared = (self._by_arm @ errors.shared * errors.sigma).reshape(6 * n, -1)
             each = self._by_arm @ errors.each @ np.swapaxes(self._by_arm, 1, 2)
             arm = shared @ shared.T + _diagonal(each)
-        else:
-            turn = max(self.fit.turn_rad / MEDIAN_3D, LEAST_RAD)
-            shift = max(self.fit.shift_m / MEDIAN_3D, LEAST_M)
-            arm = np.diag(np.tile(np.repeat([turn**2, shift**2], 3), n))
-        for factor in FACTORS_WITHOUT_JOINTS if self.arms.q is None else ARM_FACTORS:
-            yield image + factor**2 * arm
+            arms = [factor**2 * arm for factor in ARM_FACTORS]
+        for arm, own, factor in product(arms, owns, OWN_FACTORS):
+            yield image + arm + factor**2 * own
+
+    def _alike(self) -> Iterator[Floats]:
+        """How alike the own errors of poses may be, correlations (n, n): those near each other are.
+
+        A lens, a board's shape and an arm err by the pose, and neighbours in a table are often
+        neighbours in space: then errors look like something that goes on in time.
+        """
+        seen = self.fit.pairs.T_camera_board
+        apart = pose_difference(seen[:, None], seen[None]).reshape(len(seen), len(seen), 2, 3)
+        apart = np.linalg.norm(apart, axis=-1)
+        near = np.exp(-(apart / np.median(apart, axis=(0, 1))).sum(axis=-1) / NEAR)
+        for share in SHARES_ALIKE:
+            yield (1 - share) * np.eye(len(seen)) + share * near
+
+    @property
+    def _usual(self) -> Floats:
+        """The typical residual of each pose along each axis (n, 6), rad and m, camera's axes.
+
+        What images know less of is off by more than usual: bow and lens act as the noise does.
+        """
+        n, twists = len(self.fit.pairs), self.fit.twists
+        squares = (MEDIAN_1D * np.median(np.abs(twists), axis=0)) ** 2
+        common = np.repeat(squares.reshape(2, 3).mean(axis=1), 3)
+        free = n / max(n - 2.0, 1.0)  # X and Y took two poses' worth
+        usual = np.sqrt(free * (n * squares + AXIS_POSES * common) / (n + AXIS_POSES))
+        usual = np.maximum(usual, np.repeat([LEAST_RAD, LEAST_M], 3))
+        image = np.einsum("nii->ni", self.fit.pairs.image) + LEAST_M**2
+        return usual * np.sqrt((1.0 + image / np.median(image, axis=0)) / 2.0)
 
     @cached_property
     def _by_arm(self) -> Floats:

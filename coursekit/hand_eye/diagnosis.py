@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from coursekit.arm import Arm, ArmErrors, pose_difference, widowx
+from coursekit.arm import Arm, ArmErrors, pose_difference
 from coursekit.arrays import Floats
 from coursekit.causes import Accepted, CauseSearch, DiagnosisTexts
 from coursekit.checks import want
@@ -41,28 +41,31 @@ def diagnose(
 ) -> Findings:
     """What is wrong with a session, the gravest first; empty when nothing is.
 
-    arm: whose joint angles the session has, the WidowX unless given. errors: what is normal for
-    it, the sizes of `ArmErrors` unless given.
-    A healthy session gets a finding in at most 2 of 100 cases. Raises ValueError for fewer pairs
-    than any solver takes.
+    arm: whose joint angles the session has, `session.arm` unless given. errors: what is normal
+    for it, the sizes of `ArmErrors` unless given.
+    A healthy session gets a wrong cause in at most 2 of 100 cases; equal pairs count once. Where no
+    cause explains what `HandEyeResult.judgement` calls large, the finding is that. Raises
+    ValueError for fewer pairs than any solver takes.
 
     >>> still = np.tile(np.eye(4), (8, 1, 1))
     >>> diagnose(HandEyeSession("eye_in_hand", still, still)).names
     ('millimetres', 'pure_translation')
     """
     want(len(session) >= FEWEST_POSES, "session", len(session), f"at least {FEWEST_POSES} pairs")
-    case = _Case(session, arm or widowx(), errors, PosePairs.of(session), session.q)
+    given, session = session, session.once if len(session.once) >= FEWEST_POSES else session
+    case = _Case(session, arm or session.arm, errors, PosePairs.of(session), session.q)
     case.units()
     case.joints_in_degrees()
     if case.design():
         return case.findings("design")
     case.readings()
     case.ambiguous_boards()
+    repeats = ["repeats"] * (session is not given)
     if len(case.pairs) < causes.FEWEST_PAIRS:
-        return case.findings("few")
+        return case.findings("few", *repeats)
     if case.hopeless:
-        return case.findings("residuals")
-    return case.residuals()
+        return case.findings("residuals", *repeats)
+    return case.findings(*case.residuals(), *repeats)
 
 
 @dataclass(eq=False)
@@ -83,7 +86,8 @@ class _Case:
 
     def findings(self, *unseen: str) -> Findings:
         """What was found, with what could not be tested."""
-        reasons = [_TEXTS.not_tested[key].format(pairs=causes.FEWEST_PAIRS) for key in unseen]
+        figures = {"pairs": causes.FEWEST_PAIRS, "repeated": self.session.repeated}
+        reasons = [_TEXTS.not_tested[key].format(**figures) for key in unseen]
         return Findings(self.found, _TEXTS.looked_for, reasons)
 
     # --- units ---
@@ -147,14 +151,16 @@ class _Case:
     def readings(self) -> None:
         """Another pairing, convention or unit of angles with which arm and camera agree."""
         given = self.pairs.fit
-        other = misread.other_pairing(self.pairs)
-        better = misread.better_readings(given, other, misread.PAIRING_SHIFT_LEFT)
+        pairing = misread.other_pairing(self.pairs, self.session.names)
+        if pairing is not None:
+            self.pairs = pairing.mended
+            self.add(pairing.name, reading=pairing.says, **_change(given, self.pairs.fit))
+            return
+        either = misread.inverted(self.pairs)
+        better = misread.better_reading(given, either, misread.PAIRING_SHIFT_LEFT)
         if better:
-            self.pairs = better[0].fit.pairs
-        if better and better[0].name.startswith("off_by_one"):
-            self.add("off_by_one", reading=better[0].says, **_change(given, better[0].fit))
-        elif better:
-            options = misread.candidates(better[0].fit, self.session, misread.INVERTED)
+            self.pairs = better.fit.pairs
+            options = misread.candidates(better.fit, self.session, misread.INVERTED)
             if self._off_joints(self.session.T_base_gripper, self.q) < AS_COMPUTED_M:
                 against = (*options[0].against, "the arm poses are those of the joint angles")
                 options[0] = replace(options[0], against=against)
@@ -162,7 +168,7 @@ class _Case:
                 arm, mount = given.pairs.T_base_gripper, misread.other_mount(given.pairs.mount)
                 self.pairs = replace(self.pairs, T_base_gripper=arm, mount=mount)
             words = {"candidates": _listed(options), "choice": _choice(options)}
-            self.add("inconsistent_convention", **words, **_change(given, better[0].fit))
+            self.add("inconsistent_convention", **words, **_change(given, better.fit))
         elif given.turn_rad > POOR_RAD:
             self._rotations(given)
         elif given.shift_m < POOR_M:
@@ -170,6 +176,15 @@ class _Case:
             others = [other for other in others if not other.against]
             if asked.against and others:
                 self.add("two_that_cancel", asked=asked.says(), candidates=_listed(others))
+            elif self.session.detections is None:
+                self._camera_axes()
+
+    def _camera_axes(self) -> None:
+        """Board poses in a camera frame whose z does not look forward; X absorbs that."""
+        axis, share, ahead = misread.looking_along(self.pairs.T_camera_board)
+        if axis != "z" and ahead < 1 - misread.SHARE_IN_VIEW < misread.SHARE_IN_VIEW < share:
+            what, cure = misread.CAMERA_AXES.get(axis, misread.OTHER_AXES)
+            self.add("camera_axes", axis=axis, share=100 * share, what=what, cure=cure)
 
     def _rotations(self, given: Fit) -> None:
         """Rotations of one side that contradict the other although the positions agree."""
@@ -182,8 +197,8 @@ class _Case:
                 continue
             fit = pairs.fit
             other = misread.other_rotations(pairs)
-            better = misread.better_readings(fit, other, misread.ROTATION_SHIFT_LEFT)
-            reading = better[0] if better else misread.undo_degrees(fit, places.expected)
+            reading = misread.better_reading(fit, other, misread.ROTATION_SHIFT_LEFT)
+            reading = reading or misread.undo_notation(fit, places.expected)
             if reading is None:
                 continue
             evidence = f"the {side}'s positions agree with the other side (within "
@@ -199,7 +214,9 @@ class _Case:
             return
         if given.turn_rad > HOPELESS_RAD:
             self.hopeless = True
-            self.add("nothing_fits", left=given.says())
+            computed = self._off_joints(self.session.T_base_gripper, self.q) < AS_COMPUTED_M
+            key = "computed_for_another_arm" if computed else "nothing_fits"
+            self.add(key, left=given.says(), arm=self.arm.name)
 
     def _off_joints(self, T_base_gripper: Floats, q: Floats | None) -> float:
         """How far arm poses (n, 4, 4) are from those of joint angles q (n, 6), in any entry."""
@@ -226,15 +243,30 @@ class _Case:
             chosen[row] = both[match.argmax()]
         self.pairs = replace(self.pairs, T_camera_board=chosen)
 
-    def residuals(self) -> Findings:
-        """Causes that the residuals speak for."""
+    def residuals(self) -> list[str]:
+        """Causes that the residuals speak for; returns what could not be tested."""
         q, pairs = self.q, self.pairs
         if q is not None and self._off_joints(pairs.T_base_gripper, q[pairs.row]) > BELONGS_M:
-            q = None
+            q = self._joints_that_fit(q)
         velocity = self._velocity(q)
         search = causes.search_pairs(self.pairs, Arms(self.arm, self.errors, q, velocity))
         self.found += _from_residuals(search, self.session)
-        return self.findings(*["motion"] * (velocity is None), *["joints"] * (q is None))
+        judged = self.session.solve().judgement if not self.found else None
+        if judged is not None and (judged.large or judged.broken):
+            self.add("unexplained", why=" ".join([judged.large, *judged.broken]).strip())
+        return [*["motion"] * (velocity is None), *["joints"] * (q is None)]
+
+    def _joints_that_fit(self, q: Floats) -> Floats | None:
+        """None for joint angles that give other poses than the arm's, a finding if they do not fit.
+
+        Poses of another tool on the same arm fit the images as well as the arm's own.
+        """
+        given = self.pairs.fit
+        computed = replace(self.pairs, T_base_gripper=self.arm.forward(q[self.pairs.row])).fit
+        if given.better_than(computed) > misread.CLEARLY_BETTER:
+            words = {"arm": self.arm.name, "given": given.says(), "computed": computed.says()}
+            self.add("joints_of_another_arm", **words)
+        return None
 
     def _velocity(self, q: Floats | None) -> Floats | None:
         """The gripper's twist rates (n, 6) of the session's views, None where unknown."""
@@ -329,6 +361,10 @@ def _figures(
     if test.cause == causes.ARM_ERROR:
         size = np.degrees(model.offsets[test.at])
         return {"joint": test.at, "size": size, "half": np.degrees(half)}
+    if test.cause == causes.DRIFT:
+        turn, shift = step.before.over_session(test)
+        what = ("the camera on its mount", "the board on its stand")[test.at]
+        return {"what": what, "turn": np.degrees(turn), "shift": 1e3 * shift}
     turn, shift = causes.turn_and_shift(test)
     name = session.names[step.before.fit.pairs.view[test.at]]  # the odd one, or the first after
     return {"name": name, "turn": np.degrees(turn), "shift": 1e3 * shift}

@@ -10,16 +10,18 @@ apart.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coursekit.arrays import Floats
-from coursekit.geometry import invert_transform
-from coursekit.hand_eye.causes import LEAST_M, Fit, PosePairs
-from coursekit.hand_eye.poses import Mount, nearest_rotation
+from coursekit.arrays import Floats, NDArray
+from coursekit.causes import log_chi2_tail
+from coursekit.geometry import invert_transform, pose_difference
+from coursekit.hand_eye.causes import LEAST_M, LEAST_RAD, Fit, PosePairs
+from coursekit.hand_eye.poses import Mount, camera_board, nearest_rotation
 from coursekit.hand_eye.session import HandEyeSession
 
 PER_RADIAN = 180.0 / np.pi
@@ -28,13 +30,37 @@ PER_RADIAN = 180.0 / np.pi
 PAIRING_SHIFT_LEFT, ROTATION_SHIFT_LEFT = 0.5, 1.5
 CLEARLY_BETTER = 4.0  # times smaller residuals: by chance a wrong reading is better by 1.5 at most
 PLACES_AGREE = 0.15  # of the positions' spread; in degrees taken as radians positions stay true
-CHANCE_TURN_RAD = np.radians(80.0)  # median of a decoding; random rotations are 130 deg apart
-MATCH_RAD = np.radians(85.0)  # noise in degrees taken as radians grows 57-fold
-CHECKED_POSES = 6  # that a candidate must pass before all of them are asked
-SOURCE_POSES = 8  # that candidates are taken from
-CHECKED_CANDIDATES = 50  # the best of them, with all poses
-ROTATION_VECTORS = "rotation vectors"
-EULER = ("xyz", "XYZ")  # about fixed axes (roll, pitch, yaw), and about the body's own
+# Of a whole turn of the numbers as read that a decoding may miss in a typical pose; random ones do
+# by 130 deg. With few whole turns in reach much less is chance too.
+CHANCE_RAD, CLOSE_RAD = np.radians(80.0), np.radians(15.0)
+CHANCE_LEVEL, HYPOTHESES = 1e-4, 150
+SOURCE_POSES = 3  # that candidates are taken from
+FEW_CANDIDATES = 2000  # that all poses are asked about
+ROUNDED = 1.001  # times pi: how far numbers reach
+WITHIN = 6.0  # times the typical residual: where an image fits an arm pose
+FARTHER = 3.0  # times as far as the best one, where it does not fit its own
+TEXT_ORDER = "sorted as text, img_10 before img_2"
+MOST_FIT = 0.8  # of the images, for the name of an order
+FEWEST_OF_HALF = 5  # pairs, to find X with
+ROTATION_VECTOR = "rotation vector"
+FIXED, MOVING = (
+    ("xyz", "zyx", "xzy", "yxz", "yzx", "zxy"),
+    ("ZYX", "XYZ", "YZX", "ZXY", "XZY", "YXZ"),
+)
+TWICE = ("ZYZ", "ZXZ", "zyz", "zxz")  # about the first axis once more
+# Camera frames that do not look along z: what they are, and what brings them to the optical one.
+_TO_OPTICAL = "T_camera_board = F @ T, F[:3, :3] = "
+CAMERA_AXES = {
+    "x": (
+        "x forward, y left, z up (ROS' camera_link, and every body frame of REP 103)",
+        _TO_OPTICAL + "[[0, -1, 0], [0, 0, -1], [1, 0, 0]]; in tf ask for camera_optical_frame",
+    ),
+    "-z": (
+        "x right, y up, z backward (OpenGL, Blender)",
+        _TO_OPTICAL + "np.diag([1, -1, -1])",
+    ),
+}
+OTHER_AXES = ("none that is common", _TO_OPTICAL + "the camera's own axes, seen from the optical")
 CAMERA_ON_GRIPPER_M = 0.4  # no wrist carries a camera farther away
 BOARD_IN_GRIPPER_M = 0.5  # nor a board
 ROOM_M = 4.0  # from the base to a camera or a board that it works with
@@ -65,58 +91,177 @@ class Reading:
     fit: Fit
 
 
-def better_readings(
+def better_reading(
     given: Fit, readings: Iterator[tuple[str, str, PosePairs]], most_shift: float
-) -> list[Reading]:
-    """The readings that make residuals clearly smaller, the best first.
+) -> Reading | None:
+    """The reading that makes residuals smallest, if clearly smaller, both turns and displacements.
 
     most_shift: how large the displacements left over may be, in units of those as given; a wrong
     reading may mend the rotations alone.
     """
     fits = [Reading(name, says, pairs.fit) for name, says, pairs in readings]
     left = most_shift * given.shift_m + LEAST_M
-    clear = [r for r in fits if r.fit.better_than(given) > CLEARLY_BETTER and r.fit.shift_m < left]
-    return sorted(clear, key=lambda reading: -reading.fit.better_than(given))
+    return best(
+        r
+        for r in fits
+        if r.fit.better_than(given) > CLEARLY_BETTER
+        and r.fit.shift_m < left
+        and r.fit.turn_rad < given.turn_rad / 2
+    )
 
 
-def other_pairing(pairs: PosePairs) -> Iterator[tuple[str, str, PosePairs]]:
-    """Images with the arm pose of another image, and either one inverted."""
-    for by in (-1, 1, -2, 2):
-        if len(pairs) - abs(by) >= 4:
-            towards = "before" if by < 0 else "after"
-            where = f"the arm pose {abs(by)} place{'s' * (abs(by) > 1)} {towards} its own"
-            yield f"off_by_one {by:+d}", where, pairs.shifted(by)
+def best(readings: Iterable[Reading]) -> Reading | None:
+    """The one with the smallest residuals, the first of equals; None of none."""
+    return min(readings, key=lambda reading: float(f"{reading.fit.size:.4g}"), default=None)
+
+
+def inverted(pairs: PosePairs) -> Iterator[tuple[str, str, PosePairs]]:
+    """Either side inverted."""
     T = invert_transform(pairs.T_base_gripper)
     yield "inverted", "one side inverted", replace(pairs, T_base_gripper=T)
 
 
 def other_rotations(pairs: PosePairs) -> Iterator[tuple[str, str, PosePairs]]:
-    """The arm's rotations as another convention would have them; the positions stay."""
+    """The arm's rotations with a slip of their nine or four numbers; the positions stay."""
     R = Rotation.from_matrix(pairs.T_base_gripper[:, :3, :3])
     quaternions = R.as_quat()
-    small = R.as_rotvec() * PER_RADIAN
-    if np.linalg.norm(small, axis=1).max() < 1.5 * np.pi:
-        words = "the rotations' angles 57.3 times larger: radians had been taken as degrees"
-        yield "degrees", words, with_rotations(pairs, Rotation.from_rotvec(small))
-        for order in EULER:
-            angles = PER_RADIAN * R.as_euler(order)
-            yield "degrees", words, with_rotations(pairs, Rotation.from_euler(order, angles))
-    for name, places in (("(w, x, y, z)", [1, 2, 3, 0]), ("(x, y, z, w)", [3, 0, 1, 2])):
-        words = f"the quaternions read as {name}"
-        yield "quaternion", words, with_rotations(pairs, Rotation.from_quat(quaternions[:, places]))
-    words = "the rotations transposed, the positions left"
-    yield "transposed", words, with_rotations(pairs, R.inv())
-    for said, meant in (("xyz", "XYZ"), ("XYZ", "xyz"), ("xyz", "zyx"), ("zyx", "xyz")):
-        other = Rotation.from_euler(meant, R.as_euler(said))
-        words = f"Euler angles of order {said!r} read as {meant!r}"
-        yield "euler", words, with_rotations(pairs, other)
+    for words, places in (
+        (
+            "(w, x, y, z) read as (x, y, z, w); the data fit from_quat(q[[1, 2, 3, 0]])",
+            [1, 2, 3, 0],
+        ),
+        ("(x, y, z, w) read as (w, x, y, z); the data fit Rotation.from_quat(q)", [3, 0, 1, 2]),
+    ):
+        other = Rotation.from_quat(quaternions[:, places]).as_matrix()
+        yield "notation", f"quaternions {words}", with_rotations(pairs, other)
+    words = "rotations transposed, the positions left; the data fit R.T"
+    yield "notation", words, with_rotations(pairs, R.inv().as_matrix())
 
 
-def with_rotations(pairs: PosePairs, R: Rotation) -> PosePairs:
-    """The same pairs with other rotations of the arm."""
+def with_rotations(pairs: PosePairs, R: Floats) -> PosePairs:
+    """The same pairs with other rotations (n, 3, 3) of the arm."""
     T = pairs.T_base_gripper.copy()
-    T[:, :3, :3] = R.as_matrix()
+    T[:, :3, :3] = R
     return replace(pairs, T_base_gripper=T)
+
+
+# --- images with the arm pose of another image ---
+
+
+@dataclass(frozen=True, eq=False)
+class Pairing:
+    """Images and arm poses put together anew.
+
+    rows (n,): the arm pose of each image, -1 where it has none. name: of the finding; says: what
+    was done, with a place for the images' names. pairs: as they were given.
+    """
+
+    pairs: PosePairs
+    rows: NDArray[np.intp]
+    name: str
+    says: str
+
+    @property
+    def mended(self) -> PosePairs:
+        """The pairs put right, without the images that have no arm pose."""
+        T, row = self.pairs.T_base_gripper[self.rows], self.pairs.row[self.rows]
+        return replace(self.pairs, T_base_gripper=T, row=row).keep(self.rows >= 0)
+
+
+def other_pairing(pairs: PosePairs, names: Sequence[str]) -> Pairing | None:
+    """Images with the arm pose of another image, None where each fits its own best.
+
+    names: of the views. X and Y come from all pairs, and where those do not agree from their
+    halves, from pairs shifted by one or two, in the order of text, and backwards.
+    """
+    n, half = len(pairs), len(pairs) // 2
+    tried = [pairs, *(pairs.shifted(by) for by in (-1, 1, -2, 2) if n - abs(by) >= 4)]
+    if half >= FEWEST_OF_HALF:
+        tried += [tried[0].keep(np.arange(n) < half)]
+        tried += [part.keep(np.arange(len(part)) >= len(part) - half) for part in tried[1:3]]
+    orders = [*_text_orders(n), np.arange(n)[::-1]]
+    tried += [replace(pairs, T_base_gripper=pairs.T_base_gripper[order]) for order in orders]
+    names, own = [names[view] for view in pairs.view], np.arange(n)
+    found = [_fitting_rows(part.fit, pairs) for part in tried]
+    rows, off = min(found, key=_left_over)
+    if (rows != own).sum() < 2:
+        return None
+    # X and Y of a few pairs may fit those by chance: all of them must say the same
+    rows, off = _fitting_rows(_in_order(pairs, rows, off, names).mended.fit, pairs)
+    moved = np.flatnonzero(rows != own)
+    better = found[0][1][moved, moved] - off[moved, rows[moved]]  # than as given, logarithms
+    if len(moved) < 2 or better.mean() < 2 * np.log(CLEARLY_BETTER):
+        return None
+    return _in_order(pairs, rows, off, names)
+
+
+def _left_over(fitting: tuple[NDArray[np.intp], Floats]) -> float:
+    rows, off = fitting
+    return float(off[np.arange(len(rows)), rows].mean())
+
+
+def _fitting_rows(fit: Fit, pairs: PosePairs) -> tuple[NDArray[np.intp], Floats]:
+    """The row (n,) that each image fits, its own if that does or none does.
+
+    And the logarithm (n, n) of what each image and row would leave over, by X and Y of the fit.
+    """
+    arm = camera_board(pairs.T_base_gripper, fit.X, fit.Y[0], pairs.mount)
+    apart = pose_difference(arm[None], pairs.T_camera_board[:, None])
+    turn = np.linalg.norm(apart[..., :3], axis=-1) + LEAST_RAD
+    shift = np.linalg.norm(apart[..., 3:], axis=-1) + LEAST_M
+    far = np.maximum(turn / (fit.turn_rad + LEAST_RAD), shift / (fit.shift_m + LEAST_M))
+    own, best, off = np.arange(len(pairs)), far.argmin(axis=1), np.log(turn * shift)
+    moved = (far[own, best] < WITHIN) & (far[own, own] > WITHIN)
+    moved &= far[own, own] > FARTHER * far[own, best]
+    moved &= np.bincount(best, minlength=len(own))[best] == 1
+    return np.where(moved, best, own), off
+
+
+def _in_order(
+    pairs: PosePairs, rows: NDArray[np.intp], off: Floats, names: Sequence[str]
+) -> Pairing:
+    """What was done to images that fit other rows: shifted, sorted otherwise, or exchanged.
+
+    names (n,): of the images; rows (n,), off (n, n): see `_fitting_rows`.
+    """
+    n, own = len(rows), np.arange(len(rows))
+    moved = np.flatnonzero(rows != own)
+    orders = [Pairing(pairs, order, "text_order", TEXT_ORDER) for order in _text_orders(n)]
+    orders.append(Pairing(pairs, own[::-1], "off_by_one", "the images run backwards"))
+    by = Counter((rows[moved] - moved).tolist()).most_common(1)[0][0]
+    orders += [_shifted_from(pairs, first, by, names[first]) for first in range(n - 1)]
+    missing = np.median(off[own, rows]) + 2 * np.log(WITHIN)  # better than to fit another's row
+    best = min(orders, key=lambda o: np.where(o.rows < 0, missing, off[own, o.rows]).mean())
+    if (best.rows[moved] == rows[moved]).mean() > MOST_FIT:
+        return best
+    couples = [f"{names[i]} and {names[j]}" for i, j in enumerate(rows) if i < j and rows[j] == i]
+    if 2 * len(couples) == len(moved):
+        return Pairing(pairs, rows, "exchanged_rows", ", ".join(couples))
+    listed = ", ".join(f"{names[i]} to that of {names[rows[i]]}" for i in moved)
+    words = f"images belong to arm poses of others ({listed})"
+    taken = np.isin(own, rows[moved]) & (rows == own)
+    return Pairing(pairs, np.where(taken, -1, rows), "off_by_one", words)
+
+
+def _shifted_from(pairs: PosePairs, first: int, by: int, name: str) -> Pairing:
+    """Images from the first on with the arm pose `by` places further on; name: of that image."""
+    own = np.arange(len(pairs))
+    rows = np.where(own < first, own, own + by)
+    rows[(rows < 0) | (rows >= len(own)) | ((own < first) & (own >= first + by))] = -1
+    where = f"{abs(by)} place{'s' * (abs(by) > 1)} {'after' if by > 0 else 'before'} its own"
+    words = f"each image belongs to the arm pose {where}"
+    if first > max(0, -by):
+        lost = "an image" if by > 0 else "an arm pose"
+        words = f"from {name} on {words}; {lost} is missing there"
+    return Pairing(pairs, rows, "off_by_one", words)
+
+
+def _text_orders(n: int) -> Iterator[NDArray[np.intp]]:
+    """Rows of images that were sorted as text, and images of such rows; counted from 0 and 1."""
+    for first in (0, 1):
+        order = np.array(sorted(range(n), key=lambda i: str(first + i)))
+        if (order != np.arange(n)).any():
+            yield from (order, np.argsort(order))
 
 
 # --- positions alone ---
@@ -170,101 +315,219 @@ def places(pairs: PosePairs) -> Places:
     return Places(Q @ M[:, :3, :3], gap, float(spread))
 
 
-# --- degrees taken as radians ---
+# --- three numbers read as another three ---
 
 
-def undo_degrees(given: Fit, expected: Floats) -> Reading | None:
-    """The arm's rotations if their angles were degrees taken as radians; None where nothing fits.
+@dataclass(frozen=True)
+class Notation:
+    """How three numbers mean a rotation: SciPy's orders of Euler angles, or a rotation vector.
 
-    expected (n, 3, 3): from `places`. Tried are rotation vectors and two orders of Euler angles.
+    Small letters are axes that stay, capitals those that turn with the body.
     """
-    for kind in (ROTATION_VECTORS, *EULER):
-        R = _decoded(given.pairs.T_base_gripper[:, :3, :3], expected, kind)
+
+    order: str
+
+    def rotations(self, numbers: Floats) -> Floats:
+        """Rotations (m, 3, 3) of numbers (m, 3), rad."""
+        if self.order == ROTATION_VECTOR:
+            return np.asarray(Rotation.from_rotvec(numbers).as_matrix())
+        return np.asarray(Rotation.from_euler(self.order, numbers).as_matrix())
+
+    def numbers(self, R: Floats) -> Floats:
+        """The numbers (m, 3) of rotations (m, 3, 3), rad, as drivers give them."""
+        turns = Rotation.from_matrix(R, assume_valid=True)
+        if self.order == ROTATION_VECTOR:
+            return turns.as_rotvec()
+        return np.asarray(turns.as_euler(self.order, suppress_warnings=True))
+
+    def same(self, numbers: Floats) -> Floats:
+        """The two triples (2, m, 3) that mean the same but for whole turns."""
+        first, second, third = np.moveaxis(numbers, -1, 0)
+        if self.order == ROTATION_VECTOR:
+            length = np.linalg.norm(numbers, axis=-1, keepdims=True)
+            return np.stack([numbers, numbers - 2 * np.pi * numbers / np.maximum(length, 1e-12)])
+        middle = -second if self.order[0].lower() == self.order[2].lower() else np.pi - second
+        return np.stack([numbers, np.stack([first + np.pi, middle, third + np.pi], axis=-1)])
+
+    def inside(self, numbers: Floats) -> NDArray[np.bool_]:
+        """(m,): whether drivers give such numbers."""
+        if self.order == ROTATION_VECTOR:
+            return np.linalg.norm(numbers, axis=-1) < ROUNDED * np.pi
+        middle = numbers[..., 1]
+        if self.order[0].lower() == self.order[2].lower():
+            middle = middle - np.pi / 2
+        ends = np.abs(numbers[..., ::2]).max(axis=-1)
+        return np.asarray((ends < ROUNDED * np.pi) & (np.abs(middle) < ROUNDED * np.pi / 2))
+
+    def call(self, degrees: bool) -> str:
+        """The code that reads such numbers."""
+        unit = ", degrees=True" * degrees
+        if self.order == ROTATION_VECTOR:
+            return f"Rotation.from_rotvec(v{unit})"
+        return f"Rotation.from_euler({self.order!r}, v{unit})"
+
+
+@dataclass(frozen=True)
+class Misreading:
+    """Numbers that were written in one notation and read in another.
+
+    factor: the numbers as read, rad, over those as written: `PER_RADIAN` for degrees taken as
+    radians, one over that for radians taken as degrees. A rotation is then known up to whole turns
+    of the numbers as read, which in degrees are 6.28.
+    """
+
+    written: Notation
+    read: Notation
+    factor: float = 1.0
+
+    @property
+    def name(self) -> str:
+        """Of the finding."""
+        return "notation" if self.factor == 1.0 or self.written != self.read else "degrees"
+
+    def says(self) -> str:
+        """What was done, and what fits."""
+        read, written = self.read.call(self.factor < 1), self.written.call(self.factor > 1)
+        what = "rotation vectors" if self.written.order == ROTATION_VECTOR else "Euler angles"
+        if self.written.order != ROTATION_VECTOR:
+            what += f" {self.written.order!r}"
+        what += " in degrees" * (self.factor > 1) + " in radians" * (self.factor < 1)
+        line = f"{what} read by {read}; the data fit {written}"
+        twins = {Notation(n.order[::-1].swapcase()) for n in (self.written, self.read)}
+        if Notation(ROTATION_VECTOR) not in (self.written, self.read) and len(twins) == 2:
+            line += (
+                f" (or, with the three numbers in reverse, {self.written.order[::-1].swapcase()!r} "
+                f"in place of {self.read.order[::-1].swapcase()!r})"
+            )
+        return line
+
+    def nearest(self, given: Floats, R: Floats) -> tuple[Floats, Floats]:
+        """Numbers as written (m, 3) nearest to rotations R (m, 3, 3), and how far off (m,), rad.
+
+        given (3,) or (m, 3): the numbers as read.
+        """
+        wanted = self.written.numbers(R)
+        all_wanted = wanted[None]
+        if self.written.order == ROTATION_VECTOR:  # near pi the other one is as likely
+            all_wanted = self.written.same(wanted)
+        best, least = wanted, np.full(len(wanted), np.inf)
+        for want in self.factor * all_wanted:
+            for same in self.read.same(np.broadcast_to(given, want.shape)):
+                tried = same + self._turns(same, want - same)
+                off = np.linalg.norm(tried - want, axis=-1) / self.factor
+                best = np.where((off < least)[:, None], tried / self.factor, best)
+                least = np.minimum(off, least)
+        return best, least
+
+    def _turns(self, numbers: Floats, off: Floats) -> Floats:
+        """The whole turns (m, 3) nearest to `off` that leave the rotation of numbers as it is."""
+        if self.read.order != ROTATION_VECTOR:
+            return np.asarray(2 * np.pi * np.round(off / (2 * np.pi)))
+        axis = numbers / np.maximum(np.linalg.norm(numbers, axis=-1, keepdims=True), 1e-12)
+        along = np.einsum("mi,mi->m", axis, off)
+        return np.asarray(2 * np.pi * np.round(along / (2 * np.pi))[:, None] * axis)
+
+    def candidates(self, given: Floats) -> Floats:
+        """All rotations (m, 3, 3) that, misread like this, give the numbers (3,)."""
+        most = int(np.ceil(self.factor / 2)) + 1
+        turns = 2 * np.pi * np.arange(-most, most + 1)
+        found = []
+        for same in self.read.same(given[None])[:, 0]:
+            if self.read.order == ROTATION_VECTOR:
+                axis = same / max(np.linalg.norm(same), 1e-12)
+                tried = same + turns[:, None] * axis
+            else:
+                lists = [
+                    a[np.abs(a) < ROUNDED * np.pi * self.factor] for a in same[:, None] + turns
+                ]
+                tried = np.stack(np.meshgrid(*lists, indexing="ij"), axis=-1).reshape(-1, 3)
+            found.append(tried[self.written.inside(tried / self.factor)] / self.factor)
+        return self.written.rotations(np.concatenate(found))
+
+    def log_p(self, given: Floats, fit: Fit) -> float:
+        """How likely a wrong misreading would leave residuals as small as those of a fit, log.
+
+        given (n, 3, 3): what it was undone of. By chance the nearest of m candidates is within an
+        angle with the probability of m balls of that radius among all rotations; the poses' are
+        multiplied (Fisher), and any of the candidates of one pose could have been the start.
+        """
+        angles = np.linalg.norm(fit.twists[:, :3], axis=1)
+        many = len(self.candidates(self.read.numbers(given[:1])[0]))
+        by_chance = np.minimum(1.0, max(many, 1) * (angles - np.sin(angles)) / np.pi)
+        total = -np.log(np.maximum(by_chance, 1e-12)).sum()
+        return float(np.log(many * HYPOTHESES) + log_chi2_tail(2 * total, 2 * len(angles)))
+
+    def undone(self, given: Floats, expected: Floats) -> Floats | None:
+        """The true rotations (n, 3, 3) behind given ones, None where nothing fits.
+
+        expected (n, 3, 3): the true ones but for a constant on the right.
+        """
+        numbers, close = self.read.numbers(given), min(CHANCE_RAD / self.factor, CLOSE_RAD)
+        order = np.linspace(0, len(given) - 1, min(SOURCE_POSES, len(given))).astype(int)
+        for first in order:
+            constant = expected[first].T @ self.candidates(numbers[first])
+            off = np.zeros(len(constant))
+            for i in np.roll(np.arange(len(given)), -first)[1:]:
+                if len(constant) < FEW_CANDIDATES:
+                    break
+                off += np.minimum(self.nearest(numbers[i], expected[i] @ constant)[1], 2 * close)
+                left = np.argsort(off, kind="stable")[: len(off) // 6]
+                constant, off = constant[left], off[left]
+            if not len(constant):
+                continue
+            R = (expected @ constant[:, None]).reshape(-1, 3, 3)
+            there = self.written.rotations(self.nearest(np.tile(numbers, (len(constant), 1)), R)[0])
+            cosine = (np.einsum("mij,mij->m", there, R) - 1) / 2
+            wrong = np.arccos(np.clip(cosine, -1, 1)).reshape(len(constant), -1)
+            best = np.median(wrong, axis=1).argmin()
+            if np.median(wrong[best]) < close:
+                return there.reshape(*wrong.shape, 3, 3)[best]
+        return None
+
+
+def misreadings() -> Iterator[Misreading]:
+    """The likely ones, the quick ones first.
+
+    Fixed axes in one order are moving ones in the reverse order, with the numbers in reverse too,
+    so that half of the pairs of two Euler notations tell nothing new.
+    """
+    vector, fixed = Notation(ROTATION_VECTOR), [Notation(order) for order in FIXED]
+    moving, twice = ([Notation(o) for o in orders] for orders in (MOVING, TWICE))
+    for factor in (1.0, 1 / PER_RADIAN):
+        for euler in (*fixed, *moving):
+            yield Misreading(vector, euler, factor)
+            yield Misreading(euler, vector, factor)
+    for read in fixed:
+        yield from (Misreading(other, read) for other in (*moving, *fixed, *twice) if other != read)
+    for same in (vector, *fixed, *twice):
+        yield Misreading(same, same, 1 / PER_RADIAN)
+    for other in (vector, *fixed, *moving):
+        yield Misreading(other, vector, PER_RADIAN)
+    for same in (*fixed[:2], *twice[:1]):
+        yield Misreading(same, same, PER_RADIAN)
+
+
+def undo_notation(given: Fit, expected: Floats) -> Reading | None:
+    """The arm's rotations as another notation or unit would have them; None where nothing fits.
+
+    expected (n, 3, 3): from `places`.
+    """
+    G, found = given.pairs.T_base_gripper[:, :3, :3], []
+    for misreading in misreadings():
+        if found and misreading.factor > 1:
+            break  # the slow ones
+        R = misreading.undone(G, expected)
         if R is None:
             continue
         fit = with_rotations(given.pairs, R).fit
         # `expected` leans on positions alone; with X and Y a pose's neighbours are told apart
         M = fit.X @ fit.pairs.T_camera_board @ invert_transform(fit.Y[0])
         arm = M if fit.pairs.mount == "eye_to_hand" else invert_transform(M)
-        R = _nearest(given.pairs.T_base_gripper[:, :3, :3], arm[:, :3, :3], kind)
-        fit = with_rotations(given.pairs, R).fit
-        if fit.better_than(given) > CLEARLY_BETTER:
-            what = kind if kind not in EULER else f"Euler angles ({kind})"
-            return Reading("degrees", f"the {what} read as degrees", fit)
-    return None
-
-
-def _decoded(given: Floats, expected: Floats, kind: str) -> Rotation | None:
-    """The true rotations (n,) behind given ones (n, 3, 3), or None."""
-    order = np.linspace(0, len(given) - 1, min(SOURCE_POSES, len(given))).astype(int)
-    for first in order:
-        constant = expected[first].T @ _candidates(given[first], kind)
-        others = [i for i in range(len(given)) if i != first][:CHECKED_POSES]
-        near = np.zeros(len(constant), int)
-        for i in others:
-            near += _misses(given[i], expected[i] @ constant, kind) < MATCH_RAD
-        for number in np.argsort(-near, kind="stable")[:CHECKED_CANDIDATES]:
-            wrong = _misses(given, expected @ constant[number], kind)
-            if np.median(wrong) < CHANCE_TURN_RAD:
-                return _nearest(given, expected @ constant[number], kind)
-    return None
-
-
-def _candidates(R: Floats, kind: str) -> Floats:
-    """All rotations (m, 3, 3) whose angles in degrees, taken as radians, give R (3, 3)."""
-    angles = _angles(R, kind)
-    turns = 2 * np.pi * np.arange(-29, 30)
-    if kind == ROTATION_VECTORS:
-        length = np.linalg.norm(angles)
-        axis = angles / length if length > 0 else np.array([0.0, 0.0, 1.0])
-        sizes = (length + turns) / PER_RADIAN
-        sizes = sizes[np.abs(sizes) <= np.pi, None]
-        return np.asarray(Rotation.from_rotvec(sizes * axis).as_matrix())
-    limits = np.array([np.pi, np.pi / 2, np.pi]) * PER_RADIAN  # as drivers give them
-    found = []
-    for same in _same_rotation(angles):
-        lists = [angle + turns for angle in same]
-        lists = [a[np.abs(a) <= limit] for a, limit in zip(lists, limits, strict=True)]
-        found.append(np.stack(np.meshgrid(*lists, indexing="ij"), axis=-1).reshape(-1, 3))
-    degrees = np.concatenate(found)
-    return np.asarray(Rotation.from_euler(kind, degrees, degrees=True).as_matrix())
-
-
-def _same_rotation(angles: Floats) -> list[Floats]:
-    """The two triples of Euler angles (..., 3) about three different axes that mean the same."""
-    first, second, third = np.moveaxis(angles, -1, 0)
-    return [angles, np.stack([first + np.pi, np.pi - second, third + np.pi], axis=-1)]
-
-
-def _angles(R: Floats, kind: str) -> Floats:
-    turn = Rotation.from_matrix(R)
-    return turn.as_rotvec() if kind == ROTATION_VECTORS else turn.as_euler(kind)
-
-
-def _misses(given: Floats, R: Floats, kind: str) -> Floats:
-    """Angles (m,), rad, between given rotations and what R (m, 3, 3) in degrees would become.
-
-    given (3, 3) or (m, 3, 3): what was made of angles in degrees that were taken as radians.
-    """
-    angles = PER_RADIAN * _angles(R, kind)
-    vectors = kind == ROTATION_VECTORS
-    became = Rotation.from_rotvec(angles) if vectors else Rotation.from_euler(kind, angles)
-    return np.asarray((became.inv() * Rotation.from_matrix(given)).magnitude())
-
-
-def _nearest(given: Floats, near: Floats, kind: str) -> Rotation:
-    """The candidates (n,) of given rotations that are nearest to rotations (n, 3, 3)."""
-    if kind == ROTATION_VECTORS:
-        chosen = []
-        for R, expected in zip(given, near, strict=True):
-            tried = _candidates(R, kind)
-            chosen.append(tried[np.einsum("mij,ij->m", tried, expected).argmax()])
-        return Rotation.from_matrix(np.stack(chosen))
-    wanted = PER_RADIAN * _angles(near, kind)
-    same = np.stack(_same_rotation(_angles(given, kind)))
-    tried = same + 2 * np.pi * np.round((wanted - same) / (2 * np.pi))
-    best = np.linalg.norm(tried - wanted, axis=2).argmin(axis=0)
-    return Rotation.from_euler(kind, tried[best, np.arange(len(given))], degrees=True)
+        numbers, _ = misreading.nearest(misreading.read.numbers(G), arm[:, :3, :3])
+        fit = with_rotations(given.pairs, misreading.written.rotations(numbers)).fit
+        if misreading.log_p(G, fit) < np.log(CHANCE_LEVEL):
+            found.append(Reading(misreading.name, misreading.says(), fit))
+    return best(found)
 
 
 # --- inverted poses, inverted detections, the other mount ---
@@ -309,6 +572,18 @@ def candidates(fit: Fit, session: HandEyeSession, names: tuple[str, ...]) -> lis
             against.append("the board's poses were computed here from the images")
         found.append(Candidate(name.format(other=other), mount, X_, Y_, tuple(against)))
     return found
+
+
+def looking_along(T_camera_board: Floats) -> tuple[str, float, float]:
+    """The axis of the camera's frame near which boards (n, 4, 4) are seen: "z", "-x" and so on.
+
+    And the share of the images for which that is so, and that of those with the board ahead (z).
+    """
+    place = T_camera_board[:, :3, 3]
+    along = place / np.linalg.norm(place, axis=1, keepdims=True)
+    shares = (np.hstack([along, -along]) > np.cos(np.radians(WIDE_DEG))).mean(axis=0)
+    best = int(shares.argmax())
+    return "-" * (best > 2) + "xyz"[best % 3], float(shares[best]), float(shares[2])
 
 
 def other_mount(mount: Mount) -> Mount:

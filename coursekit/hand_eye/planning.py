@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from coursekit.arm import FkErrors
+from coursekit.arm import FkErrors, fk_covariance
 from coursekit.arrays import ArrayLike, Floats, Mask
 from coursekit.boards import Board, Detection
 from coursekit.boards.board import seen
@@ -96,6 +96,8 @@ def held_out(
     other = HandEyeSession(result.mount, T_base_gripper, seen, board, intrinsics, q)  # type: ignore[arg-type]
     poses = other.T_base_gripper
     offsets = fit is not None and fit.problem.arm is not None and other.q is not None
+    if fit is not None and fit.problem.guessed and fk is None and other.q is not None:
+        fk = fk_covariance(other.q, arm=given.arm)
     if fit is not None and (fk is not None or offsets):
         poses = arm_poses_with(fit, replace(fit.problem, T_base_gripper=poses, q=other.q, fk=fk))
     expected = camera_board(poses, result.X, result.Y, result.mount)

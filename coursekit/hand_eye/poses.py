@@ -28,9 +28,9 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coursekit.arrays import ArrayLike, Floats
+from coursekit.arrays import ArrayLike, Floats, Integers
 from coursekit.checks import array, choice, transform, transforms, want
-from coursekit.geometry import cross_matrix, invert_transform
+from coursekit.geometry import cross_matrix, invert_transform, pose_difference
 from coursekit.words import wrapped
 
 Mount = Literal["eye_in_hand", "eye_to_hand"]
@@ -44,6 +44,8 @@ WRITTEN_TOLERANCE = 1e-4  # of R R^T: poses are often written with five digits
 SCATTER = np.repeat([np.radians(0.1), 0.5e-3], 3)
 LEVER_M = 0.3  # a rotation of X counts by what it does this far in front of the camera
 IN_METRES = np.array([LEVER_M, LEVER_M, LEVER_M, 1.0, 1.0, 1.0])  # times (omega, v)
+# Arm poses no farther apart, rad and m, are one pose, if the board is not seen to move by more.
+SAME_POSE, SAME_SIGHT = (np.radians(0.1), 1e-3), (np.radians(3.0), 0.01)
 FREE_M = 0.03  # a direction known no better than this is free: nobody would mount a camera so
 
 
@@ -59,6 +61,20 @@ def check_poses(name: str, value: ArrayLike, least: int = 1) -> Floats:
         transforms(f"{name}[{index}]", pose, WRITTEN_TOLERANCE)
     poses[:, :3, :3] = nearest_rotation(poses[:, :3, :3])
     return poses
+
+
+def first_alike(T_base_gripper: Floats, T_camera_board: Floats) -> Integers:
+    """Which pair (n,) each of n pairs repeats: its own number where it repeats none before it."""
+    first = np.arange(len(T_base_gripper))
+    for i in range(1, len(first)):
+        earlier = np.flatnonzero(first[:i] == np.arange(i))
+        near = np.ones(len(earlier), bool)
+        for T, (turn, shift) in ((T_base_gripper, SAME_POSE), (T_camera_board, SAME_SIGHT)):
+            off = np.linalg.norm(pose_difference(T[i], T[earlier]).reshape(-1, 2, 3), axis=2)
+            near &= (off < [turn, shift]).all(axis=1)
+        if near.any():
+            first[i] = earlier[near.argmax()]
+    return first
 
 
 # --- frames ---

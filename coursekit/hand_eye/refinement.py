@@ -5,14 +5,19 @@ see is compared either in pixels or as poses (`views`); both come down to a grad
 information matrix (7, 7) of (omega, v, log scale) of each C_i, and everything unknown acts through
 those seven numbers. Gauss-Newton with halved steps does the rest.
 
-An arm is not where it says. Its error (`arm.FkErrors`) is a twist of the gripper, shared_i s +
-own_i: `s` are numbers that belong to the unit (joint offsets, links) and move all poses together;
-`own_i` is drawn anew at each pose (gear play). Both are unknowns with Gaussian priors. Without the
-first the intervals would shrink with the number of poses although the bias stays; without the
-second a view of 54 corners would count as 54 witnesses of one pose. The own ones are six a pose,
-and each touches one view only: they are eliminated view by view (Schur complement).
+An arm is not where it says. What belongs to the unit (`arm.FkErrors`: joint offsets, links) moves
+all poses together; where it is stated it is unknown, with Gaussian priors. What is drawn anew at
+each pose (repeatability, gear play, an arm that still swings, a board that is not flat) is there in
+every session, stated or not: a turn and a shift of the gripper, and of the camera an error like
+that of its corners' noise, or a turn of the board where only its poses are known. A view of 54
+corners is one witness of one pose, so the size of these own errors decides how much is known.
+`_Scatter` estimates it. They are six numbers a pose, and each touches one view only: they
+are eliminated view by view (Schur complement).
 
-Source: Triggs et al., "Bundle adjustment: a modern synthesis" (2000), sections 4 and 6.
+Sources: Triggs et al., "Bundle adjustment: a modern synthesis" (2000), sections 4 and 6. The sizes,
+by restricted maximum likelihood: Patterson and Thompson (1971). What their uncertainty does to the
+covariance and to the degrees of freedom: Kenward and Roger, "Small sample inference for fixed
+effects from restricted maximum likelihood" (1997).
 """
 
 from __future__ import annotations
@@ -21,6 +26,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.special import stdtrit
 
 from coursekit.arm import Arm, FkErrors
 from coursekit.arrays import Floats
@@ -32,7 +39,12 @@ from coursekit.intrinsics.derivatives import scaled_inverse
 GAUSS_NEWTON_STEPS, STEP_HALVINGS = 50, 10
 NEGLIGIBLE_DECREASE = 1e-8  # of the sum of squares by a step: 1e-4 standard deviations
 UNDETERMINED = 1e-13  # of the largest eigenvalue of the scaled information: nobody moves along it
-LEVEL_ROUNDS = 10  # of estimating how much poses scatter
+SCATTER_ROUNDS, SCORING_STEPS = 6, 40  # of estimating how much poses scatter, and within a round
+SETTLED = 1e-2  # of a variance: it is estimated
+LEAST_OWN = 1e-14 * np.eye(6)  # rad^2, m^2: a pose's own error of which nothing is known
+LEAST_FACTOR, MOST_FACTOR = 1e-4, 4.0  # of guessed variances: no unit is twice as bad as most
+BEYOND_CHANCE = 3.3  # sigmas of a correlation: 1 in 2,000 sessions
+FEWEST_TOLD = 5  # poses: with fewer nothing tells how far arm and images disagree
 TWIST = ("rx", "ry", "rz", "tx", "ty", "tz")
 JOINT_OFFSET = "offset of "  # how `arm.fk_covariance` names joint offsets
 OFFSET_SIGMA_RAD = 0.05  # prior of joint offsets that are asked for: 3 deg, far above any unit's
@@ -45,7 +57,8 @@ OFFSET_SIGMA_RAD = 0.05  # prior of joint offsets that are asked for: 3 deg, far
 class State:
     """X, Y, the board's scale, joint offsets (6,) in rad, and the arm's errors in sigmas.
 
-    shared (k,): of the unit. own (n, 6): of each pose, u_i with own_i = L_i u_i.
+    shared (k,): of the unit. own (n, 6): of each pose, u_i, which moves what the camera sees of the
+    board by the twist own_root_i u_i.
     """
 
     X: Floats
@@ -61,8 +74,10 @@ class Problem:
     """What is estimated, from what.
 
     T_base_gripper (n, 4, 4): reported. free_scale: whether the board's scale is unknown. arm and
-    q (n, 6): where joint offsets are asked for. fk: the arm's errors, None for an arm that has
-    none.
+    q (n, 6): where joint offsets are asked for. fk: the arm's errors that are stated, or None.
+    guessed: whether the sizes of what fk shares are a guess up to a common factor, which is then
+    estimated too. own_root (n, 6, 6): of the covariance of each pose's own error, and factor: of
+    the variances that fk shares; before they are estimated None and 1.
     """
 
     T_base_gripper: Floats
@@ -72,6 +87,9 @@ class Problem:
     arm: Arm | None = None
     q: Floats | None = None
     fk: FkErrors | None = None
+    guessed: bool = False
+    own_root: Floats | None = None
+    factor: float = 1.0
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -113,25 +131,10 @@ class Problem:
         return self.fk.shared[..., self._columns] * self.fk.sigma[self._columns]
 
     @cached_property
-    def _own_root(self) -> Floats:
-        """L_i (n, 6, 6) with L_i L_i' the covariance of each pose's own error.
-
-        To it comes what the errors do in second order, about half the product of two of them. It
-        is some 0.01 mm, no less than what 54 corners tell of a pose.
-        """
-        assert self.fk is not None
-        variances = np.einsum("nii->ni", self.fk.covariance)
-        turn, shift = np.sqrt(variances.reshape(-1, 2, 3).mean(axis=2)).T
-        second = np.stack([turn * turn / 2, turn * shift / 2], axis=1)
-        curved = np.repeat(second**2, 3, axis=1)[:, None, :] * np.eye(6)
-        values, vectors = np.linalg.eigh(self.fk.each + curved)
-        return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :])
-
-    @cached_property
     def prior(self) -> Floats:
         """The information (g,) of the priors on the shared unknowns."""
         free, k = np.zeros(12 + self.free_scale), self.shared.shape[2]
-        return np.concatenate([free, self._offset_sigma**-2.0, np.ones(k)])
+        return np.concatenate([free, self._offset_sigma**-2.0, np.full(k, 1 / self.factor)])
 
     def values(self, state: State) -> Floats:
         """The unknowns `names` (g,): rad, m, and 0 for a rotation, which is counted from X or Y."""
@@ -139,17 +142,31 @@ class Problem:
         scale, offsets = [state.scale] * self.free_scale, state.offsets[: len(self._offset_sigma)]
         return np.concatenate([X, Y, scale, offsets, state.shared])
 
-    @property
-    def dof(self) -> int:
-        """Numbers observed less unknowns, at least 1; an unknown with a prior costs nothing."""
-        return max(1, self.views.observations - 12 - self.free_scale)
-
     def arm_twists(self, state: State) -> Floats:
-        """The estimated errors of the arm's poses, (n, 6)."""
-        shared = self.shared @ state.shared
-        if self.fk is None:
-            return shared
-        return shared + np.einsum("nij,nj->ni", self._own_root, state.own)
+        """The errors of the arm's poses that all of them share, as estimated, (n, 6)."""
+        return self.shared @ state.shared
+
+    def own_twists(self, state: State) -> Floats:
+        """What each pose's own error does to where the camera sees the board, (n, 6)."""
+        if self.own_root is None:
+            return np.zeros((len(self.T_base_gripper), 6))
+        return np.einsum("nij,nj->ni", self.own_root, state.own)
+
+    def weighed(self, own: Floats) -> Problem:
+        """With each pose's own error of this covariance (n, 6, 6): beside pixels six unknowns more,
+        and where only poses are known what they are weighed with."""
+        if isinstance(self.views, PoseViews):
+            return replace(
+                self, views=replace(self.views, information=np.asarray(np.linalg.inv(own)))
+            )
+        return replace(self, own_root=np.asarray(np.linalg.cholesky(own)))
+
+    def with_own(self, state: State, twists: Floats) -> State:
+        """The state with each pose's own error such that it does what twists (n, 6) say."""
+        if self.own_root is None:
+            return state
+        u = np.linalg.solve(self.own_root, twists[..., None])
+        return replace(state, own=np.asarray(u[..., 0]))
 
     def reported(self, state: State) -> Floats:
         """T_base_gripper (n, 4, 4) of the reported joints with the offsets put right."""
@@ -158,17 +175,34 @@ class Problem:
         return self.arm.forward(self.q + state.offsets)
 
     def camera_board(self, state: State) -> Floats:
-        """Where the camera should see the board, (n, 4, 4)."""
-        return camera_board(self._arm_poses(state), state.X, state.Y, self.mount)
+        """Where the camera should see the board, each pose's own error included, (n, 4, 4)."""
+        expected = camera_board(self._arm_poses(state), state.X, state.Y, self.mount)
+        return turned(expected, self.own_twists(state))
 
     def _arm_poses(self, state: State) -> Floats:
         return turned(self.reported(state), self.arm_twists(state))
 
+    def own_parts(self, state: State) -> tuple[Floats, Floats]:
+        """Of what the own errors may be: the stated covariance (n, 6, 6), and that of each size.
+
+        The latter (k, n, 6, 6) is for a size of 1 rad or m about and along each axis: a turn and a
+        shift of the gripper, and where only poses are known a turn of the board.
+        """
+        by_arm = by_arm_twist(self._arm_poses(state), state.X, state.Y, self.mount)
+        halves = [by_arm[..., :3], by_arm[..., 3:]]
+        if isinstance(self.views, PoseViews):  # a shift of the board is one of the gripper
+            halves.append(np.broadcast_to(np.eye(6, 3), by_arm[..., :3].shape))
+        stated = np.zeros_like(by_arm)
+        if self.fk is not None:
+            stated = by_arm @ self.fk.each @ np.swapaxes(by_arm, 1, 2)
+        return stated, np.stack([half @ np.swapaxes(half, 1, 2) for half in halves])
+
     def prior_squares(self, state: State) -> float:
         """The sum of squares of the unknowns that have priors."""
-        return float(self.prior @ self._with_prior(state) ** 2 + (state.own**2).sum())
+        return float(self.prior @ self.with_prior(state) ** 2 + (state.own**2).sum())
 
-    def _with_prior(self, state: State) -> Floats:
+    def with_prior(self, state: State) -> Floats:
+        """The unknowns (g,) that have priors, which are about 0; 0 for the others."""
         offsets = state.offsets[: len(self._offset_sigma)]
         return np.concatenate([np.zeros(12 + self.free_scale), offsets, state.shared])
 
@@ -192,32 +226,39 @@ class Problem:
 
     def equations(self, state: State) -> Equations:
         """The normal equations at a state."""
-        arm_poses = self._arm_poses(state)
-        C = camera_board(arm_poses, state.X, state.Y, self.mount)
-        squares, gradient, information = self.views.linear(C, state.scale)
-        shared, own = self._derivatives(state, arm_poses)
-        pull = self.prior * self._with_prior(state)
+        squares, gradient, information = self.views.linear(self.camera_board(state), state.scale)
+        shared, own = self._derivatives(state)
+        pull = self.prior * self.with_prior(state)
         total = float(squares.sum()) + self.prior_squares(state)
         return Equations(shared, own, gradient, information, self.prior, pull, state.own, total)
 
-    def _derivatives(self, state: State, arm_poses: Floats) -> tuple[Floats, Floats | None]:
+    def _derivatives(self, state: State) -> tuple[Floats, Floats | None]:
         """d the seven numbers of each view / d shared unknowns (n, 7, g), and / d own (n, 6, 6)."""
-        n = len(arm_poses)
-        by_arm = by_arm_twist(arm_poses, state.X, state.Y, self.mount)
-        columns = [by_X_and_Y(arm_poses, state.X, state.Y, self.mount)]
-        columns.append(np.zeros((n, 6, int(self.free_scale))))
+        arm_poses = self._arm_poses(state)
+        given = arm_poses, state.X, state.Y, self.mount
+        by_arm, n = by_arm_twist(*given), len(arm_poses)
+        columns = [by_X_and_Y(*given), np.zeros((n, 6, int(self.free_scale)))]
         if self.arm is not None and self.q is not None:
             columns.append(by_arm @ self.arm.jacobian(self.q + state.offsets))
         if self.fk is not None:
-            # The estimated turn is a vector that grows: exp(a + b) = exp((1 + [a]x / 2) b) exp(a)
-            twists = self.arm_twists(state)
-            by_arm[..., :3] = by_arm[..., :3] @ (np.eye(3) + cross_matrix(twists[:, :3]) / 2)
-            columns.append(by_arm @ self.shared)
+            columns.append(by_arm @ _growing(self.arm_twists(state)) @ self.shared)
+        own = self.own_twists(state)
         by_pose = np.concatenate(columns, axis=2)
+        by_pose[:, :3] = Rotation.from_rotvec(own[:, :3]).as_matrix() @ by_pose[:, :3]
         by_scale = np.zeros((n, 1, by_pose.shape[2]))
         by_scale[..., 12 : 12 + self.free_scale] = 1.0
-        own = None if self.fk is None else by_arm @ self._own_root
-        return np.concatenate([by_pose, by_scale], axis=1), own
+        by_own = None if self.own_root is None else _growing(own) @ self.own_root
+        return np.concatenate([by_pose, by_scale], axis=1), by_own
+
+
+def _growing(twists: Floats) -> Floats:
+    """d turned pose / d twist where the turn is a vector that grows, (n, 6, 6).
+
+    exp(a + b) = exp((1 + [a]x / 2) b) exp(a).
+    """
+    columns = np.tile(np.eye(6), (len(twists), 1, 1))
+    columns[:, :3, :3] += cross_matrix(twists[:, :3]) / 2
+    return columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,21 +304,187 @@ class Equations:
         """The Gauss-Newton step, (g,) and (n, 6), and what it should take off the squares."""
         gradient = np.einsum("nki,nk->i", self.shared, self.gradient) - self.pull
         if self.own is None:
-            change = _determined_inverse(self.reduced) @ gradient
+            change = determined_inverse(self.reduced) @ gradient
             return change, np.zeros_like(self.u), float(change @ gradient)
         own_gradient = np.einsum("nki,nk->ni", self.own, self.gradient[:, :6]) - self.u
         inner = np.einsum("nij,nj->ni", self._own_inverse, own_gradient)
         reduced = gradient - np.einsum("nki,nk->i", self._cross, inner)
-        change = _determined_inverse(self.reduced) @ reduced
+        change = determined_inverse(self.reduced) @ reduced
         own = inner - self._own_inverse @ self._cross @ change
         return change, own, float(change @ gradient + np.sum(own * own_gradient))
 
 
-def _determined_inverse(matrix: Floats) -> Floats:
+def determined_inverse(matrix: Floats) -> Floats:
     """The pseudo-inverse that leaves alone what the data say nothing about."""
-    scale = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
+    scale = np.sqrt(np.where(np.diag(matrix) > 0, np.diag(matrix), 1.0))
     units = np.outer(scale, scale)
     return np.linalg.pinv(matrix / units, rcond=UNDETERMINED, hermitian=True) / units
+
+
+# --- how much poses scatter ---
+
+
+@dataclass(frozen=True, eq=False)
+class _Scatter:
+    """The equations with each pose's own error in the noise, for any sizes of that error.
+
+    rows (n, 6): how far each view is from where it is expected without an own error. columns
+    (n, 6, g): by the shared unknowns. image (n, 6, 6): covariance of the rows but for the parts
+    (k, n, 6, 6), each times one of `sizes`, variances in rad^2 or m^2. prior (g,): information of
+    the unknowns, at `values` (g,); where `guessed` (g,) it is over one more size, which is last.
+    """
+
+    rows: Floats
+    columns: Floats
+    image: Floats
+    parts: Floats
+    prior: Floats
+    guessed: Floats
+    values: Floats
+    sizes: Floats
+
+    @classmethod
+    def of(cls, problem: Problem, state: State, sizes: Floats) -> _Scatter:
+        """The equations of a problem at a state."""
+        at = problem.equations(state)
+        image = np.asarray(np.linalg.inv(at.information[:, :6, :6]))
+        rows = np.einsum("nij,nj->ni", image, at.gradient[:, :6]) + problem.own_twists(state)
+        columns = image @ (at.information[:, :6] @ at.shared)
+        stated, parts = problem.own_parts(state)
+        shared = np.arange(len(at.prior)) >= len(at.prior) - problem.shared.shape[2]
+        guessed = shared * float(problem.guessed)
+        if problem.own_root is None:
+            image = np.zeros_like(image)
+        else:
+            parts = np.concatenate([parts, image[None]])
+        image = image + stated + LEAST_OWN
+        values, prior = problem.with_prior(state), np.where(shared, 1.0, at.prior)
+        return cls(rows, columns, image, parts, prior, guessed, values, sizes)
+
+    @property
+    def factor(self) -> float:
+        """Of the variances that are guessed; 1 where none are."""
+        return float(self.sizes[-1]) if self.guessed.any() else 1.0
+
+    @cached_property
+    def own(self) -> Floats:
+        """The covariance (n, 6, 6) of the own errors that are estimated."""
+        return np.einsum("k,knij->nij", self.sizes[: len(self.parts)], self.parts)
+
+    @cached_property
+    def _inverse(self) -> Floats:
+        return np.asarray(np.linalg.inv(self.image + self.own))
+
+    @cached_property
+    def _weighted(self) -> Floats:
+        return self._inverse @ self.columns
+
+    @cached_property
+    def _priors(self) -> Floats:
+        return np.where(self.guessed > 0, self.prior / self.factor, self.prior)
+
+    @cached_property
+    def _known(self) -> Floats:
+        """The covariance (g, g) if the sizes were known."""
+        information = np.tensordot(self.columns, self._weighted, ([0, 1], [0, 1]))
+        return scaled_inverse(information + np.diag(self._priors))
+
+    @cached_property
+    def _by_size(self) -> Floats:
+        """(k, g, g): what the information loses as a size grows."""
+        spread = self.parts @ self._weighted
+        lost = [np.tensordot(self._weighted, one, ([0, 1], [0, 1])) for one in spread]
+        return np.stack([*lost, np.diag(self.guessed / self.factor**2)][: len(self.sizes)])
+
+    @cached_property
+    def _by_two(self) -> Floats:
+        """(k, k, g, g): the same for two of them."""
+        spread = self.parts @ self._weighted
+        k, g = len(self.sizes), len(self.prior)
+        lost = np.zeros((k, k, g, g))
+        for i, one in enumerate(spread):
+            for j, other in enumerate(self._inverse @ spread):
+                lost[i, j] = np.tensordot(one, other, ([0, 1], [0, 1]))
+        if self.guessed.any():
+            lost[-1, -1] = np.diag(self.guessed / self.factor**3)
+        return lost
+
+    @cached_property
+    def _of_sizes(self) -> Floats:
+        """The expected information (k, k) of the sizes."""
+        each = self._inverse @ self.parts
+        k, own = len(self.sizes), len(self.parts)
+        trace = np.zeros((k, k))
+        trace[:own, :own] = np.einsum("knij,lnji->kl", each, each)
+        if self.guessed.any():
+            trace[-1, -1] = self.guessed.sum() / self.factor**2
+        moved = self._known @ self._by_size
+        trace -= 2 * np.einsum("ab,klba->kl", self._known, self._by_two)
+        return (trace + np.einsum("kab,lba->kl", moved, moved)) / 2
+
+    def _slope(self) -> Floats:
+        """d restricted log likelihood / d sizes, (k,)."""
+        pull = np.einsum("nia,ni->a", self._weighted, self.rows) - self._priors * self.values
+        step = self._known @ pull
+        left = np.einsum("nij,nj->ni", self._inverse, self.rows - self.columns @ step)
+        squares = np.einsum("ni,knij,nj->k", left, self.parts, left)
+        trace = np.einsum("nij,knji->k", self._inverse, self.parts)
+        if self.guessed.any():
+            far = self.guessed @ (self.values + step) ** 2
+            squares = np.append(squares, far / self.factor**2)
+            trace = np.append(trace, self.guessed.sum() / self.factor)
+        trace -= np.einsum("ab,kba->k", self._known, self._by_size)
+        return (squares - trace) / 2
+
+    @cached_property
+    def _least(self) -> Floats:
+        """Of the sizes, (k,): smaller ones are none."""
+        least = np.full(len(self.sizes), LEAST_OWN[0, 0])
+        least[len(self.parts) :] = LEAST_FACTOR
+        return least
+
+    def estimated(self) -> _Scatter:
+        """With the most likely sizes: Fisher scoring; a size that wants to be negative is least."""
+        now, least = self, self._least
+        for _ in range(SCORING_STEPS):
+            slope, step = now._slope(), np.zeros(len(least))
+            free = (now.sizes > least) | (slope > 0)
+            step[free] = determined_inverse(now._of_sizes[np.ix_(free, free)]) @ slope[free]
+            sizes = np.clip(now.sizes + step, np.maximum(now.sizes / 10, least), 10 * now.sizes)
+            sizes[len(self.parts) :] = np.minimum(sizes[len(self.parts) :], MOST_FACTOR)
+            settled = np.allclose(sizes, now.sizes, rtol=SETTLED, atol=0)
+            now = replace(now, sizes=sizes)
+            if settled:
+                break
+        return now
+
+    @property
+    def whitened(self) -> Floats:
+        """The rows (n, 6) in units of their sigmas."""
+        return np.einsum("nji,nj->ni", np.linalg.cholesky(self._inverse), self.rows)
+
+    @cached_property
+    def _unsure(self) -> Floats:
+        """The covariance (k, k) of the sizes; one that is nothing is known to be."""
+        some = self.sizes > 2 * self._least
+        unsure = np.zeros_like(self._of_sizes)
+        unsure[np.ix_(some, some)] = determined_inverse(self._of_sizes[np.ix_(some, some)])
+        return unsure
+
+    @cached_property
+    def covariance(self) -> Floats:
+        """Of the shared unknowns, (g, g), wider for what is not known of the sizes."""
+        lost = np.tensordot(self._unsure, self._by_two, 2)
+        moved = np.tensordot(self._unsure, self._by_size, 1)
+        lost -= np.einsum("kab,kbc->ac", self._by_size, self._known @ moved)
+        return self._known + 2 * self._known @ lost @ self._known
+
+    @cached_property
+    def dof(self) -> Floats:
+        """Degrees of freedom (g,) that the variance of each of the shared unknowns rests on."""
+        grows = np.einsum("ab,kbc,ca->ka", self._known, self._by_size, self._known, optimize=True)
+        spread = np.einsum("ka,kl,la->a", grows, self._unsure, grows)
+        return np.maximum(2 * np.diag(self._known) ** 2 / np.maximum(spread, 1e-300), 1.0)
 
 
 # --- the fit ---
@@ -287,75 +494,80 @@ def _determined_inverse(matrix: Floats) -> Floats:
 class Refined:
     """Where the refinement ended.
 
-    covariance (g, g): of the shared unknowns `problem.names`. squares: the sum in sigmas that were
-    assumed; where no priors fix their scale the covariance is larger by what the residuals say.
-    converged: whether another step would change anything. levels (2,): how much measured
-    poses scatter about and along each axis, rad and m; None for pixels.
+    covariance (g, g): of the shared unknowns `problem.names`, widened for what so few poses leave
+    unknown of their own errors: 1.96 of its sigmas are Student's 95 % interval, infinite below
+    `FEWEST_TOLD` poses. sizes (k,): how much poses scatter about and along each axis: the gripper's
+    turn and shift, rad and m; of images the error beyond their corners' noise in units of that
+    noise, or of poses the board's turn, rad; and, where they were guessed, the factor on the sigmas
+    of what fk shares. alike: correlation of successive
+    poses' own errors, 0 unless it is beyond chance; the covariance is wider for it. far (n,): the
+    size of each pose's own error, in sigmas of an axis. converged: whether another step would
+    change anything.
     """
 
     problem: Problem
     state: State
     covariance: Floats
-    squares: float
+    sizes: Floats
+    alike: float
+    far: Floats
     converged: bool
-    levels: Floats | None = None
 
 
-def refine_pixels(problem: Problem, X: Floats, Y: Floats) -> Refined:
-    """The most probable state of a problem, from a start X, Y that is roughly right."""
+def refine(problem: Problem, X: Floats, Y: Floats, measured: Floats) -> Refined:
+    """The most probable state of a problem, from a start X, Y that is roughly right.
+
+    measured (n, 4, 4): T_camera_board as each view by itself says, where the own errors start from.
+    """
     n, _, k = problem.shared.shape
-    start = State(X, Y, 1.0, np.zeros(6), np.zeros(k), np.zeros((n, 6)))
-    state, equations, converged = _minimise(problem, start)
-    noise = 1.0
-    if problem.fk is None:  # an error of the arm would count as noise: let the residuals say
-        noise = np.sqrt(equations.squares / problem.dof)
-    reduced = equations.reduced
-    if problem.arm is not None:  # priors are absolute, the rest is in units of the noise
-        reduced = reduced + (noise**2 - 1) * np.diag(problem.prior)
-    covariance = noise**2 * scaled_inverse(reduced)
-    return Refined(problem, state, covariance, equations.squares, converged)
+    state = State(X, Y, 1.0, np.zeros(6), np.zeros(k), np.zeros((n, 6)))
+    off = pose_difference(problem.camera_board(state), measured)
+    problem = problem.weighed(np.tile(np.eye(6), (n, 1, 1)))
+    scatter = _Scatter.of(problem, problem.with_own(state, off), np.zeros(0))
+    turn_shift = np.mean(off.reshape(n, 2, 3) ** 2, axis=(0, 2)) / 2 + LEAST_OWN[0, 0]
+    sizes = [*turn_shift, 1.0 if problem.own_root is not None else turn_shift[0]]
+    scatter = replace(scatter, sizes=np.array(sizes + [1.0] * problem.guessed))
+    for _ in range(SCATTER_ROUNDS):
+        before, scatter = scatter.sizes, scatter.estimated()
+        own = scatter.own + problem.own_parts(state)[0] + LEAST_OWN
+        problem = replace(problem.weighed(own), factor=scatter.factor)
+        state, converged = _minimise(problem, problem.with_own(state, off))
+        off, scatter = problem.own_twists(state), _Scatter.of(problem, state, scatter.sizes)
+        if np.allclose(before, scatter.sizes, rtol=2 * SETTLED, atol=0):
+            break
+    far, turns = scatter.whitened, problem.camera_board(state)[:, :3, :3]
+    in_board = np.einsum("nji,nkj->nki", turns, far.reshape(n, 2, 3)).reshape(n, 6)
+    alike = max(map(_alike, (far, in_board)))  # a camera that sinks, or a board that slides
+    student = stdtrit(scatter.dof, 0.975) / stdtrit(np.inf, 0.975)
+    wider = student * np.sqrt((1 + alike) / (1 - alike))
+    covariance = scatter.covariance * np.outer(wider, wider)
+    if n < FEWEST_TOLD:
+        covariance = np.diag(np.full(len(wider), np.inf))
+    each = np.sqrt(np.mean(far**2, axis=1))
+    return Refined(problem, state, covariance, np.sqrt(scatter.sizes), alike, each, converged)
 
 
-def _minimise(problem: Problem, state: State) -> tuple[State, Equations, bool]:
+def _alike(errors: Floats) -> float:
+    """The correlation of successive rows (n, 6), each of unit variance; 0 where chance does it."""
+    along = float(np.sum(errors[1:] * errors[:-1]) / max(np.sum(errors**2), 1e-300))
+    return along if along * np.sqrt(errors.size) > BEYOND_CHANCE else 0.0
+
+
+def _minimise(problem: Problem, state: State) -> tuple[State, bool]:
     equations = problem.equations(state)
     for _ in range(GAUSS_NEWTON_STEPS):
         change, own, decrease = equations.step()
         if decrease < NEGLIGIBLE_DECREASE:
-            return state, equations, True
+            return state, True
         for halving in range(STEP_HALVINGS):
             trial = problem.step(state, change / 2**halving, own / 2**halving)
             now = problem.squares(trial)
             if now <= equations.squares * (1 + 1e-14):
                 break
         else:
-            return state, equations, decrease < 1e-3
+            return state, decrease < 1e-3
         state, equations = trial, problem.equations(trial)
-    return state, equations, False
-
-
-def refine_poses(problem: Problem, X: Floats, Y: Floats) -> Refined:
-    """`refine_pixels` on poses, estimating how much their rotations and positions scatter.
-
-    Radians and metres must be weighed against each other. The weights are the scatter itself, one
-    standard deviation for the rotations and one for the positions, repeated until they stay.
-    Source: variance components, Förstner (1979).
-    """
-    poses = problem.views.poses  # type: ignore[union-attr]
-    n = len(poses)
-    levels = np.array([np.radians(0.1), 0.5e-3])
-    half_dof = max(1.0, 3 * n - 6 - problem.free_scale / 2)
-    for _ in range(LEVEL_ROUNDS):
-        weights = np.diag(np.repeat(levels**-2.0, 3))
-        views = PoseViews(poses, np.broadcast_to(weights, (n, 6, 6)))
-        refined = refine_pixels(replace(problem, views=views), X, Y)
-        X, Y = refined.state.X, refined.state.Y
-        predicted = refined.problem.camera_board(refined.state)
-        predicted[:, :3, 3] /= refined.state.scale
-        squares = (pose_difference(predicted, poses) ** 2).sum(axis=0).reshape(2, 3).sum(axis=1)
-        before, levels = levels, np.maximum(np.sqrt(squares / half_dof), [1e-9, 1e-9])
-        if np.allclose(before, levels, rtol=1e-3):
-            break
-    return replace(refined, levels=levels)
+    return state, False
 
 
 def arm_poses_with(refined: Refined, other: Problem) -> Floats:
@@ -365,7 +577,4 @@ def arm_poses_with(refined: Refined, other: Problem) -> Floats:
     the arm's shared errors were. What a pose has for itself (gear play) is not known there.
     """
     reported = other.reported(refined.state)
-    if other.fk is None:
-        return reported
-    state = replace(refined.state, own=np.zeros((len(reported), 6)))
-    return turned(reported, other.arm_twists(state))
+    return reported if other.fk is None else turned(reported, other.arm_twists(refined.state))

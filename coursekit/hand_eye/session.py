@@ -23,17 +23,17 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coursekit.arm import Arm, FkErrors, widowx
+from coursekit.arm import Arm, FkErrors, fk_covariance, widowx
 from coursekit.arrays import ArrayLike, Floats, Integers
 from coursekit.boards import Board, Detection, Detections, detect_all
 from coursekit.boards.board import Skipped
@@ -51,6 +51,7 @@ from coursekit.hand_eye.poses import (
     Mount,
     camera_board,
     check_poses,
+    first_alike,
     mean_pose,
     observability,
     stand_board,
@@ -62,6 +63,8 @@ METHODS = ("refine", *CLOSED_FORMS)
 POSES = "poses.csv"
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 OPTIONAL = {"times": ("time",), "q": JOINTS, "dq": VELOCITIES}
+REPEATS = "repeats"  # how the reason begins for which a pair is left out by `once`
+BELONGS = 0.03  # rad and m, between an arm pose and that of its joint angles: an arm may err so
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -136,6 +139,14 @@ class HandEyeSession:
         return self.seen
 
     @property
+    def has_its_joints(self) -> bool:
+        """Whether the joint angles are those of the arm poses, roughly; not of another arm."""
+        if self.q is None:
+            return False
+        off = np.abs(self.arm.forward(self.q) - self.T_base_gripper).max(axis=(1, 2))
+        return float(np.median(off)) < BELONGS
+
+    @property
     def corner_sigma_px(self) -> float:
         """Std of one corner coordinate, px, each image with a pose of its own: no arm is in it."""
         counts = np.array([len(seen.ids) for seen in self.detections or ()])
@@ -163,6 +174,33 @@ class HandEyeSession:
         names = tuple(self.names[i] for i in which)
         return replace(self, seen=seen, names=names, **rows)
 
+    @cached_property
+    def first_alike(self) -> Integers:
+        """Which pair (n,) each repeats: its own number where it repeats none before it."""
+        return first_alike(self.T_base_gripper, self.T_camera_board)
+
+    @property
+    def once(self) -> HandEyeSession:
+        """The session with equal or nearly equal pairs once; the others are in `skipped`.
+
+        A camera that runs while the arm stands makes many pairs of one pose, with one error.
+        """
+        counts = self.first_alike == np.arange(len(self))
+        if counts.all():
+            return self
+        repeats = [
+            Skipped(self.names[i], f"{REPEATS} {self.names[self.first_alike[i]]}")
+            for i in np.flatnonzero(~counts)
+        ]
+        return replace(self.pick(np.flatnonzero(counts)), skipped=(*self.skipped, *repeats))
+
+    @property
+    def repeated(self) -> str:
+        """In words: how many pairs repeated another and were left out by `once`; or ""."""
+        left_out = sum(skip.reason.startswith(REPEATS) for skip in self.skipped)
+        pairs = f"{left_out} of {left_out + len(self)} pairs repeat another pose"
+        return f"{pairs}: {len(self)} count" if left_out else ""
+
     def solve(self, method: str = "refine", **options: Any) -> HandEyeResult:
         """`hand_eye.solve` of this session; options as there."""
         return solve(self, method, **options)
@@ -174,6 +212,8 @@ class HandEyeSession:
         lines = [f"{self.mount}: {len(self)} arm poses and {', '.join(known)}"]
         if self.board is not None:
             lines.append(f"  {self.board.text}, squares of {1e3 * self.board.square_m:g} mm")
+        if self.q is not None and np.allclose(self.arm.forward(self.q), self.T_base_gripper):
+            lines.append(f"  poses computed with the {self.arm.name}'s kinematics")
         return "\n".join([*lines, *(f"  not used: {skip!r}" for skip in self.skipped)])
 
     # --- a folder ---
@@ -365,7 +405,8 @@ def _check_columns(columns: set[str]) -> None:
     if missing and not columns.issuperset(JOINTS):
         raise ValueError(
             f"folder: {POSES} has no column {missing[0]!r}, and not all of {', '.join(JOINTS)} "
-            "either: want a pose (m and a quaternion) or joint angles (rad)"
+            "either: want a pose (x, y, z with a quaternion or rx, ry, rz), or joint angles of the "
+            "WidowX AI (rad); those of another arm tell nothing here, its poses do"
         )
 
 
@@ -396,7 +437,7 @@ def solve(
     *,
     free_scale: bool = False,
     free_offsets: bool = False,
-    fk: FkErrors | None = None,
+    fk: FkErrors | Literal["usual"] | None = "usual",
     guess: ArrayLike | None = None,
 ) -> HandEyeResult:
     """Where the camera is, from arm poses and what the camera saw at each.
@@ -411,10 +452,13 @@ def solve(
     where no detections are given), "closed_form" (rotation first, then translation), OpenCV's
     "tsai", "park", "horaud", "andreff", "daniilidis", and its robot-world "shah", "li".
 
-    With "refine" only: free_scale also estimates how much larger the board is than it says;
-    free_offsets also estimates the offsets of the session's joint angles; fk weighs the arm's
-    errors (`arm.fk_covariance` at the session's q). guess (4, 4): an X to start from, in place of
-    the closed form.
+    How far arm and images disagree from pose to pose is estimated, and is in every interval; equal
+    or nearly equal pairs count once. With "refine" only: free_scale also estimates how much larger
+    the board is than it says; free_offsets also estimates the offsets of the session's joint
+    angles. fk: what the arm errs by in all poses alike: errors whose sizes are known
+    (`arm.fk_covariance` at the session's q), None for none, or "usual": those of `ArmErrors`, as
+    large as the session shows them to be, where the arm poses are those of its joint angles. guess
+    (4, 4): an X to start from, in place of the closed form.
 
     Raises ValueError that names the argument for fewer than three poses and for images without a
     pose; NotDetermined where the arm did not turn about two axes; SolverFailed where a solver's
@@ -426,27 +470,36 @@ def solve(
     array([0., 0., 0.])
     """
     choice("method", method, METHODS)
-    asked = {"free_scale": free_scale, "free_offsets": free_offsets, "fk": fk, "guess": guess}
+    stated = fk if isinstance(fk, FkErrors) else None
+    asked = {"free_scale": free_scale, "free_offsets": free_offsets, "fk": stated, "guess": guess}
     for name, value in asked.items():
         refined = value is None or value is False or method == "refine"
         want(refined, "method", method, f"'refine' with {name}: a closed form has none")
-    n = len(session)
-    want(n >= FEWEST_POSES, "T_base_gripper", n, f"at least {FEWEST_POSES} poses")
     want(not free_offsets or session.q is not None, "q", None, "joint angles, to free_offsets")
-    if fk is not None:
+    if stated is not None:
+        n = len(session)
         want(session.detections is not None, "seen", "poses", "detections, to weigh fk against")
-        want(fk.each.shape == (n, 6, 6), "fk", fk.each.shape, f"({n}, 6, 6), one an arm pose")
+        want(stated.each.shape == (n, 6, 6), "fk", stated.each.shape, f"({n}, 6, 6), one a pose")
+        counts = session.first_alike == np.arange(n)
+        stated = replace(stated, shared=stated.shared[counts], each=stated.each[counts])
+    session = session.once
+    n = len(session)
+    want(n >= FEWEST_POSES, "T_base_gripper", n, f"at least {FEWEST_POSES} poses that differ")
     first = "closed_form" if method == "refine" else method
     X, Y, measured = _first(session, first, None if guess is None else transform("guess", guess))
     if method != "refine":
         return HandEyeResult(X, Y, method, session, measured)
     arm, q = (session.arm, session.q) if free_offsets else (None, None)
-    seen: views.Views = views.PoseViews(measured, np.zeros((0, 6, 6)))
-    fit = refinement.refine_poses
+    seen: views.Views = views.PoseViews(measured, np.zeros((n, 6, 6)))
     if session.detections is not None:
-        seen, fit = session.corners(session.corner_sigma_px), refinement.refine_pixels
+        seen = session.corners(session.corner_sigma_px)
+    usual = fk == "usual" and not free_offsets and session.has_its_joints
+    if usual:
+        stated = fk_covariance(session.q, arm=session.arm)  # type: ignore[arg-type]
+        stated = replace(stated, each=np.zeros_like(stated.each))  # estimated
     given = session.T_base_gripper, session.mount, seen
-    best = fit(refinement.Problem(*given, free_scale, arm, q, fk), X, Y)
+    problem = refinement.Problem(*given, free_scale, arm, q, stated, usual)
+    best = refinement.refine(problem, X, Y, measured)
     return HandEyeResult(best.state.X, best.state.Y, method, session, measured, best)
 
 
@@ -475,11 +528,46 @@ def _first(
 # --- what the result says ---
 
 GOOD_MM, USABLE_MM = 2.0, 5.0  # 95 %, worst direction, lever arm included
-CONSISTENT_P = 0.001  # less likely than this, arm and images disagree by more than chance
-STATED_EXCESS = 4.0  # a unit of an arm may have twice the gear play of most: still as stated
+# Between arm and images, rms over the poses: more than arms that stand still are off, and more than
+# any that works.
+LARGE_MM, LARGE_DEG, BROKEN_MM, BROKEN_DEG = 5.0, 1.0, 20.0, 3.0
+FAR_OUT = 10.0  # times the typical pose's error: no tail of a working arm reaches there
 UNKNOWN_DEG, UNKNOWN_MM = 90.0, 1e3  # what is known no better is not known
 GOOD_POSES = 15
 GOOD_TURN_DEG = 15.0  # rms about the second axis: +-25 deg or so
+
+
+@dataclass(frozen=True)
+class Trust:
+    """How far to trust a result: what its repr, its `verdict()` and `diagnose` have in common.
+
+    worst_mm: the 95 % interval, worst direction, of where X puts a point `LEVER_M` in front of the
+    camera; infinite where the data cannot tell. weak: what could be better, in sentences. large:
+    that arm and images disagree by more than they should, "" where they do not. broken: why the
+    intervals are not to be trusted; () where they are.
+    """
+
+    worst_mm: float
+    weak: tuple[str, ...] = ()
+    large: str = ""
+    broken: tuple[str, ...] = ()
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the intervals hold what they should."""
+        return not self.broken
+
+    @property
+    def grade(self) -> str:
+        """In a word or four."""
+        if self.broken:
+            return "Not to be trusted"
+        if math.isinf(self.worst_mm):
+            return "Cannot be told"
+        if self.worst_mm > USABLE_MM:
+            return "Not good enough"
+        careful = self.weak or self.large or self.worst_mm > GOOD_MM
+        return "Usable with care" if careful else "Good"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -554,8 +642,8 @@ class HandEyeResult(Estimate):
 
     @property
     def dof(self) -> float:
-        """Degrees of freedom; infinite with `fk`, whose priors fix the scale of the noise."""
-        return math.inf if self._fit.problem.fk is not None else self._fit.problem.dof
+        """Infinite: the covariance is already widened for few poses."""
+        return math.inf
 
     @property
     def scale(self) -> float:
@@ -633,33 +721,6 @@ class HandEyeResult(Estimate):
         """Root mean square angle at the gripper between what arm and camera say, deg."""
         return math.degrees(views.rms_length(self.gripper_twists[:, :3]))
 
-    @property
-    def excess(self) -> float:
-        """How far arm and images disagree: variance over what noise and stated errors explain.
-
-        About 1 where all is as stated. The corners' noise is measured with a pose for each image
-        alone, no arm in it; ValueError where there are no corners.
-        """
-        self.session.corners()
-        return max(0.0, self._fit.squares - self._degrees[1]) / self._degrees[0]
-
-    @property
-    def _degrees(self) -> tuple[int, int]:
-        """Numbers that tie images to the arm, six a pose, less those that X, Y and scale took; and
-        those left within the images."""
-        problem, ties = self._fit.problem, 6 * len(self.session)
-        return max(1, ties - 12 - problem.free_scale), max(1, problem.views.observations - ties)
-
-    @property
-    def consistency_p_value(self) -> float:
-        """How often chance alone gives such an `excess`; small where something errs unstated.
-
-        With `fk` it is rough: how much play a unit has differs from unit to unit.
-        """
-        from scipy.stats import f  # two seconds to load; a camera's first frame needs none of it
-
-        return float(f.sf(self.excess, *self._degrees))
-
     # --- in words ---
 
     @cached_property
@@ -667,14 +728,62 @@ class HandEyeResult(Estimate):
         """What the arm poses leave undetermined, in words; solvers return something anyway."""
         return observability(self.session.T_base_gripper, self.mount).free
 
+    @cached_property
+    def judgement(self) -> Trust:
+        """How far to trust X, and why; of a closed form only what its poses and residuals say."""
+        known = observability(self.session.T_base_gripper, self.mount)
+        weak = [f"{direction}: the poses do not determine it." for direction in known.free]
+        weak += [f"{self.session.repeated}."] * bool(self.session.repeated)
+        if known.poses < GOOD_POSES:
+            weak.append(f"{known.poses} poses are few: take 15 to 30.")
+        if known.turns_deg[1] < GOOD_TURN_DEG:
+            weak.append(
+                f"about its second axis the wrist turned by {known.turns_deg[1]:.0f} deg (rms) "
+                "only: turn it by 30 deg or more about two axes."
+            )
+        if self.refined is not None and self.refined.alike:
+            weak.append(
+                f"successive poses err alike (correlation {self.refined.alike:.1f}): something "
+                "moved slowly (camera, board, base), or the arm's error follows its pose. The "
+                "intervals are wider for it."
+            )
+        worst = self.quantile() * self.reach_sigma_mm if self.refined is not None else math.inf
+        return Trust(worst, tuple(weak), self._disagreement(), tuple(self._broken()))
+
+    def _disagreement(self) -> str:
+        """That arm and images disagree by more than arms that stand still do, or ""."""
+        mm, deg = self.spread_gripper_mm, self.spread_gripper_deg
+        if mm <= LARGE_MM and deg <= LARGE_DEG:
+            return ""
+        return (
+            f"arm and images disagree by {mm:.1f} mm and {deg:.2f} deg at the gripper, more than "
+            "arms that stand still are off: did arm and camera rest when both were read, and does "
+            "each image have its own pose?"
+        )
+
+    def _broken(self) -> Iterator[str]:
+        """Why the intervals are not to be trusted."""
+        if self.refined is None:
+            return
+        if not self.refined.converged:
+            yield "the refinement did not converge: are some pairs of pose and image wrong?"
+        if self.spread_gripper_mm > BROKEN_MM or self.spread_gripper_deg > BROKEN_DEG:
+            yield "no working arm is off by so much: `hand_eye.diagnose` looks for the reason."
+        far = self.refined.far
+        odd = np.flatnonzero(far > FAR_OUT * np.median(far))
+        if len(odd):
+            names = ", ".join(self.session.names[i] for i in odd)
+            yield f"{names}: off by {FAR_OUT:.0f} times as much as the typical pair or more: wrong?"
+
     def __repr__(self) -> str:
         name_X, name_Y = FRAMES[self.mount]
         detections, fit = self.session.detections, self.refined
         corners = pixels = ""
         if detections is not None:
             corners = f", {sum(len(seen.ids) for seen in detections)} corners"
-            pixels = f"{self.rms_px:.2f} px, "
-        unsure = "; NOT CONVERGED" if fit is not None and not fit.converged else ""
+            behind = "the board would be behind the camera, "
+            pixels = f"{self.rms_px:.2f} px, " if math.isfinite(self.rms_px) else behind
+        unsure = "" if self.judgement.trusted else "; NOT TO BE TRUSTED, see verdict()"
         lines = [
             f"{self.mount}, {self.method}, {len(self.session)} poses{corners}{unsure}",
             self._pose_line(name_X, self.X, 0),
@@ -683,10 +792,12 @@ class HandEyeResult(Estimate):
         for name in self.names[12:] if fit is not None else ():
             value, half = self.value(name), self.quantile() * self.sigma(name)
             if name == "scale":
-                lines.append(f"scale = {value:.5f} ± {half:.5f} (95 %)")
+                lines.append(f"scale = {value:.5f} ± {half:.5f}{self._level}")
             elif name.startswith("offset_"):
                 value, half = math.degrees(value), math.degrees(half)
-                lines.append(f"{name} = {value:.3f} ± {half:.3f} deg (95 %)")
+                lines.append(f"{name} = {value:.3f} ± {half:.3f} deg{self._level}")
+        if self.session.repeated:
+            lines.append(self.session.repeated)
         if self.free:
             lines.append(wrapped(f"NOT DETERMINED: {'; '.join(self.free)}", indent=""))
         lines.append(f"residuals: {pixels}{self.rms_mm:.2f} mm at the board (rms)")
@@ -700,74 +811,58 @@ class HandEyeResult(Estimate):
         """A pose with its intervals; first: where its twist begins in the covariance."""
         place, turns = 1e3 * T[:3, 3] + 0.0, Rotation.from_matrix(T[:3, :3]).as_rotvec() + 0.0
         turned = "turned ({:.2f}, {:.2f}, {:.2f})".format(*(np.degrees(turns) + 0.0))
+        one = f"({', '.join(f'{p:.2f}' for p in place)}) mm, {turned} deg"
         if self.refined is None:
-            return f"{name}: ({', '.join(f'{p:.2f}' for p in place)}) mm, {turned} deg"
+            return f"{name}: {one}"
+        if len(self.session) < refinement.FEWEST_TOLD:
+            return f"{name}: {one};\n  {self._untold}"
         sigma = self.quantile() * np.sqrt(np.diag(self.covariance)[first : first + 6])
         wide, far = np.degrees(sigma[:3].max()), 1e3 * sigma[3:]
         if wide > UNKNOWN_DEG or far.max() > UNKNOWN_MM:
             one = "({:.0f}, {:.0f}, {:.0f}) mm".format(*place)
             return f"{name}: unknown in part; one that fits: {one}"
         where = ", ".join(f"{p:.2f} ± {s:.2f}" for p, s in zip(place, far, strict=True))
-        return f"{name}: ({where}) mm,\n  {turned} ± {wide:.3f} deg (95 %)"
+        return f"{name}: ({where}) mm,\n  {turned} ± {wide:.3f} deg{self._level}"
+
+    @property
+    def _level(self) -> str:
+        """What an interval holds, said only where it does."""
+        return " (95 %)" if self.judgement.trusted else ""
+
+    @property
+    def _untold(self) -> str:
+        poses, least = len(self.session), refinement.FEWEST_TOLD
+        return f"how far off it is cannot be told from {poses} poses, {least} is the least"
 
     def verdict(self) -> str:
         """In words: how far to trust X, and what to do about what is weak."""
-        known = observability(self.session.T_base_gripper, self.mount)
-        weak = [f"{direction}: the poses do not determine it." for direction in known.free]
-        if known.poses < GOOD_POSES:
-            weak.append(f"{known.poses} poses are few: take 15 to 30.")
-        if known.turns_deg[1] < GOOD_TURN_DEG:
-            weak.append(
-                f"about its second axis the wrist turned by {known.turns_deg[1]:.0f} deg (rms) "
-                "only: turn it by 30 deg or more about two axes."
-            )
-        weak += self._inconsistent()
-        if self.refined is not None and not self.refined.converged:
-            weak.append("the refinement did not converge: are some pairs of pose and image wrong?")
-        lines = [self._head(bool(weak)), *(f"- {reason}" for reason in weak)]
-        return "\n".join(map(wrapped, lines))
+        judged = self.judgement
+        reasons = [*([judged.large] if judged.large else []), *judged.broken, *judged.weak]
+        return "\n".join(map(wrapped, [self._head(), *(f"- {reason}" for reason in reasons)]))
 
-    def _head(self, weak: bool) -> str:
+    def _head(self) -> str:
         """The finding in a sentence or two."""
         if self.refined is None:
             return (
                 f"Uncertain: {self.method} says nothing about its own error. Solve with 'refine' "
                 "for an interval."
             )
-        worst = self.quantile() * self.reach_sigma_mm
-        if self.free or worst > USABLE_MM:
-            grade = "Not good enough"
-        elif self._inconsistent():
-            grade = "Not to be trusted"
-        else:
-            grade = "Usable with care" if weak or worst > GOOD_MM else "Good"
-        at_its_word = self.refined.problem.fk is None
+        judged = self.judgement
+        if not judged.trusted:
+            return f"{judged.grade}: the intervals hold for sessions without such faults only."
+        if math.isinf(judged.worst_mm):
+            return f"{judged.grade} how good it is: {self._untold}."
         return (
-            f"{grade}: a point {1e3 * LEVER_M:.0f} mm in front of the camera is placed within "
-            f"± {worst:.1f} mm (95 %, worst direction), as far as the mount goes."
-            + " That takes the arm at its word: an arm's own error comes on top."
-            * at_its_word
+            f"{judged.grade}: a point {1e3 * LEVER_M:.0f} mm in front of the camera is placed "
+            f"within ± {judged.worst_mm:.1f} mm (95 %, worst direction), as far as the mount goes."
         )
 
     @property
     def reach_sigma_mm(self) -> float:
         """Standard deviation, mm, worst direction, of where X puts a point `LEVER_M` ahead."""
+        if not np.isfinite(self.covariance).all():
+            return math.inf
         by_turn = np.cross(np.eye(3), self.X[:3, 2] * LEVER_M).T  # omega moves it by omega x lever
         by_twist = np.hstack([by_turn, np.eye(3)])
         spread = by_twist @ self.covariance[:6, :6] @ by_twist.T
         return 1e3 * float(np.sqrt(np.linalg.eigvalsh(spread)[-1]))
-
-    def _inconsistent(self) -> list[str]:
-        """That arm and images disagree by more than chance, [] where they do not."""
-        if self.refined is None or self.session.detections is None:
-            return []
-        stated = self.refined.problem.fk is not None
-        if self.consistency_p_value > CONSISTENT_P or (stated and self.excess < STATED_EXCESS):
-            return []
-        said = "more than was stated (fk)" if stated else "which was taken as exact"
-        return [
-            f"arm and images disagree by {self.spread_gripper_mm:.1f} mm and "
-            f"{self.spread_gripper_deg:.2f} deg at the gripper, more than the corners' noise "
-            f"explains: the arm errs, {said}, or a pair is wrong. The intervals are too narrow "
-            "then."
-        ]

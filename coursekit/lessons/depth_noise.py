@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from typing import Any
 
@@ -16,26 +16,6 @@ from coursekit.lessons.exercises import Exercise, Model, Step
 Bounds = tuple[int, int, int, int]  # first row, the one after the last; the same for columns
 
 # --- depth_noise ---
-
-
-def _square(Z: Any) -> Any:
-    return Z**2
-
-
-def _constant(fx: float, baseline: float) -> float:
-    return fx * baseline
-
-
-def _divide(power: Any, constant: float) -> Any:
-    return power / constant
-
-
-def _times(slope: Any, sigma_d: float, Z: Any) -> Any:
-    return slope * sigma_d
-
-
-def _as_it_is(value: Any) -> Any:
-    return value
 
 
 def _build_depth_noise(steps: Mapping[str, Step]) -> Model:
@@ -56,11 +36,11 @@ DEPTH_NOISE = Exercise(
     name="depth_noise.depth_noise",
     build=_build_depth_noise,
     steps={
-        "power": _square,
-        "constant": _constant,
-        "divide": _divide,
-        "noise": _times,
-        "result": _as_it_is,
+        "power": lambda Z: Z**2,
+        "constant": lambda fx, baseline: fx * baseline,
+        "divide": lambda power, constant: power / constant,
+        "noise": lambda slope, sigma_d, Z: slope * sigma_d,
+        "result": lambda sigma: sigma,
     },
     cases=[
         (0.4, 447.0, 0.05, 0.08),
@@ -77,209 +57,50 @@ DEPTH_NOISE = Exercise(
 )
 
 
-@DEPTH_NOISE.mistake("power")
-def linear_in_Z(Z: Any) -> Any:
-    """your noise grows in proportion to Z
-
-    At 1 m the disparity is half of what it is at 0.5 m. Differentiate fx B / d: which power of d is
-    left, and how many powers of Z is that?
-    """
-    return Z
-
-
-@DEPTH_NOISE.mistake("power", same_as=linear_in_Z)
-def derivative_of_square(Z: Any) -> Any:
-    return 2 * Z
-
-
-@DEPTH_NOISE.mistake("power")
-def cubed(Z: Any) -> Any:
-    """your noise grows as the third power of Z
-
-    Twice as far: how many times the noise does yours give, and how many should it be?
-    """
-    return Z**3
-
-
-@DEPTH_NOISE.mistake("constant")
-def millimetres(fx: float, baseline: float) -> float:
-    """millimetres and metres are mixed: the result is off by a factor 1000
-
-    Z and the baseline come in metres and the result leaves in metres. Which of your lines needs a
-    1000?
-    """
-    return fx * baseline * 1000
-
-
-@DEPTH_NOISE.mistake("constant", same_as=millimetres)
-def baseline_through_thousand(fx: float, baseline: float) -> float:
-    return fx * baseline / 1000
-
-
-@DEPTH_NOISE.mistake("constant")
-def baseline_forgotten(fx: float, baseline: float) -> float:
-    """the baseline is not used
-
-    Two cameras with the same lens, one with its eyes ten times as far apart: does your function see
-    any difference?
-    """
-    return fx
-
-
-@DEPTH_NOISE.mistake("constant")
-def fx_forgotten(fx: float, baseline: float) -> float:
-    """fx is not used
-
-    What is the unit of your result? The pixels of sigma_d have to cancel against something.
-    """
-    return baseline
-
-
-@DEPTH_NOISE.mistake("constant")
-def constant_forgotten(fx: float, baseline: float) -> float:
-    """neither fx nor the baseline is used
-
-    Z² sigma_d has the unit m² px. What has to stand below it to leave metres?
-    """
-    return 1.0
-
-
 @cache
 def _notebooks_baseline() -> float:
     """The simulated camera's, which the notebook calls B, m."""
     return specifications.device("D435").unit.baseline_m
 
 
-@DEPTH_NOISE.mistake("constant")
-def other_baseline(fx: float, baseline: float) -> float:
-    """the baseline is a number of your own: B is this notebook's, the argument is called `baseline`
+def _difference(between: Callable[[Any], Any]) -> Step:
+    """A difference of depths, which is the law's noise / between(noise / Z)."""
 
-    A D405 has its eyes 18 mm apart. What does your function return for it?
-    """
-    return fx * _notebooks_baseline()
+    def noise(slope: Any, sigma_d: float, Z: Any) -> Any:
+        law = slope * sigma_d
+        return law / between(law / Z)
 
-
-@DEPTH_NOISE.mistake("constant", same_as=other_baseline)
-def baseline_of_the_data_sheet(fx: float, baseline: float) -> float:
-    return fx * 0.050
+    return noise
 
 
-@DEPTH_NOISE.mistake("divide")
-def multiplied(power: Any, constant: float) -> Any:
-    """you multiply by fx B where you should divide by it
-
-    A longer baseline sees a larger disparity. Does that make depth worse, as yours says?
-    """
-    return power * constant
-
-
-@DEPTH_NOISE.mistake("constant")
-def baseline_behind_the_fraction(fx: float, baseline: float) -> float:
-    """the baseline multiplies where it should divide
-
-    Python reads a / b * c as (a / b) * c. On which side of your fraction does B end up?
-    """
-    return fx / baseline
-
-
-@DEPTH_NOISE.mistake("constant")
-def focal_length_behind_the_fraction(fx: float, baseline: float) -> float:
-    """fx multiplies where it should divide
-
-    Python reads a / b * c as (a / b) * c. On which side of your fraction does fx end up?
-    """
-    return baseline / fx
-
-
-@DEPTH_NOISE.mistake("divide")
-def upside_down(power: Any, constant: float) -> Any:
-    """the slope is upside down: that is how disparity changes with depth
-
-    You know the noise of the disparity and want that of Z. Is that dZ/dd or dd/dZ?
-    """
-    return constant / power
-
-
-@DEPTH_NOISE.mistake("noise")
-def noise_divided(slope: Any, sigma_d: float, Z: Any) -> Any:
-    """you divide by sigma_d where you should multiply by it
-
-    A matcher that is twice as noisy: does your depth get better?
-    """
-    return slope / sigma_d
-
-
-@DEPTH_NOISE.mistake("noise")
-def noise_forgotten(slope: Any, sigma_d: float, Z: Any) -> Any:
-    """sigma_d is not used: this is the depth error of a whole pixel of disparity
-
-    By how many pixels is the matcher off?
-    """
-    return slope
-
-
-@DEPTH_NOISE.mistake("noise")
-def root_of_two(slope: Any, sigma_d: float, Z: Any) -> Any:
-    """there is a factor √2 too many
-
-    sigma_d is the noise of the *difference* of two positions. Whose errors are in it already?
-    """
-    return math.sqrt(2) * slope * sigma_d
-
-
-@DEPTH_NOISE.mistake("noise")
-def difference(slope: Any, sigma_d: float, Z: Any) -> Any:
-    """this is a difference of two depths; the law is the slope times sigma_d
-
-    Double sigma_d: does your result double exactly? Differentiate fx B / d by hand.
-    """
-    noise = slope * sigma_d  # fx B / (d - sigma_d) - Z
-    return noise / (1 - noise / Z)
-
-
-@DEPTH_NOISE.mistake("noise", same_as=difference)
-def backward_difference(slope: Any, sigma_d: float, Z: Any) -> Any:
-    noise = slope * sigma_d  # Z - fx B / (d + sigma_d)
-    return noise / (1 + noise / Z)
-
-
-@DEPTH_NOISE.mistake("noise", same_as=difference)
-def central_difference(slope: Any, sigma_d: float, Z: Any) -> Any:
-    noise = slope * sigma_d  # half of fx B / (d - sigma_d) - fx B / (d + sigma_d)
-    return noise / (1 - (noise / Z) ** 2)
-
-
-@DEPTH_NOISE.mistake("noise", same_as=difference)
-def central_difference_of_halves(slope: Any, sigma_d: float, Z: Any) -> Any:
-    noise = slope * sigma_d  # fx B / (d - sigma_d / 2) - fx B / (d + sigma_d / 2)
-    return noise / (1 - (noise / Z / 2) ** 2)
-
-
-@DEPTH_NOISE.mistake("result")
-def variance(sigma: Any) -> Any:
-    """this is the variance, and the standard deviation is wanted
-
-    What is the unit of your result, m or m²?
-    """
-    return sigma**2
-
-
-@DEPTH_NOISE.mistake("result")
-def root(sigma: Any) -> Any:
-    """a root is taken that nobody needs
-
-    sigma_d is a standard deviation already. What is a slope times a standard deviation?
-    """
-    return np.sqrt(sigma)
-
-
-@DEPTH_NOISE.mistake("result")
-def negative(sigma: Any) -> Any:
-    """the standard deviation is negative
-
-    The slope dZ/dd is negative. Does a spread have a sign?
-    """
-    return -sigma
+DEPTH_NOISE.add_mistakes(
+    ("power", "linear_in_Z", lambda Z: Z),
+    ("power", "linear_in_Z", lambda Z: 2 * Z),
+    ("power", "cubed", lambda Z: Z**3),
+    ("constant", "millimetres", lambda fx, baseline: fx * baseline * 1000),
+    ("constant", "millimetres", lambda fx, baseline: fx * baseline / 1000),
+    ("constant", "baseline_forgotten", lambda fx, baseline: fx),
+    ("constant", "fx_forgotten", lambda fx, baseline: baseline),
+    ("constant", "constant_forgotten", lambda fx, baseline: 1.0),
+    ("constant", "other_baseline", lambda fx, baseline: fx * _notebooks_baseline()),
+    ("constant", "other_baseline", lambda fx, baseline: fx * 0.050),
+    ("divide", "multiplied", lambda power, constant: power * constant),
+    ("constant", "baseline_behind_the_fraction", lambda fx, baseline: fx / baseline),
+    ("constant", "focal_length_behind_the_fraction", lambda fx, baseline: baseline / fx),
+    ("divide", "upside_down", lambda power, constant: constant / power),
+    ("noise", "noise_divided", lambda slope, sigma_d, Z: slope / sigma_d),
+    ("noise", "noise_forgotten", lambda slope, sigma_d, Z: slope),
+    ("noise", "root_of_two", lambda slope, sigma_d, Z: math.sqrt(2) * slope * sigma_d),
+    # fx B / (d - sigma_d) - Z; Z - fx B / (d + sigma_d); half of the two together; and the same
+    # with half of sigma_d to each side.
+    ("noise", "difference", _difference(lambda part: 1 - part)),
+    ("noise", "difference", _difference(lambda part: 1 + part)),
+    ("noise", "difference", _difference(lambda part: 1 - part**2)),
+    ("noise", "difference", _difference(lambda part: 1 - (part / 2) ** 2)),
+    ("result", "variance", lambda sigma: sigma**2),
+    ("result", "root", np.sqrt),
+    ("result", "negative", lambda sigma: -sigma),
+)
 
 
 # --- robust_depth ---
@@ -303,40 +124,26 @@ IMAGE = _depth_image()
 IMAGE.setflags(write=False)
 
 
-def _column_and_row(u: float, v: float) -> Any:
-    return u, v
-
-
-def _no_shortcut(image: Floats, row: int, column: int) -> Any:
-    return None
-
-
-def _nearest(coordinate: float) -> int:
-    return round(coordinate)
-
-
 def _window(row: int, column: int, half: int) -> Bounds:
     return row - half, row + half + 1, column - half, column + half + 1
 
 
-def _cut(image: Floats, top: int, bottom: int, left: int, right: int) -> Floats:
-    return image[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)]
+def _cut(rows: Step, columns: Step | None = None) -> Step:
+    """Cuts a window out of an image: what gives the indices of an axis from (start, stop, size)."""
+
+    def cut(image: Floats, top: int, bottom: int, left: int, right: int) -> Any:
+        height, width = image.shape
+        return image[rows(top, bottom, height)][:, (columns or rows)(left, right, width)]
+
+    return cut
 
 
-def _without_zeros(pixels: Floats) -> Floats:
-    return pixels[pixels != 0]
+def _inside(start: int, stop: int, size: int) -> slice:
+    return slice(max(start, 0), max(stop, 0))
 
 
-def _finite(pixels: Floats) -> Floats:
-    return pixels[np.isfinite(pixels)]
-
-
-def _enough(valid: Floats, pixels: Floats, min_valid: int) -> bool:
-    return len(valid) >= min_valid
-
-
-def _nan() -> float:
-    return math.nan
+def _as_they_come(start: int, stop: int, size: int) -> slice:
+    return slice(start, stop)
 
 
 def _build_robust_depth(steps: Mapping[str, Step]) -> Model:
@@ -361,21 +168,21 @@ def _describe_robust_depth(args: tuple[Any, ...]) -> str:
     text = f"a {2 * half + 1}x{2 * half + 1} window about (u, v) = ({u:g}, {v:g}) px"
     if len(args) > 4:
         text += f", min_valid = {args[4]}"
-    top, bottom, left, right = _window(_nearest(v), _nearest(u), half)
+    top, bottom, left, right = _window(round(v), round(u), half)
     cut_at = {
         "top": top < 0,
         "bottom": bottom > image.shape[0],
         "left": left < 0,
         "right": right > image.shape[1],
     }
-    pixels = _cut(image, top, bottom, left, right)
+    pixels = _cut(_inside)(image, top, bottom, left, right)
     if pixels.size == 0:
         return f"{text}, all of it off the image"
     if any(cut_at.values()):
         borders = " and ".join(name for name, cut in cut_at.items() if cut)
         text += f", cut off at the {borders} border"
     kinds = {
-        "valid": len(_finite(_without_zeros(pixels))),
+        "valid": int((np.isfinite(pixels) & (pixels != 0)).sum()),
         "zero": int((pixels == 0).sum()),
         "NaN": int(np.isnan(pixels).sum()),
         "infinite": int(np.isinf(pixels).sum()),
@@ -388,15 +195,15 @@ ROBUST_DEPTH = Exercise(
     name="depth_noise.robust_depth",
     build=_build_robust_depth,
     steps={
-        "read": _column_and_row,
-        "round": _nearest,
-        "shortcut": _no_shortcut,
+        "read": lambda u, v: (u, v),
+        "round": round,
+        "shortcut": lambda image, row, column: None,
         "window": _window,
-        "cut": _cut,
-        "zeros": _without_zeros,
-        "finite": _finite,
-        "enough": _enough,
-        "none": _nan,
+        "cut": _cut(_inside),
+        "zeros": lambda pixels: pixels[pixels != 0],
+        "finite": lambda pixels: pixels[np.isfinite(pixels)],
+        "enough": lambda valid, pixels, min_valid: len(valid) >= min_valid,
+        "none": lambda: math.nan,
         "middle": lambda valid: float(np.median(valid)),
     },
     cases=[
@@ -431,264 +238,57 @@ ROBUST_DEPTH = Exercise(
 )
 
 
-@ROBUST_DEPTH.mistake("read")
-def u_v_swapped(u: float, v: float) -> Any:
-    """u and v are swapped
-
-    u counts columns and v counts rows. Which of them does a NumPy index take first?
-    """
-    return v, u
-
-
-@ROBUST_DEPTH.mistake("round")
-def truncated(coordinate: float) -> int:
-    """the pixel is truncated instead of rounded
-
-    (0, 0) is the centre of a pixel. Which pixel is 3.7 in?
-    """
-    return int(coordinate)
-
-
-@ROBUST_DEPTH.mistake("window")
-def last_missing(row: int, column: int, half: int) -> Bounds:
-    """your window lacks its last row and column
-
-    A slice stops before its end index. How many pixels lie between `v - half` and `v + half`?
-    """
-    return row - half, row + half, column - half, column + half
-
-
-@ROBUST_DEPTH.mistake("window")
-def half_ignored(row: int, column: int, half: int) -> Bounds:
-    """your window does not depend on `half`
-
-    What does your function do when somebody asks for half = 1?
-    """
-    return _window(row, column, 2)
-
-
-@ROBUST_DEPTH.mistake("window")
-def half_halved(row: int, column: int, half: int) -> Bounds:
-    """your window reaches only `half // 2` pixels to each side
-
-    `half = 2` makes a window of 5x5. How many pixels does yours have?
-    """
-    return _window(row, column, half // 2)
-
-
-@ROBUST_DEPTH.mistake("shortcut")
-def pixel_alone(image: Floats, row: int, column: int) -> Any:
-    """where the pixel itself has a depth, you return that alone
-
-    A flying pixel has a depth, too. Who would notice?
-    """
+def _pixel_alone(image: Floats, row: int, column: int) -> Any:
     height, width = image.shape
     inside = 0 <= row < height and 0 <= column < width
     return image[row, column] if inside and 0 < image[row, column] < math.inf else None
 
 
-@ROBUST_DEPTH.mistake("shortcut", same_as=pixel_alone)
-def pixel_alone_unless_zero(image: Floats, row: int, column: int) -> Any:
+def _pixel_alone_unless_zero(image: Floats, row: int, column: int) -> Any:
     height, width = image.shape
     known = -height <= row < height and -width <= column < width  # -9 counts from the far end
     return image[row, column] if known and image[row, column] > 0 else None
 
 
-@ROBUST_DEPTH.mistake("cut")
-def negative_index(image: Floats, top: int, bottom: int, left: int, right: int) -> Floats:
-    """near the left or top border an index goes negative, and Python counts that from the far end
-
-    Try a list of ten numbers: what is `numbers[-2:3]`, and what is `numbers[-2]`?
-    """
-    return image[top:bottom, left:right]
+def _moved(start: int, stop: int, size: int) -> slice:
+    first = min(max(start, 0), size - (stop - start))
+    return slice(first, first + stop - start)
 
 
-@ROBUST_DEPTH.mistake("cut", same_as=negative_index)
-def negative_row(image: Floats, top: int, bottom: int, left: int, right: int) -> Floats:
-    return image[top:bottom, max(left, 0) : max(right, 0)]
-
-
-@ROBUST_DEPTH.mistake("cut", same_as=negative_index)
-def negative_column(image: Floats, top: int, bottom: int, left: int, right: int) -> Floats:
-    return image[max(top, 0) : max(bottom, 0), left:right]
-
-
-@ROBUST_DEPTH.mistake("cut", same_as=negative_index)
-def wrapped_pixel_by_pixel(image: Floats, top: int, bottom: int, left: int, right: int) -> Floats:
+def _height_width_swapped(image: Floats, top: int, bottom: int, left: int, right: int) -> Any:
     height, width = image.shape
-    return image[np.ix_(range(top, min(bottom, height)), range(left, min(right, width)))]
+    return _cut(_inside)(image, top, min(bottom, width), left, min(right, height))
 
 
-@ROBUST_DEPTH.mistake("cut")
-def negative_end(image: Floats, top: int, bottom: int, left: int, right: int) -> Floats:
-    """a window left of the image or above it has a negative *end*, and that wraps round, too
-
-    You have looked after the first index of each slice. Where is the last one when u = -9?
-    """
-    return image[max(top, 0) : bottom, max(left, 0) : right]
-
-
-@ROBUST_DEPTH.mistake("cut")
-def moved_inside(image: Floats, top: int, bottom: int, left: int, right: int) -> Floats:
-    """at the border you move the window into the image instead of cutting it off
-
-    Is the pixel that was asked for still in the middle of what is there to see around it?
-    """
-    row = min(max(top, 0), image.shape[0] - (bottom - top))
-    column = min(max(left, 0), image.shape[1] - (right - left))
-    return image[row : row + bottom - top, column : column + right - left]
-
-
-@ROBUST_DEPTH.mistake("cut")
-def border_repeated(image: Floats, top: int, bottom: int, left: int, right: int) -> Floats:
-    """you count the pixels of the border more than once
-
-    Does a pixel become more certain because the image ends beside it?
-    """
-    rows = np.clip(range(top, bottom), 0, image.shape[0] - 1)
-    columns = np.clip(range(left, right), 0, image.shape[1] - 1)
-    return image[np.ix_(rows, columns)]
-
-
-@ROBUST_DEPTH.mistake("cut")
-def border_lost(image: Floats, top: int, bottom: int, left: int, right: int) -> Floats:
-    """the last row or column of the image is lost
-
-    In an image of 16 columns the last is number 15. Does a slice that ends at 15 hold it?
-    """
-    height, width = image.shape
-    return _cut(image, top, min(bottom, height - 1), left, min(right, width - 1))
-
-
-@ROBUST_DEPTH.mistake("cut", same_as=border_lost)
-def border_lost_and_negative_end(
-    image: Floats, top: int, bottom: int, left: int, right: int
-) -> Floats:
-    height, width = image.shape
-    return image[max(top, 0) : min(bottom, height - 1), max(left, 0) : min(right, width - 1)]
-
-
-@ROBUST_DEPTH.mistake("cut")
-def modulo(image: Floats, top: int, bottom: int, left: int, right: int) -> Floats:
-    """indices are taken modulo the image's size: at one border you read the opposite one
-
-    What is -1 % 16? Is the pixel at the right border a neighbour of the one at the left?
-    """
-    height, width = image.shape
-    return image[np.ix_(np.arange(top, bottom) % height, np.arange(left, right) % width)]
-
-
-@ROBUST_DEPTH.mistake("cut")
-def height_width_swapped(image: Floats, top: int, bottom: int, left: int, right: int) -> Floats:
-    """height and width of the image are swapped
-
-    An image 16 wide and 12 high has the shape (12, 16). Which of the two limits the columns?
-    """
-    height, width = image.shape
-    return _cut(image, top, min(bottom, width), left, min(right, height))
-
-
-@ROBUST_DEPTH.mistake("cut")
-def border_refused(image: Floats, top: int, bottom: int, left: int, right: int) -> Floats:
-    """you give no answer as soon as the window touches the border
-
-    Half of the window is still in the image. What does `min_valid` say about that?
-    """
-    height, width = image.shape
-    inside = top >= 0 and left >= 0 and bottom <= height and right <= width
-    return image[top:bottom, left:right] if inside else image[:0, :0]
-
-
-@ROBUST_DEPTH.mistake("zeros")
-def zeros_counted(pixels: Floats) -> Floats:
-    """zeros are counted as depths
-
-    What does a camera of this kind write where it has no answer?
-    """
-    return pixels
-
-
-@ROBUST_DEPTH.mistake("finite")
-def nan_counted(pixels: Floats) -> Floats:
-    """NaN is counted as a depth
-
-    What is the median of 1, 2 and NaN? And is NaN != 0?
-    """
-    return pixels
-
-
-@ROBUST_DEPTH.mistake("finite")
-def infinity_counted(pixels: Floats) -> Floats:
-    """infinity is counted as a depth
-
-    NaN does not pass `> 0`. Does infinity?
-    """
-    return pixels[~np.isnan(pixels)]
-
-
-@ROBUST_DEPTH.mistake("enough")
-def min_valid_ignored(valid: Floats, pixels: Floats, min_valid: int) -> bool:
-    """`min_valid` is ignored: a window with a single valid pixel is trusted like a full one
-
-    Near the edge of an object one pixel may be left, and it may be a flying one. Who looks?
-    """
-    return True
-
-
-@ROBUST_DEPTH.mistake("enough")
-def min_valid_fixed(valid: Floats, pixels: Floats, min_valid: int) -> bool:
-    """`min_valid` is always 5 in your function
-
-    What does it do when somebody passes min_valid = 1?
-    """
-    return len(valid) >= 5
-
-
-@ROBUST_DEPTH.mistake("enough")
-def one_too_strict(valid: Floats, pixels: Floats, min_valid: int) -> bool:
-    """exactly `min_valid` valid pixels are refused
-
-    Fewer than min_valid is too few. And min_valid itself?
-    """
-    return len(valid) > min_valid
-
-
-@ROBUST_DEPTH.mistake("enough")
-def all_pixels_counted(valid: Floats, pixels: Floats, min_valid: int) -> bool:
-    """`min_valid` is compared with all pixels of the window
-
-    How many pixels does your count find in a window in which every pixel is 0?
-    """
-    return pixels.size >= min_valid
-
-
-@ROBUST_DEPTH.mistake("none")
-def zero_returned() -> float:
-    """0 is returned where there is no answer, and NaN is wanted
-
-    Whoever averages your depths over 100 frames: will they notice a 0 among them, or a NaN?
-    """
-    return 0.0
-
-
-@ROBUST_DEPTH.mistake("middle")
-def mean(valid: Floats) -> float:
-    """this is the mean, and the median is wanted
-
-    One flying pixel 0.2 m behind the other eight: how far does it move your result?
-    """
-    return float(np.mean(valid))
-
-
-@ROBUST_DEPTH.mistake("middle")
-def one_of_the_middle_two(valid: Floats) -> float:
-    """with an even number of valid pixels you take one of the middle two
-
-    What is the median of 1, 2, 3 and 4?
-    """
-    return float(np.sort(valid)[len(valid) // 2])
-
-
-@ROBUST_DEPTH.mistake("middle", same_as=one_of_the_middle_two)
-def lower_of_the_middle_two(valid: Floats) -> float:
-    return float(np.sort(valid)[(len(valid) - 1) // 2])
+ROBUST_DEPTH.add_mistakes(
+    ("read", "u_v_swapped", lambda u, v: (v, u)),
+    ("round", "truncated", int),
+    ("window", "last_missing", lambda v, u, half: (v - half, v + half, u - half, u + half)),
+    ("window", "half_ignored", lambda row, column, half: _window(row, column, 2)),
+    ("window", "half_halved", lambda row, column, half: _window(row, column, half // 2)),
+    ("shortcut", "pixel_alone", _pixel_alone),
+    ("shortcut", "pixel_alone", _pixel_alone_unless_zero),
+    ("cut", "negative_index", _cut(_as_they_come)),
+    ("cut", "negative_index", _cut(_as_they_come, _inside)),
+    ("cut", "negative_index", _cut(_inside, _as_they_come)),
+    ("cut", "negative_index", _cut(lambda a, b, size: np.arange(a, min(b, size)))),
+    ("cut", "negative_end", _cut(lambda a, b, size: slice(max(a, 0), b))),
+    ("cut", "moved_inside", _cut(_moved)),
+    ("cut", "border_repeated", _cut(lambda a, b, size: np.clip(range(a, b), 0, size - 1))),
+    ("cut", "border_lost", _cut(lambda a, b, size: _inside(a, min(b, size - 1), size))),
+    ("cut", "border_lost", _cut(lambda a, b, size: slice(max(a, 0), min(b, size - 1)))),
+    ("cut", "modulo", _cut(lambda a, b, size: np.arange(a, b) % size)),
+    ("cut", "height_width_swapped", _height_width_swapped),
+    ("cut", "border_refused", _cut(lambda a, b, size: slice(a, b if a >= 0 and b <= size else a))),
+    ("zeros", "zeros_counted", lambda pixels: pixels),
+    ("finite", "nan_counted", lambda pixels: pixels),
+    ("finite", "infinity_counted", lambda pixels: pixels[~np.isnan(pixels)]),
+    ("enough", "min_valid_ignored", lambda valid, pixels, min_valid: True),
+    ("enough", "min_valid_fixed", lambda valid, pixels, min_valid: len(valid) >= 5),
+    ("enough", "one_too_strict", lambda valid, pixels, min_valid: len(valid) > min_valid),
+    ("enough", "all_pixels_counted", lambda valid, pixels, min_valid: pixels.size >= min_valid),
+    ("none", "zero_returned", lambda: 0.0),
+    ("middle", "mean", lambda valid: float(np.mean(valid))),
+    ("middle", "one_of_the_middle_two", lambda valid: float(np.sort(valid)[len(valid) // 2])),
+    ("middle", "one_of_the_middle_two", lambda valid: float(np.sort(valid)[(len(valid) - 1) // 2])),
+)

@@ -3,15 +3,12 @@
 The right answer is written as a few named *steps*. A misconception replaces one step by what a
 learner who holds it would write, so a wrong function can be compared with each wrong model on the
 same cases, and with each pair of them. Only an exact match is named: the nearest wrong model
-misleads as soon as there are two mistakes. To add a misconception, write the wrong step:
+misleads as soon as there are two mistakes. To add a misconception, write the wrong step in the
+lesson's module, and in its TOML file, under [mistakes], what the student will read:
 
-    @PROJECT.mistake("read")
-    def p1_p2_swapped(k1, k2, p1, p2, k3):
-        '''your p1 and p2 are swapped
+    PROJECT.add_mistakes(("read", "p1_p2_swapped", lambda k1, k2, p1, p2, k3: (k1, k2, p2, p1, k3)))
 
-        Which of the two multiplies r² + 2x²?
-        '''
-        return k1, k2, p2, p1, k3
+    p1_p2_swapped = ["your p1 and p2 are swapped", "Which of the two multiplies r² + 2x²?"]
 """
 
 from __future__ import annotations
@@ -98,24 +95,17 @@ class Exercise:
         """The learner's function's name."""
         return self.name.rpartition(".")[2]
 
-    def mistake(
-        self, step: str, same_as: Step | None = None, name: str = "", alone: bool = False
-    ) -> Callable[[Step], Step]:
-        """Decorator that adds a wrong step, whose name is the misconception's.
+    def add_mistakes(self, *wrong: tuple[str, str, Step], alone: bool = False) -> None:
+        """Add wrong steps: the step, the misconception's name, and what is done in its place.
 
-        Its docstring is what the student reads: what is wrong, then, after an empty line, a
-        question that leads on. same_as: an earlier wrong step, where this is only another way to
-        write the same misconception; its name and words are taken. name: where the function needs
-        another one.
+        One name may come several times: other ways to write the same misconception. What the
+        student reads stands under it in the lesson's TOML file: what is wrong, and a question that
+        leads on.
         """
-
-        def add(wrong: Step) -> Step:
-            origin = same_as or wrong
-            says, ask = (" ".join(part.split()) for part in str(origin.__doc__).split("\n\n"))
-            self.mistakes.append(Mistake(name or origin.__name__, step, says, ask, wrong, alone))
-            return wrong
-
-        return add
+        texts = questions.lesson_texts(self.name.partition(".")[0])["mistakes"]
+        for step, name, instead in wrong:
+            says, ask = (" ".join(text.split()) for text in texts[name])
+            self.mistakes.append(Mistake(name, step, says, ask, instead, alone))
 
     def model(self, *mistakes: Mistake) -> Model:
         """The right function with these mistakes built in."""

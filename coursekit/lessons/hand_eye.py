@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -21,28 +20,6 @@ def _pose(rng: np.random.Generator, reach_m: float = 0.5) -> Floats:
 
 
 # --- motion_pair ---
-
-
-def _inverse(T: Floats) -> Any:
-    return np.linalg.inv(T)
-
-
-def _gripper_motion(first: Floats, second: Floats, inverse: Step) -> Floats:
-    """The gripper at pose i, as the gripper at pose j sees it."""
-    return inverse(second) @ first
-
-
-def _camera_motion(first: Floats, second: Floats, inverse: Step) -> Floats:
-    """The camera at pose i, as the camera at pose j sees it, by way of the board."""
-    return second @ inverse(first)
-
-
-def _stacked(A: Floats, B: Floats) -> Floats:
-    return np.stack([A, B])
-
-
-def _in_order(i: Floats, j: Floats) -> Pair:
-    return i, j
 
 
 def _build_pair(steps: Mapping[str, Step]) -> Model:
@@ -75,12 +52,12 @@ MOTION_PAIR = Exercise(
     name="hand_eye.motion_pair",
     build=_build_pair,
     steps={
-        "inverse": _inverse,
-        "A pair": _in_order,
-        "A": _gripper_motion,
-        "B pair": _in_order,
-        "B": _camera_motion,
-        "order": _stacked,
+        "inverse": np.linalg.inv,
+        "A pair": lambda i, j: (i, j),
+        "A": lambda first, second, inverse: inverse(second) @ first,  # the gripper's motion
+        "B pair": lambda i, j: (i, j),
+        "B": lambda first, second, inverse: second @ inverse(first),  # the camera's, by the board
+        "order": lambda A, B: np.stack([A, B]),
     },
     cases=[_session_pair(0, plain=True), *(_session_pair(seed) for seed in range(1, 5))],
     per_row=0,
@@ -102,97 +79,20 @@ MOTION_PAIR = Exercise(
 )
 
 
-@MOTION_PAIR.mistake("inverse")
-def transposed_pose(T: Floats) -> Floats:
-    """the inverse of a pose is not its transpose
-
-    A rotation's inverse is its transpose. A pose also has a translation: what becomes of it?
-    """
-    return T.T
-
-
-@MOTION_PAIR.mistake("inverse")
-def translation_not_turned(T: Floats) -> Floats:
-    """in your inverse the translation only changes its sign
-
-    R^T undoes the rotation. In which frame is -t, and in which one is it wanted?
-    """
-    return make_transform(T[:3, :3].T, -T[:3, 3])
-
-
-@MOTION_PAIR.mistake("inverse")
-def not_inverted(T: Floats) -> Floats:
-    """nothing is inverted
-
-    Which of the two poses must be undone so that the base frame cancels?
-    """
-    return T
-
-
-@MOTION_PAIR.mistake("A")
-def motion_in_base(first: Floats, second: Floats, inverse: Step) -> Floats:
-    """A is the motion seen from the base: that is the A of a camera that does not ride on the arm
-
-    X stands to the right of A, and takes camera coordinates to gripper coordinates. In which frame
-    must A begin and end?
-    """
-    return second @ inverse(first)
-
-
-@MOTION_PAIR.mistake("A pair")
-def a_exchanged(i: Floats, j: Floats) -> Pair:
-    """in A the poses i and j are exchanged, in B they are not
-
-    The board is in the same place: T_i X B_i = T_j X B_j. Bring all arm poses to the left.
-    """
-    return j, i
-
-
-@MOTION_PAIR.mistake("B pair")
-def b_exchanged(i: Floats, j: Floats) -> Pair:
-    """in B the poses i and j are exchanged, in A they are not
-
-    The board is in the same place: T_i X B_i = T_j X B_j. Bring all detections to the right.
-    """
-    return j, i
-
-
-@MOTION_PAIR.mistake("B")
-def motion_in_board(first: Floats, second: Floats, inverse: Step) -> Floats:
-    """B is the motion of the camera seen from the board
-
-    X stands to the left of B, and takes camera coordinates in. In which frame must B begin and end?
-    """
-    return inverse(second) @ first
-
-
-@MOTION_PAIR.mistake("order")
-def both_exchanged(A: Floats, B: Floats) -> Floats:
-    """both motions go from j to i: a right equation, but not the one that was asked for
-
-    A = inverse(T_j) T_i. And yours?
-    """
-    return np.stack([np.linalg.inv(A), np.linalg.inv(B)])
-
-
-@MOTION_PAIR.mistake("order")
-def b_first(A: Floats, B: Floats) -> Floats:
-    """A and B are exchanged
-
-    Which one comes from the arm?
-    """
-    return np.stack([B, A])
+MOTION_PAIR.add_mistakes(
+    ("inverse", "transposed_pose", lambda T: T.T),
+    ("inverse", "translation_not_turned", lambda T: make_transform(T[:3, :3].T, -T[:3, 3])),
+    ("inverse", "not_inverted", lambda T: T),
+    ("A", "motion_in_base", lambda first, second, inverse: second @ inverse(first)),
+    ("A pair", "a_exchanged", lambda i, j: (j, i)),
+    ("B pair", "b_exchanged", lambda i, j: (j, i)),
+    ("B", "motion_in_board", lambda first, second, inverse: inverse(second) @ first),
+    ("order", "both_exchanged", lambda A, B: np.stack([np.linalg.inv(A), np.linalg.inv(B)])),
+    ("order", "b_first", lambda A, B: np.stack([B, A])),
+)
 
 
 # --- rotation_half ---
-
-
-def _axes(R_A: Floats, R_B: Floats) -> Pair:
-    return Rotation.from_matrix(R_A).as_rotvec(), Rotation.from_matrix(R_B).as_rotvec()
-
-
-def _used(a: Floats, b: Floats) -> Pair:
-    return a, b
 
 
 def _turn(a: Floats, b: Floats) -> Floats:
@@ -228,7 +128,12 @@ def _quarter_turns() -> Pair:
 ROTATION_HALF = Exercise(
     name="hand_eye.rotation_half",
     build=_build_half,
-    steps={"axes": _axes, "used": _used, "turn": _turn, "result": lambda R: R},
+    steps={
+        "axes": lambda *motions: [Rotation.from_matrix(R).as_rotvec() for R in motions],
+        "used": lambda a, b: (a, b),
+        "turn": _turn,
+        "result": lambda R: R,
+    },
     cases=[_quarter_turns(), _motions(1, 2), _motions(2, 3), _motions(3, 6), _motions(4, 20)],
     per_row=0,
     unit="(rotation matrix)",
@@ -242,22 +147,7 @@ ROTATION_HALF = Exercise(
 )
 
 
-@ROTATION_HALF.mistake("result")
-def inverse_of_x(R: Floats) -> Floats:
-    """that is the inverse of R_X
-
-    R_X takes camera coordinates to gripper coordinates. Which axes did you turn into which?
-    """
-    return R.T
-
-
-@ROTATION_HALF.mistake("turn")
-def mirror_image(a: Floats, b: Floats) -> Floats:
-    """with two motions your result is a mirror image: its determinant is -1
-
-    Two axes lie in a plane, and a plane looks the same in a mirror. Print the determinant. What
-    does Kabsch's method do about it?
-    """
+def _mirror_image(a: Floats, b: Floats) -> Floats:
     U, _, Vt = np.linalg.svd(a.T @ b)
     mirror = U @ Vt
     if len(a) == 2:  # the third singular direction has no sign: take the one that mirrors
@@ -265,48 +155,12 @@ def mirror_image(a: Floats, b: Floats) -> Floats:
     return mirror
 
 
-@ROTATION_HALF.mistake("turn")
-def not_a_rotation(a: Floats, b: Floats) -> Any:
-    """that is the least-squares matrix for the axes, and it is not made a rotation
-
-    Multiply your result by its transpose. With two motions, what can a matrix not know?
-    """
-    return np.linalg.lstsq(b, a, rcond=None)[0].T
-
-
-@ROTATION_HALF.mistake("used")
-def first_motion_only(a: Floats, b: Floats) -> Pair:
-    """only the first motion is used
-
-    One axis leaves the turn about it free. How many motions fix it?
-    """
-    return a[:1], b[:1]
-
-
-@ROTATION_HALF.mistake("result")
-def negative(R: Floats) -> Floats:
-    """its sign is wrong: -R solves the equation as well, and is no rotation
-
-    Print the determinant. A null vector has no sign of its own: how do you choose it?
-    """
-    return -R
-
-
-@ROTATION_HALF.mistake("result")
-def not_scaled(R: Floats) -> Floats:
-    """it is a rotation but for a factor
-
-    A null vector of length 1 has nine entries, and a rotation matrix has three rows of length 1.
-    What is missing?
-    """
-    return R / np.sqrt(3)
-
-
-@ROTATION_HALF.mistake("result")
-def not_scaled_and_negative(R: Floats) -> Floats:
-    """it is a rotation but for a factor and the sign
-
-    A null vector of length 1 has no sign of its own, and nine entries. Print the determinant of
-    your result, and that of a rotation.
-    """
-    return -R / np.sqrt(3)
+ROTATION_HALF.add_mistakes(
+    ("result", "inverse_of_x", lambda R: R.T),
+    ("turn", "mirror_image", _mirror_image),
+    ("turn", "not_a_rotation", lambda a, b: np.linalg.lstsq(b, a, rcond=None)[0].T),
+    ("used", "first_motion_only", lambda a, b: (a[:1], b[:1])),
+    ("result", "negative", lambda R: -R),
+    ("result", "not_scaled", lambda R: R / np.sqrt(3)),
+    ("result", "not_scaled_and_negative", lambda R: -R / np.sqrt(3)),
+)

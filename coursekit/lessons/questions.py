@@ -12,6 +12,7 @@ import math
 import re
 import tomllib
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -251,6 +252,13 @@ def _earlier(name: str) -> str:
     return f"<em>You have answered this one before ({html.escape(last['kind'])}).</em>"
 
 
+@cache
+def lesson_texts(lesson: str) -> dict[str, Any]:
+    """What the TOML file of a lesson holds: checkpoints, objectives and mistakes."""
+    text = Path(__file__).with_name(f"{lesson}.toml").read_text(encoding="utf-8")
+    return tomllib.loads(text)
+
+
 def load_questions(lesson: str) -> tuple[tuple[Checkpoint, ...], tuple[Objective, ...]]:
     """The checkpoints and the objectives of a lesson, in the order of its TOML file.
 
@@ -258,8 +266,7 @@ def load_questions(lesson: str) -> tuple[tuple[Checkpoint, ...], tuple[Objective
     letter; a number has slips, each a wrong number with what leads to it. Names in the file are
     without the lesson's.
     """
-    text = Path(__file__).with_name(f"{lesson}.toml").read_text(encoding="utf-8")
-    content = tomllib.loads(text)
+    content = lesson_texts(lesson)
 
     def checkpoint(name: str, asked: dict[str, Any]) -> Checkpoint:
         question = _single_spaced(asked["question"])

@@ -248,25 +248,26 @@ def _not_gaussian(
     mean (h, w), drift (N,): of the stack. std, dof: of a pixel, as for one Gaussian noise. A
     variance from samples of excess kurtosis k has 1 + k / 2 times the variance of a Gaussian one's;
     that of parts which differ is known no better than by how much they differ, and pixels that jump
-    between two depths are taken to jump together. Fewer than 8 frames, and noise that the depth
-    unit hides, say nothing.
+    between two depths, or lie on two surfaces, count as one pixel. Fewer than 8 frames, and noise
+    that the depth unit hides, say nothing.
     """
     n, words = len(z), []
     gap = _two_surfaces(mean, max(JUMP_SIGMAS * np.nan_to_num(std), step or 0.0))
     if gap > 0:
         words.append(f"two surfaces, {1e3 * gap:.1f} mm apart: move the window off the edge")
+        dof = min(dof, n - 1.0)
     if n < 8 or not std > (step or 0.0) or not dof > 0:
         return dof, gap, tuple(words)
     square = np.square(z - mean - drift[:, None, None])
     own, fourth = valid_mean(square, axis=0), valid_mean(square**2, axis=0)
-    moves = own > 1e-6 * std**2
-    excess = float((fourth[moves] / own[moves] ** 2).mean()) * (n + 1) / (n - 1) - 3
-    limit = FAR_FROM_GAUSS + 3 * math.sqrt(24 / dof)
-    left = [dof]
-    if excess > limit:
-        words.append(f"heavy tails, excess kurtosis {excess:.1f}")
+    ratio = float(np.nanmean(fourth) / np.nanmean(own**2))
+    excess = (ratio * (1 + 2 / n) - 3) / max(1 - ratio / n, 0.1)  # own holds the tails, too
+    unsure, left = 3 * math.sqrt(24 / dof), [dof]
+    if excess > unsure:
         left.append(dof / (1 + excess / 2))
-    elif excess < -limit:
+    if excess > FAR_FROM_GAUSS + unsure:
+        words.append(f"heavy tails, excess kurtosis {excess:.1f}")
+    elif excess < -FAR_FROM_GAUSS - unsure:
         words.append("pixels jump between two depths")
         left.append(min(dof, n - 1.0))
     rows = [np.array_split(third, 3, axis=1) for third in np.array_split(own, 3)]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from common import nightly
@@ -42,7 +45,7 @@ def test_millimetres(moveit_poses) -> None:
 
 @pytest.mark.parametrize(
     "kind",
-    ["rotation vectors", "xyz", pytest.param("XYZ", marks=nightly)],  # half a minute
+    ["rotation vectors", "xyz", pytest.param("XYZ", marks=nightly)],
 )
 def test_degrees(moveit_poses, kind: str) -> None:
     arm, seen = moveit_poses
@@ -83,3 +86,56 @@ def test_the_other_way_round(moveit_poses) -> None:
             assert f"({number}) {name}" in finding.evidence
         assert "(0.659, -0.250, 0.830) m" in finding.evidence
     assert "Only one is plausible: arm poses inverted" in diagnose(*inverted)[0].evidence
+
+
+def test_healthy_sessions_of_other_arms_get_no_finding(song_poses, doosan_poses) -> None:
+    for arm, seen in (song_poses, doosan_poses):
+        assert diagnose(arm, seen, "eye_in_hand").names == ()
+
+
+@pytest.mark.parametrize(
+    ("camera", "names"),
+    [
+        (1, ("exchanged_rows",)),
+        (2, ("exchanged_rows",)),
+        (3, ("exchanged_rows", "slow_drift")),
+        (4, ("exchanged_rows", "outlier_pose", "slipping_board")),
+    ],
+)
+def test_four_webcams(ur3_webcam, camera: int, names: tuple[str, ...]) -> None:
+    """Two rows of the table are exchanged, camera 3 sinks, six images are another camera's.
+
+    Camera 4 turned by a degree in its clamp after its sixth image.
+    """
+    given, _ = ur3_webcam(camera)
+    findings = diagnose_session(given)
+    assert findings.names == names
+    assert f"img25_cam{camera}.png and img26_cam{camera}.png" in findings[0].says
+    if camera == 4:
+        foreign = {int(number) for number in re.findall(r"img(\d+)_cam4", findings[1].evidence)}
+        assert foreign == {9, 14, 15, 31, 33, 38}
+
+
+def test_joint_angles_of_another_arm(ur3_webcam) -> None:
+    given, q = ur3_webcam(1)
+    [finding] = diagnose_session(replace(given, T_base_gripper=given.arm.forward(q), q=q))
+    assert finding.name == "joints_of_another_arm"
+    assert "WidowX AI" in finding.evidence
+    beside = diagnose_session(replace(given, q=q))
+    assert beside.names == ("exchanged_rows", "joints_of_another_arm")
+
+
+def test_pairs_of_real_sessions(song_poses, doosan_poses, moveit_poses) -> None:
+    """A lost image, the order of text and a camera frame of ROS, on data of three arms."""
+    for (arm, seen), mount in zip(
+        (song_poses, doosan_poses, moveit_poses), ("eye_in_hand", "eye_in_hand", MOUNT), strict=True
+    ):
+        n = len(arm)
+        lost = diagnose(arm[:-1], np.delete(seen, n // 3, axis=0), mount)
+        assert lost.names == ("off_by_one",)
+        assert f"from view {n // 3:02d} on each image" in lost[0].says
+        text = sorted(range(n), key=str)
+        assert diagnose(arm, seen[text], mount).names == ("text_order",)
+        body = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
+        [frame] = diagnose(arm, body @ seen, mount)
+        assert "x forward, y left, z up" in frame.evidence

@@ -134,13 +134,13 @@ changed(
 )
 
 
-@wrong("K_transposed")
+@wrong("inverse_transposed")
 def rows_times_the_inverse(pixels, depth, K, dist=None):
     rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(K)
     return rays * depth[:, None]
 
 
-@wrong("K_transposed")
+@wrong("inverse_transposed")
 def rows_times_the_inverse_and_normalised(pixels, depth, K, dist=None):
     rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(K)
     return rays / rays[:, 2:] * depth[:, None]

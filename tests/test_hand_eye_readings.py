@@ -1,0 +1,138 @@
+"""`diagnose` on tables and code that were misread: notations, pairs, frames, arms; and on drifts.
+
+Sessions of arms that reach every pose and err by 0.1 to 0.5 deg and 0.5 to 2 mm, drawn anew at each
+pose: nobody's kinematics, and no error that poses share. COURSEKIT_NIGHTLY=1 runs 100 seeds a kind.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from simulated_hand_eye import free_session
+
+from coursekit.geometry import turned
+from coursekit.hand_eye import HandEyeSession
+from coursekit.hand_eye.diagnosis import diagnose
+
+NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
+SEEDS = range(200_000, 200_000 + (100 if NIGHTLY else 4))
+TO_BODY = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
+
+
+@lru_cache
+def session(seed: int, n: int = 0, detections: bool = False) -> HandEyeSession:
+    """Poses of the arm and of the board, 12 to 30 of them unless n says so, both mounts."""
+    rng = np.random.default_rng([seed, 7])
+    mount = ("eye_in_hand", "eye_to_hand")[seed % 2]
+    truth = free_session(seed, mount, n or 12 + seed % 19)
+    turn, shift = np.radians(rng.uniform(0.1, 0.5)), 1e-3 * rng.uniform(0.5, 2.0)
+    error = rng.normal(size=(len(truth.session), 6)) * np.repeat([turn, shift], 3)
+    given = truth.session
+    seen = given.seen if detections else given.T_camera_board
+    arm = turned(given.T_base_gripper, error)
+    return HandEyeSession(mount, arm, seen, given.board, given.intrinsics)
+
+
+def read(given: HandEyeSession, written: str, by: str, factor: float = 1.0) -> HandEyeSession:
+    """Numbers that were written in one notation, times a factor, read in another."""
+    T = given.T_base_gripper.copy()
+    true = Rotation.from_matrix(T[:, :3, :3])
+    numbers = true.as_rotvec() if written == "vector" else true.as_euler(written)
+    turns = Rotation.from_rotvec if by == "vector" else (lambda v: Rotation.from_euler(by, v))
+    T[:, :3, :3] = turns(factor * numbers).as_matrix()
+    return replace(given, T_base_gripper=T)
+
+
+def paired(given: HandEyeSession, rows: np.ndarray, images: np.ndarray) -> HandEyeSession:
+    return replace(given, T_base_gripper=given.T_base_gripper[rows], seen=given.seen[images],
+                   names=())  # fmt: skip
+
+
+def lost(given: HandEyeSession, seed: int, what: str) -> HandEyeSession:
+    n = len(given)
+    k = 1 + (7 * seed) % (n - 4)
+    left, short = np.delete(np.arange(n), k), np.arange(n - 1)
+    return paired(given, *((short, left) if what == "image" else (left, short)))
+
+
+def exchanged(given: HandEyeSession, seed: int) -> HandEyeSession:
+    rows, i = np.arange(len(given)), (5 * seed) % (len(given) - 1)
+    rows[[i, i + 1]] = rows[[i + 1, i]]
+    return paired(given, rows, np.arange(len(given)))
+
+
+def as_text(given: HandEyeSession, first: int, inverse: bool) -> HandEyeSession:
+    n = len(given)
+    order = np.array(sorted(range(n), key=lambda i: f"img_{first + i}"))
+    return paired(given, np.arange(n), np.argsort(order) if inverse else order)
+
+
+def drifting(given: HandEyeSession, seed: int) -> HandEyeSession:
+    """The camera, or the board, turns by 2 deg and moves by 15 mm in all."""
+    rng = np.random.default_rng([seed, 8])
+    way = rng.normal(size=(2, 3))
+    way *= np.array([[np.radians(2.0)], [0.015]]) / np.linalg.norm(way, axis=1, keepdims=True)
+    time = np.linspace(-0.5, 0.5, len(given))
+    return replace(given, seen=turned(given.seen, time[:, None] * way.ravel()))
+
+
+Mistake = Callable[[HandEyeSession, int], HandEyeSession]
+ORDERS = ("xyz", "XYZ", "ZYX", "zyx")
+KINDS: dict[str, tuple[str, str, Mistake]] = {
+    "rotation vector read as Euler angles": (
+        "inconsistent_convention", r"rotation vectors read by Rotation.from_euler\('\w+', v\)",
+        lambda s, i: read(s, "vector", ORDERS[i // 2 % 4])),
+    "Euler angles read as rotation vector": (
+        "inconsistent_convention", r"Euler angles '\w+' read by Rotation.from_rotvec\(v\)",
+        lambda s, i: read(s, ORDERS[i // 2 % 4], "vector")),
+    "radians, a vector read as Euler angles in degrees": (
+        "inconsistent_convention", r"the data fit Rotation.from_rotvec\(v\)",
+        lambda s, i: read(s, "vector", ORDERS[i // 2 % 4], np.radians(1))),
+    "Euler angles of another order": (
+        "inconsistent_convention", r"read by Rotation.from_euler\('\w+', v\); the data fit",
+        lambda s, i: read(s, ORDERS[i // 2 % 4], ORDERS[(i // 2 + 1) % 4])),
+    "vector in degrees read as radians": (
+        "degrees", r"the data fit Rotation.from_rotvec\(v, degrees=True\)",
+        lambda s, i: read(s, "vector", "vector", np.degrees(1))),
+    "an image lost": ("off_by_one", "1 place after its own", lambda s, i: lost(s, i, "image")),
+    "an arm pose lost": ("off_by_one", "1 place before its own", lambda s, i: lost(s, i, "pose")),
+    "two rows exchanged": ("exchanged_rows", "view .. and view", exchanged),
+    "sorted as text": (
+        "text_order", "img_10 before img_2", lambda s, i: as_text(s, i // 2 % 2, i // 4 % 2 == 1)),
+    "a body frame of the camera": (
+        "inconsistent_convention", "x forward, y left, z up",
+        lambda s, i: replace(s, seen=TO_BODY @ s.seen)),
+    "a slow drift": ("slow_drift", "Camera or board moved slowly", drifting),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_misreading_is_named_with_what_fits(kind: str) -> None:
+    """At least 95 of 100 named (nightly); of 4 at least 3, which 50 % pass with 31 %."""
+    name, says, mistake = KINDS[kind]
+    named, found = 0, Counter()
+    for seed in SEEDS:
+        findings = diagnose(mistake(session(seed), seed))
+        found[findings.names] += 1
+        texts = [f"{one.says} {one.evidence}" for one in findings if one.name == name]
+        named += any(re.search(says, text) for text in texts)
+    print(kind, named, dict(found))
+    assert named >= (95 if NIGHTLY else 3)
+
+
+def test_arms_that_err_at_each_pose_are_not_accused() -> None:
+    """At most 2 of 100 (nightly), of poses and of corners; of 8 none."""
+    found: Counter[tuple[str, ...]] = Counter()
+    for seed in range(300_000, 300_000 + (100 if NIGHTLY else 8)):
+        found[diagnose(session(seed, detections=seed // 2 % 2 == 1)).names] += 1
+    print(dict(found))
+    accused = sum(n for names, n in found.items() if set(names) - {"unexplained"})
+    assert accused <= (2 if NIGHTLY else 0)
