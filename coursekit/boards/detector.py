@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from coursekit.arrays import Grey, NDArray
-from coursekit.boards.board import Board, BoardNotFound, Detection, Detections, Skipped
+from coursekit.boards.board import Board, BoardNotFound, Detection, Detections, OtherBoard, Skipped
 from coursekit.boards.corners import blur_covariance, refine_corners, steps
 from coursekit.boards.explain import explain
 from coursekit.boards.find import find_corners
@@ -126,7 +126,8 @@ def detect_all(
             try:
                 views.append(detect(_read(source), board, name))
             except (BoardNotFound, _Unreadable) as reason:
-                skipped.append(Skipped(name, str(reason)))
+                kind = "other_board" if isinstance(reason, OtherBoard) else ""
+                skipped.append(Skipped(name, str(reason), kind))
     except KeyboardInterrupt:
         done = len(views) + len(skipped)
         print(f"Stopped after {done} of {len(sources)} images; they are kept.")
@@ -222,6 +223,6 @@ def _of_one_size(views: list[Detection], skipped: list[Skipped], names: list[str
     for view in views:
         if view.size != common:
             reason = "{}x{} px, where most are {}x{}: one calibration is for one size"
-            skipped.append(Skipped(view.name, reason.format(*view.size, *common)))
+            skipped.append(Skipped(view.name, reason.format(*view.size, *common), "other_size"))
     skipped.sort(key=lambda skip: names.index(skip.name))
     return Detections([view for view in views if view.size == common], skipped)

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from coursekit.arrays import Floats, Grey, NDArray
-from coursekit.boards.board import DICTIONARIES, FEWEST_SQUARES, Board
+from coursekit.boards.board import DICTIONARIES, FEWEST_SQUARES, Board, OtherBoard
 from coursekit.boards.find import SEARCHES, checkerboard_grid, shrunk
 
 COMMON_CORNERS = ((9, 6), (8, 6), (7, 6), (8, 5), (7, 5), (11, 8), (10, 7), (7, 7), (6, 5), (5, 4))
@@ -45,7 +45,8 @@ class _Markers(NamedTuple):
 def explain(grey: Grey, board: Board, corners: int) -> str:
     """Why `board` was not found in a grey image (H, W), uint8, in one sentence.
 
-    corners: how many of the board's corners were found, too few for use.
+    corners: how many of the board's corners were found, too few for use. Raises OtherBoard with the
+    sentence where another board is seen.
     """
     small = shrunk(grey, LONGEST_PX)
     low, high = np.quantile(small, [0.01, 0.99])
@@ -55,7 +56,7 @@ def explain(grey: Grey, board: Board, corners: int) -> str:
         )
     asked = f"the {board.text} asked for"
     if reason := _what_else(small, board):
-        return f"not {asked}, but {reason}"
+        raise OtherBoard(f"not {asked}, but {reason}")
     if corners:
         return (
             f"only {corners} usable corners of {asked}: at least 6 are needed that do not lie on "

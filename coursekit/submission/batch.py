@@ -325,7 +325,9 @@ def work_through(
         running: dict[Future[Graded], Bundle] = {}
         with _pool(limits) as pool, contextlib.suppress(BrokenProcessPool):
             while True:
-                room = 1 if again else (1 + AHEAD) * limits.workers  # the last of them is alone, too
+                room = (
+                    1 if again else (1 + AHEAD) * limits.workers
+                )  # the last of them is alone, too
                 while len(running) < room:
                     bundle = again.pop() if again else next(left, None)
                     if bundle is None:
