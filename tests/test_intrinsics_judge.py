@@ -111,8 +111,8 @@ def test_halves_disagree_when_the_lens_was_refocused_between() -> None:
     odd, _ = corner_session(CHARUCO, other, 9, views=14)
     mixed = Detections(view for pair in zip(even, odd, strict=True) for view in pair)
     both = intrinsics.halves(mixed, CHARUCO)
-    assert both.p_value < 1e-6
-    assert "more than noise explains (p < 0.000001)" in repr(both)
+    assert both.p_value < 1e-4
+    assert "more than noise explains (p = " in repr(both)
     assert both.first.value("fx") == pytest.approx(612, abs=4)
     assert both.second.value("fx") == pytest.approx(624, abs=4)
 
@@ -232,13 +232,15 @@ def test_bow_is_what_scipy_finds_over_everything() -> None:
     for i, name in enumerate(names):
         tolerance = 0.02 * bow.result.sigma(name)
         assert bow.result.value(name) == pytest.approx(found.x[i], abs=tolerance)
-    sigma = np.sqrt(np.diag(bow.covariance))
-    assert np.abs((bow.coefficients - found.x[6:9]) / sigma).max() < 0.02
+    equations = bow.result.equations
+    sigma = bow.result.sigma_px * np.sqrt(np.diag(equations.shared_covariance))
+    assert np.abs((bow.coefficients - found.x[6:9]) / sigma[6:9]).max() < 0.02
     free = len(found.fun) - len(found.x)
     covariance = np.linalg.inv(found.jac.T @ found.jac) * (found.fun @ found.fun) / free
     expected = np.sqrt(np.diag(covariance))
-    np.testing.assert_allclose(sigma, expected[6:9], rtol=0.01)
-    np.testing.assert_allclose([bow.result.sigma(name) for name in names], expected[:6], rtol=0.01)
+    np.testing.assert_allclose(sigma, expected[:9], rtol=0.01)  # were all corners independent
+    stated = [*(bow.result.sigma(name) for name in names), *np.sqrt(np.diag(bow.covariance))]
+    np.testing.assert_allclose(stated, expected[:9], rtol=0.5)  # and as nine views scatter
 
 
 def test_bow_agrees_with_opencvs_released_object() -> None:

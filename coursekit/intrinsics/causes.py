@@ -63,13 +63,14 @@ BOW, HEIGHTS, PRINT = "bowed_board", "heights", "print"
 DRIFT, FOCUS = "steady_drift", "focus_drift"
 SHUTTER, LENS = "rolling_shutter", "lens_model"
 SHAPE = (BOW, HEIGHTS, PRINT)  # of the board: three causes, one fault
-PHYSICAL = (*SHAPE, DRIFT, FOCUS, SHUTTER, LENS)
+FLEX = "flexing_board"
+PHYSICAL = (*SHAPE, FLEX, DRIFT, FOCUS, SHUTTER, LENS)
 SPOILED_VIEW, BAD_CORNERS = "spoiled_view", "bad_corners"
-OWN = {FOCUS: 1, SHUTTER: 3}  # columns of the causes that each view has of its own
+OWN = {FLEX: 3, FOCUS: 1, SHUTTER: 3}  # columns of the causes that each view has of its own
 # What a cause's coefficients are when it matters: bow, heights, print and motion during the readout
 # in m, relative focal length, px for the rest.
 TYPICAL = {
-    BOW: 5e-4, HEIGHTS: 3e-4, PRINT: 1e-4, DRIFT: 0.5, FOCUS: 0.01, SHUTTER: 1e-3, LENS: 0.5,
+    BOW: 5e-4, FLEX: 5e-4, HEIGHTS: 3e-4, PRINT: 1e-4, DRIFT: 0.5, FOCUS: 0.01, SHUTTER: 1e-3, LENS: 0.5,
     SPOILED_VIEW: 1.0, BAD_CORNERS: 1.0,
 }  # fmt: skip
 SHAPE_VIEWS, SHAPE_SIGHTS = 6, 5  # so many, and of each corner on average, tell a shape from noise
@@ -78,6 +79,7 @@ SMOOTH_DEGREE = 3  # of the field over the board that is no corner's noise
 # causes explain them together; else a cause must take most of what they hold by itself.
 AS_SMALL, MOST_CAUSES = 1.2, 2
 MOST, MOST_OF_SHAPE = 0.75, 0.5  # paper is never without a shape, whatever comes on top
+STIFF = 0.1  # nor is it stiff: that much of what its shape does changes from view to view
 # At most 2 % of healthy sessions may get a finding. Six kinds of test at this level make 0.2 %; the
 # rest is for noise that is not quite Gaussian and for the checks that are no F-tests.
 CHANCE_LEVEL = 3e-4
@@ -187,7 +189,10 @@ class Calibration:
         """Residuals and derivatives at the corners."""
         corners, camera, values = self.corners, self.camera, self.values
         R, t = self.poses[corners.view, :3, :3], self.poses[corners.view, :3, 3]
-        still = np.einsum("nij,nj->ni", R, corners.points + self.shape[corners.ids]) + t
+        bow = bow_shape(self, corners.points)
+        off = self.shape[corners.ids]
+        off[:, 2] += np.einsum("nk,nk->n", bow, values[FLEX][corners.view])
+        still = np.einsum("nij,nj->ni", R, corners.points + off) + t
         # The row at which a corner was seen is measured: nothing has to be solved for it.
         time = (corners.pixels[:, 1] + 0.5) / camera.height - 0.5
         points = still + time[:, None] * values[SHUTTER][corners.view]
@@ -207,7 +212,8 @@ class Calibration:
         drift = np.concatenate([0.01 * from_axis[..., None], centre], axis=2)
         heights, spread = self.free
         columns = {
-            BOW: on_board[:, :, 2:] * bow_shape(self, corners.points)[:, None, :],
+            BOW: on_board[:, :, 2:] * bow[:, None, :],
+            FLEX: on_board[:, :, 2:] * bow[:, None, :],
             HEIGHTS: on_board[:, :, 2:] * heights[corners.ids][:, None, :],
             PRINT: on_board[:, :, :2] @ spread[corners.ids],
             DRIFT: drift * number[:, None, None],
@@ -420,13 +426,17 @@ def named(found: CauseSearch[Calibration]) -> list[Accepted[Calibration]]:
     shape = [step for step in found.accepted if step.test.cause in SHAPE]
     others = [s for s in found.accepted if s.test.cause in PHYSICAL and s not in shape]
 
+    def taken(steps: Sequence[Accepted[Calibration]]) -> float:
+        return sum(step.before.left_px**2 - step.after.left_px**2 for step in steps)
+
     def takes(steps: Sequence[Accepted[Calibration]], share: float) -> bool:
-        taken = sum(step.before.left_px**2 - step.after.left_px**2 for step in steps)
-        return taken >= share * max(steps[0].before.left_px ** 2 - noise, 0.0)
+        return taken(steps) >= share * max(steps[0].before.left_px ** 2 - noise, 0.0)
 
     closed = found.model.left_px**2 <= AS_SMALL * noise and len(others) <= MOST_CAUSES
     good = shape if shape and (closed or takes(shape, MOST_OF_SHAPE)) else []
-    good = good + [step for step in others if closed or takes([step], MOST)]
+    crumbs = STIFF**2 * taken(good)
+    large = [step for step in others if taken([step]) > crumbs]
+    good = good + [step for step in large if closed or takes([step], MOST)]
     kept = _sound(found, good)
     return [step for step in kept if step.test.cause not in PHYSICAL] + good
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from coursekit.arrays import Floats
+from coursekit.arrays import ArrayLike, Floats
 from coursekit.boards import Board, Detection
 from coursekit.checks import want
 from coursekit.geometry import Intrinsics, deproject, moved, project
@@ -89,11 +89,12 @@ def halves(
     same_focal: bool = False,
     range_m: float | None = None,
     shape: tuple[int, int] = MAP_SHAPE,
+    points: ArrayLike | None = None,
 ) -> HalvesDifference:
     """Calibrate the even and the odd views apart and compare.
 
     range_m: where to compare, m; None takes the boards' median distance. shape: (rows, columns)
-    of the map. Raises ValueError where a half is too small to fit, and as `calibrate`.
+    of the map. points (N, 3): where the board's corners really are, m, as in `calibrate`. Raises ValueError where a half is too small to fit, and as `calibrate`.
 
     >>> halves([], Board("checkerboard", (10, 7), 0.025))
     Traceback (most recent call last):
@@ -102,7 +103,7 @@ def halves(
     if len(detections) < 6:
         raise ValueError(f"detections: got {len(detections)} views, halves need at least 6")
     first, second = (
-        calibrate([detections[i] for i in part], board, model, same_focal)
+        calibrate([detections[i] for i in part], board, model, same_focal, points=points)
         for part in (range(0, len(detections), 2), range(1, len(detections), 2))
     )
     range_m = first.board_range_m if range_m is None else float(range_m)

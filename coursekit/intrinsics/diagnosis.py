@@ -226,7 +226,7 @@ def _residuals(result: IntrinsicsResult, unseen: list[str]) -> list[Finding]:
         why = "another step of the solver would still move the parameters"
         found.insert(0, _TEXTS.finding("not_converged", why=why))
     try:
-        apart = _halves(search.model, result, explained=bool(found))
+        apart = _halves(model, result, explained=bool(found))
     except (CalibrationFailed, np.linalg.LinAlgError) as error:
         unseen.append(_TEXTS.not_tested["halves"].format(error=error))
         return found
@@ -373,7 +373,8 @@ def _halves(model: Calibration, result: IntrinsicsResult, explained: bool) -> Fi
     kept = causes.kept(model, result.detections)
     if len(kept) < FEW_VIEWS or _no_edge_corners(result.detections):
         return None
-    both = halves(kept, result.board, model=result.model)
+    points = model.board + model.shape
+    both = halves(kept, result.board, model=result.model, points=points)
     worst, sigma = float(np.nanmax(both.length_px)), float(np.nanmax(both.expected_px))
     unexplained = both.p_value < causes.CHANCE_LEVEL and worst > GRAVE_PX and not explained
     if not unexplained and min(worst, sigma) < LOST_PX:
