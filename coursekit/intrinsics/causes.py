@@ -3,10 +3,11 @@
 The model is the camera and the board's pose in each view, to which causes are added. Corner j, at
 P_j on the board (m, z into it), is seen at
 
-    p = R_i (P_j + (bow(P_j) + height_j) n + print_j) + t_i + time motion_i,
+    p = R_i (P_j + (bow(P_j) + height_j + flex_i(P_j)) n + print_j) + t_i + time motion_i,
     pixel = c + drift_c number_i + (1 + focus_i + drift_f number_i) (K distort(p) + lens terms - c),
 
-where bow is a quadratic form (constant and linear terms are poses), n the board's normal, height_j
+where bow is a quadratic form (constant and linear terms are poses), as flex_i is, that of a board
+which bends from view to view, n the board's normal, height_j
 and print_j what the corner is off out of the plane and in it, motion_i what the board moves while
 view i is read out (time = -1/2 ... 1/2 from first row to last), focus_i the view's relative change
 of the focal length, and number_i = -1/2 ... 1/2 over the session. Heights, prints, motions and
@@ -59,19 +60,18 @@ from coursekit.intrinsics.derivatives import (
 from coursekit.intrinsics.fit import MIN_CORNERS, IntrinsicsResult, evaluate
 from coursekit.words import p_text
 
-BOW, HEIGHTS, PRINT = "bowed_board", "heights", "print"
+BOW, HEIGHTS, PRINT, FLEX = "bowed_board", "heights", "print", "flexing_board"
 DRIFT, FOCUS = "steady_drift", "focus_drift"
 SHUTTER, LENS = "rolling_shutter", "lens_model"
 SHAPE = (BOW, HEIGHTS, PRINT)  # of the board: three causes, one fault
-FLEX = "flexing_board"
 PHYSICAL = (*SHAPE, FLEX, DRIFT, FOCUS, SHUTTER, LENS)
 SPOILED_VIEW, BAD_CORNERS = "spoiled_view", "bad_corners"
 OWN = {FLEX: 3, FOCUS: 1, SHUTTER: 3}  # columns of the causes that each view has of its own
 # What a cause's coefficients are when it matters: bow, heights, print and motion during the readout
 # in m, relative focal length, px for the rest.
 TYPICAL = {
-    BOW: 5e-4, FLEX: 5e-4, HEIGHTS: 3e-4, PRINT: 1e-4, DRIFT: 0.5, FOCUS: 0.01, SHUTTER: 1e-3, LENS: 0.5,
-    SPOILED_VIEW: 1.0, BAD_CORNERS: 1.0,
+    BOW: 5e-4, HEIGHTS: 3e-4, PRINT: 1e-4, FLEX: 5e-4, DRIFT: 0.5, FOCUS: 0.01, SHUTTER: 1e-3,
+    LENS: 0.5, SPOILED_VIEW: 1.0, BAD_CORNERS: 1.0,
 }  # fmt: skip
 SHAPE_VIEWS, SHAPE_SIGHTS = 6, 5  # so many, and of each corner on average, tell a shape from noise
 SMOOTH_DEGREE = 3  # of the field over the board that is no corner's noise
@@ -139,8 +139,8 @@ class Calibration:
     T_camera_board. names: of the n views. board (m, 3): its corners, m; free: what they are free to
     do, see `free_shapes`. values: the coefficients of the causes, 0 where a cause is not in the
     model: bow (3,) of x^2, xy, y^2 in half diagonals, m; heights (m - 3,) and print (2 m - 4,),
-    m; drift (3,) over the session, of the focal length in per cent and of the centre in px; focus
-    (n, 1); motion (n, 3) during the readout of a whole image, m; lens (8 or more,), the terms of
+    m; flex (n, 3) as bow; drift (3,) over the session, of the focal length in per cent and of the
+    centre in px; focus (n, 1); motion (n, 3) during the readout of a whole image, m; lens (8 or more,), the terms of
     `lens_terms`. sizes: the causes that were added, with their coefficients' rms. prior_px: the
     corners' noise against which those are weighed.
     """
@@ -245,11 +245,11 @@ class Calibration:
         """
         linear, view = self.linear, np.repeat(self.corners.view, 2)
         rows_of = [np.flatnonzero(view == v) for v in self.views]
-        own, shared = [linear.own], [linear.shared]
+        own, shared = linear.own, [linear.shared]
         if smooth:  # in place of the views' own causes: a row that was measured has noise in it
-            own = [linear.own[..., :6], self._fields]
+            own = np.concatenate([own[..., :6], self._fields], axis=2)
             shared += [linear.columns[c] for c in (HEIGHTS, PRINT) if self.shows_shape]
-        own = np.concatenate(own, axis=2).reshape(len(view), -1)
+        own = own.reshape(len(view), -1)
         blocks = [(rows, own[rows]) for rows in rows_of]
         columns = np.concatenate(shared, axis=2).reshape(len(view), -1)
         by_row = None if weights is None else np.repeat(weights, 2)
@@ -288,8 +288,8 @@ class Calibration:
         x, y = ((self.corners.points - self.board.mean(axis=0))[:, :2] / self.half_diagonal).T
         powers = [(i, j) for i in range(SMOOTH_DEGREE + 1) for j in range(SMOOTH_DEGREE + 1 - i)]
         terms = np.stack([x**i * y**j for i, j in powers], axis=1)
-        few = np.bincount(self.index)[self.index] < 2 * len(powers)
-        terms[np.ix_(few, [i + j > 2 for i, j in powers])] = 0.0  # a cubic takes few corners whole
+        few = np.bincount(self.index)[self.index] < 2 * len(powers)  # a cubic takes those whole
+        terms[np.ix_(few, np.array([i + j > 2 for i, j in powers]))] = 0.0
         return np.einsum("nk,ij->nijk", terms, np.eye(2)).reshape(len(x), 2, -1)
 
     @cached_property

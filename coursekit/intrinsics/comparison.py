@@ -94,7 +94,8 @@ def halves(
     """Calibrate the even and the odd views apart and compare.
 
     range_m: where to compare, m; None takes the boards' median distance. shape: (rows, columns)
-    of the map. points (N, 3): where the board's corners really are, m, as in `calibrate`. Raises ValueError where a half is too small to fit, and as `calibrate`.
+    of the map. points (N, 3): where the board's corners really are, m, as in `calibrate`.
+    Raises ValueError where a half is too small to fit, and as `calibrate`.
 
     >>> halves([], Board("checkerboard", (10, 7), 0.025))
     Traceback (most recent call last):

@@ -187,21 +187,23 @@ class NormalEquations:
         """How the first p shared parameters scatter from view to view; all g get a covariance.
 
         The views' gradients say it, whatever the residuals of one view have in common: half of
-        each variance is the parameter's own (a sandwich with the view as its cluster), half the
-        `shared_covariance` times what all p agree on. Both are scaled to be right, on average, for
-        independent corners, however few the views. Source: Bell and McCaffrey, "Bias reduction in
-        standard errors for linear regression with multi-stage samples" (2002).
+        each variance is the parameter's own, by a jackknife in which each view in turn keeps an
+        n-th of its weight; half is the `shared_covariance` times what all p agree on. That is right
+        for independent corners and for views that differ, however few they are. Source: Bell and
+        McCaffrey, "Bias reduction in standard errors for linear regression with multi-stage
+        samples" (2002).
         """
         V, (information, gradients) = self.shared_covariance, self.parts
         moves = gradients @ V  # what each view adds to the parameters, (n, g)
+        least = np.eye(len(V)) - (1.0 - 1.0 / len(moves)) * information @ V
+        without = np.linalg.solve(least, gradients[..., None])[..., 0] @ V
         free = information - information @ V @ information
         expected = np.einsum("ag,ngh,hb->nab", V[:p], free, V[:, :p])  # of moves, at noise 1
         by_view = np.einsum("ag,ngh,ha->na", V, free, V)
         inverse = scaled_inverse(V[:p, :p])
         squares = np.einsum("na,ab,nb->", moves[:, :p], inverse, moves[:, :p])
         variance = float(squares / np.einsum("nab,ab->", expected, inverse))
-        scale = np.sqrt(np.diag(V) / (np.diag(V) + by_view.sum(axis=0)))
-        covariance = scale[:, None] * (moves.T @ moves + variance * V) * scale
+        covariance = (without.T @ without + variance * V) / 2.0
         own = by_view[:, :p].sum(axis=0) ** 2 / (by_view[:, :p] ** 2).sum(axis=0)
         return Scatter(covariance, variance, float(4.0 * np.mean(own) / (1.0 + 3.0 / p)))
 

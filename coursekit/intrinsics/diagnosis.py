@@ -111,7 +111,10 @@ def diagnose(
     if flat:
         unseen.append(_TEXTS.not_tested["residuals"])
     else:
-        found += _residuals(result, unseen)
+        start = causes.refit(Calibration.of(result))
+        if lens := _wrong_lens(start):  # passes for everything else
+            return Findings([*found, lens], _TEXTS.looked_for, [_TEXTS.not_tested["lens_first"]])
+        found += _residuals(start, result, unseen)
     scale = depth_scale(result, [depths[i] for i in used]) if depths else None
     design = [_blur(views), flat, _no_edge_corners(views), _wrong_squares(result, scale)]
     found += [finding for finding in design if finding]
@@ -203,13 +206,8 @@ def _lattice_misfit(detections: list[Detection], columns: int) -> float:
 # --- after a fit ---
 
 
-def _residuals(result: IntrinsicsResult, unseen: list[str]) -> list[Finding]:
+def _residuals(start: Calibration, result: IntrinsicsResult, unseen: list[str]) -> list[Finding]:
     """What the residuals of a fit speak for; what could not be tested is added to `unseen`."""
-    start = causes.refit(Calibration.of(result))
-    lens = _wrong_lens(start)
-    if lens:
-        unseen.append(_TEXTS.not_tested["lens_first"])
-        return [lens]
     search = causes.search_residuals(start)
     model, steps = causes.explained(search), causes.named(search)
     found = []
@@ -312,6 +310,11 @@ def _shape(search: _Search, steps: _Steps, model: Calibration) -> _Told:
     return "bowed_board", figures
 
 
+def _flex(search: _Search, steps: _Steps, model: Calibration) -> _Told:
+    size = model.sizes[causes.FLEX]
+    return ("flexing_board", {"size": 1e3 * size}) if size >= NORMAL_BOW_M else None
+
+
 def _drift(search: _Search, steps: _Steps, model: Calibration) -> _Told:
     longer, right, down = model.values[causes.DRIFT].tolist()
     if abs(longer) < 100 * NORMAL_DRIFT and math.hypot(right, down) < NORMAL_SHIFT_PX:
@@ -342,6 +345,7 @@ _FIGURES: tuple[tuple[tuple[str, ...], Callable[[_Search, _Steps, Calibration], 
     ((causes.SPOILED_VIEW,), _spoiled_views),
     ((causes.BAD_CORNERS,), _bad_corners),
     (causes.SHAPE, _shape),
+    ((causes.FLEX,), _flex),
     ((causes.DRIFT,), _drift),
     ((causes.FOCUS,), _focus),
     ((causes.SHUTTER,), _shutter),

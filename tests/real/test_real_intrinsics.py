@@ -130,7 +130,8 @@ SESSIONS = ("doosan", "opencv", "udacity", *(f"cam{k}" for k in CAMS))
 STILL = {  # the board is paper and no more is wrong, or what is wrong has no name here
     "doosan": {"bowed_board", "no_edge_corners"},
     "opencv": {"bowed_board"},
-    "udacity": {"bowed_board", "unexplained", "motion_blur", "halves_disagree"},
+    # one photograph is 1281 px wide, and there are corners in no corner of the image
+    "udacity": {"mixed_sizes", "bowed_board", "unexplained", "motion_blur", "halves_disagree"},
 }
 HELD = {"bowed_board", "unexplained", "no_edge_corners", "rolling_shutter", "focus_drift"}
 
@@ -148,7 +149,8 @@ def test_paper_is_named_and_nothing_is_invented(sessions, name):
         assert not FIGURE.search(text)
     if name.startswith("cam"):
         [bowed] = [f for f in findings if f.name == "bowed_board"]
-        assert "corner 2 is 0.4" in bowed.evidence
+        [dent] = re.findall(r"corner 2 is ([0-9.]+) mm out of the board", bowed.evidence)
+        assert 0.35 < float(dent) < 0.45
         for motion in re.findall(r"([0-9.]+) mm of motion", repr(findings)):
             assert 0.1 < float(motion) < 3  # a hand moves 5 to 100 mm/s
 
@@ -184,8 +186,8 @@ def test_four_webcams_see_the_same_shape_of_the_same_board(sessions):
     assert np.mean(heights, axis=0).argmin() == 2
 
 
-def test_the_factorys_k_is_inside_of_what_the_shape_leaves(sessions):
-    """With the board's shape rms falls from 0.64 to 0.08 px, and fx stays near the factory's."""
+def test_the_published_k_is_one_of_the_flat_board_and_inside_its_interval(sessions):
+    """It was fitted as if the board were flat; with the shape rms falls from 0.64 to 0.08 px."""
     views, board = sessions["doosan"]
     fit = intrinsics.calibrate(views, board)
     shaped = intrinsics.fit_shape(fit)
@@ -193,7 +195,7 @@ def test_the_factorys_k_is_inside_of_what_the_shape_leaves(sessions):
     assert shaped.rms_px < 0.1
     for name, factory in (("fx", 898.29), ("fy", 901.07), ("cx", 649.37), ("cy", 362.53)):
         assert abs(fit.value(name) - factory) < 2 * fit.sigma(name)
-        assert abs(shaped.value(name) - factory) < 0.005 * factory
+        assert abs(shaped.value(name) - factory) < 5
     assert shaped.sigma("fx") < 0.5 * fit.sigma("fx")
 
 
