@@ -36,6 +36,8 @@ def pytest_collection_modifyitems(items):
         for module in modules.values():
             if module[0].path.suffix != ".ipynb":
                 order.shuffle(module)
+            if module[0].get_closest_marker("browser"):  # the tests of a page share its Run All
+                module.sort(key=lambda item: item.callspec.params["name"])
         items[:] = chain.from_iterable(order.sample(list(modules.values()), len(modules)))
 
 

@@ -10,15 +10,16 @@ and `words` serve them all.
 | `checks` | checks of arguments, one line each | `ValueError`: NAME: got ..., want ... | - |
 | `words` | tables, plurals, wrapped lines, p-values; what a diagnosis found | text and HTML, `Findings` | - |
 | `kernels` | whole images at a time, compiled with numba | arrays | - |
-| `geometry` | `project` and `deproject`, rigid transforms and small motions | `Intrinsics`, (4, 4) transforms | `kernels` |
+| `formats` | files of other programs: lenses, tables of poses, transforms | dictionaries of fields, (4, 4) transforms | - |
+| `geometry` | `project` and `deproject`, rigid transforms and small motions | `Intrinsics`, (4, 4) transforms | `kernels`, `formats` |
 | `specifications` | devices, lenses and published noise, from tables in data/ | `Device`, `Unit` | `geometry` |
-| `results` | the files by which a notebook hands over what it found | `Result`, results/*.json | - |
+| `results` | the files by which a notebook hands over what it found, and `export` | `Result`, results/*.json | `formats`, `geometry` |
 | `stereo` | depth from disparity: its noise, its bias, a block's face | `WindowStats`, `NoiseFit`, `BiasFit` | `geometry` |
 | `boards` | calibration boards: drawn, found, corners refined, is it seen from here | `Board`, `Detection(s)` | `geometry` |
 | `causes` | the search for what else explains residuals; both diagnoses use it | `Hypothesis`, `Tested` | - |
 | `intrinsics` | K and distortion: fitted, how well known, what is wrong with a session | `IntrinsicsResult`, `Findings` | `geometry`, `specifications`, `results`, `boards`, `causes` |
 | `arm` | the WidowX: kinematics, and how an arm errs | `Arm`, joint angles, (4, 4) poses | `geometry`, `specifications` |
-| `hand_eye` | where the camera is: AX = XB, refined, how good, what is wrong | `HandEyeSession`, `HandEyeResult` | `geometry`, `results`, `boards`, `causes`, `intrinsics`, `arm` |
+| `hand_eye` | where the camera is: AX = XB, refined, how good, what is wrong | `HandEyeSession`, `HandEyeResult` | `formats`, `geometry`, `results`, `boards`, `causes`, `intrinsics`, `arm` |
 | `budget` | errors in millimetres at the gripper, added up | `View`, `ErrorTerm`, `ErrorBudget` | `geometry`, `specifications`, `results`, `stereo`, `intrinsics`, `arm`, `hand_eye` |
 | `attribution` | whose fault misses are | (n, 3) misses, `Attribution` | `geometry`, `results`, `arm`, `budget` |
 | `simulation` | scenes, light, infrared, boards and arms that do not exist | `Scene`, `Rig`, sessions with their truth | `geometry`, `specifications`, `boards`, `arm`, `hand_eye` |
@@ -28,7 +29,7 @@ and `words` serve them all.
 | `submission` | handing in and grading the studio exercise | `Submission`, bundles (.zip), HTML pages | `specifications`, `results`, `stereo`, `cameras`, `lessons` |
 | `doctor` | what works on this computer, and what to do about the rest | lines of text | `results`, `stereo`, `cameras` |
 | `warm_up` | compiles what numba compiles, before the first notebook | nothing | `geometry`, `boards`, `simulation` |
-| `cli` | the command `coursekit` | arguments, exit codes | `boards`, `cameras`, `submission`, `doctor` |
+| `cli` | the command `coursekit` | arguments, exit codes | `results`, `boards`, `cameras`, `submission`, `doctor` |
 
 Where a thing is: open the room's `__init__.py`; it begins with the room's question or equation and
 lists what the room offers. A module is named for what is in it.
@@ -62,6 +63,7 @@ if TYPE_CHECKING:
     from coursekit.lessons import check, checkpoint, evidence
     from coursekit.lessons.overview import progress
     from coursekit.plots import drag
+    from coursekit.results import export
     from coursekit.submission.submit import submit
 
 __all__ = [
@@ -75,6 +77,7 @@ __all__ = [
     "checkpoint",
     "drag",
     "evidence",
+    "export",
     "geometry",
     "hand_eye",
     "intrinsics",
@@ -100,6 +103,7 @@ _FUNCTIONS = {
     "evidence": "coursekit.lessons",
     "progress": "coursekit.lessons.overview",
     "drag": "coursekit.plots",
+    "export": "coursekit.results",
     "submit": "coursekit.submission.submit",
 }
 

@@ -88,9 +88,32 @@ def _parser() -> argparse.ArgumentParser:
     finished = "replace a finished report; only what has changed is graded"
     the.add_argument("--overwrite", action="store_true", help=finished)
 
+    _add_export(command)
+
     the = command("doctor", _doctor, "say what works here, and what to do about the rest")
     the.add_argument("--camera", default="auto", metavar="WHICH", help=CAMERAS)
     return parser
+
+
+def _export(options: argparse.Namespace) -> None:
+    names = ("parent", "optical", "link", "T_link_optical", "overwrite")
+    frames = {name: getattr(options, name) for name in names}
+    print(ck.export(options.what, options.to, options.out, **frames))
+
+
+def _add_export(command: Callable[..., Any]) -> None:
+    more = "A lens, or where the camera is, as other programs read it (the README has a table)."
+    the = command("export", _export, "write a result for ROS, OpenCV and others", description=more)
+    what = "03_intrinsics, 04_hand_eye, or a file of a lens"
+    the.add_argument("what", metavar="WHAT", help=what)
+    the.add_argument("--to", required=True, metavar="FORMAT", help="/".join(ck.results.EXPORTS))
+    the.add_argument("--out", metavar="FILE", help="default: print it")
+    the.add_argument("--parent", metavar="FRAME", help="what X is given in, default: the gripper")
+    the.add_argument("--optical", metavar="FRAME", default=ck.results.OPTICAL)
+    the.add_argument("--link", metavar="FRAME", help="of the driver, above the optical frame")
+    pose = "where optical is in link, m: 'turn', or 'x y z qx qy qz qw' as tf2_echo says"
+    the.add_argument("--link-to-optical", dest="T_link_optical", metavar="POSE", help=pose)
+    the.add_argument("--overwrite", action="store_true", help="replace an existing file")
 
 
 def _squares(text: str) -> tuple[int, int]:

@@ -440,8 +440,11 @@ def _baseline(camera: Any) -> CheckUp:
     from coursekit.cameras.realsense import specified
 
     if camera.baseline_m is None:
-        says = "not recorded: disparity and the noise law need it"
-        return CheckUp("note", says, "record anew with `coursekit record`, which keeps it")
+        says = "none: no stereo camera, or a recording without its baseline"
+        remedy = (
+            "sections on disparity use the D435's 50 mm; your noise is fitted as std over distance"
+        )
+        return CheckUp("note", says, remedy)
     says, device = f"{1e3 * camera.baseline_m:.2f} mm", specified(camera.name)
     if device is None:
         return CheckUp("ok", f"{says} (usual: 18 to 95 mm)")

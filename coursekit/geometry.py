@@ -8,7 +8,9 @@ takes coordinates in frame b to coordinates in frame a.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,8 +19,11 @@ from scipy.spatial.transform import Rotation
 from coursekit import kernels
 from coursekit.arrays import ArrayLike, Floats, NDArray
 from coursekit.checks import array, instance, number, positive, transform, transforms, want, whole
+from coursekit.formats.lens import read_lens
 
 DISTORTION_MODELS = ("none", "brown_conrady", "inverse_brown_conrady", "modified_brown_conrady")
+# What others call Brown-Conrady; ROS's rational_polynomial is that where k4 to k6 are zero
+SAME_MODEL = {"plumb_bob": "brown_conrady", "rational_polynomial": "brown_conrady"}
 _NEWTON_STEPS = 50
 _NEWTON_TOLERANCE = 1e-13  # normalised units; times fx this is 1e-10 px
 
@@ -29,7 +34,8 @@ class Intrinsics:
 
     `model` names what the device says about its coefficients; `project` and `deproject` take
     `dist` in OpenCV's sense, which is librealsense's `brown_conrady`. What the other two models
-    do differently is measured in notebook 01.
+    do differently is measured in notebook 01. `plumb_bob`, ROS's name, is taken for brown_conrady;
+    4, 5, 8, 12 or 14 coefficients, also as one row or column, where all after k3 are zero.
     """
 
     width: int
@@ -45,9 +51,11 @@ class Intrinsics:
         lengths = {"width": whole, "height": whole, "fx": positive, "fy": positive}
         for name, check in (lengths | {"cx": number, "cy": number}).items():
             object.__setattr__(self, name, check(name, getattr(self, name)))
+        model = SAME_MODEL.get(self.model, self.model)
         known = ", ".join(DISTORTION_MODELS)
-        want(self.model in DISTORTION_MODELS, "model", self.model, f"one of {known}")
-        coeffs = array("coeffs", self.coeffs, (5,), finite=True)
+        want(model in DISTORTION_MODELS, "model", model, f"one of {known}; {NO_OTHER}")
+        object.__setattr__(self, "model", model)
+        coeffs = _coefficients("coeffs", self.coeffs)
         object.__setattr__(self, "coeffs", tuple(coeffs.tolist()))
 
     @property
@@ -74,6 +82,79 @@ class Intrinsics:
     def vfov_deg(self) -> float:
         """Vertical field of view in degrees, edge of the first to edge of the last pixel."""
         return _field_of_view_deg(self.height, self.fy, self.cy)
+
+    def as_brown_conrady(self, k3: bool = True) -> Intrinsics:
+        """The Brown-Conrady lens nearest to this one; k3: whether it may have that coefficient.
+
+        K and coefficients are fitted again to where this camera sees rays all over its image:
+        dropping k3 would leave it to none of them. A lens of librealsense's inverse_brown_conrady
+        becomes one that `project` describes. `largest_difference_px` says how well that went.
+        """
+        from scipy.optimize import least_squares
+
+        known = "none, brown_conrady or inverse_brown_conrady"
+        want(
+            self.model != "modified_brown_conrady" or not any(self.coeffs),
+            "model",
+            self.model,
+            known,
+        )
+        if self.model != "inverse_brown_conrady" and (k3 or not self.coeffs[4]):
+            return self
+        rays, seen = self._rays()
+        free = 9 if k3 else 8
+
+        def lens_of(p: Floats) -> Intrinsics:
+            coeffs = tuple(np.append(p[4:], 0.0)[:5].tolist())
+            fx, fy, cx, cy = p[:4].tolist()
+            return replace(self, fx=fx, fy=fy, cx=cx, cy=cy, model="brown_conrady", coeffs=coeffs)
+
+        def off(p: Floats) -> Floats:
+            changed = lens_of(p)
+            return (project(rays, changed.K, changed.coeffs) - seen).ravel()
+
+        start = np.array([self.fx, self.fy, self.cx, self.cy, *self.coeffs])[:free]
+        return lens_of(least_squares(off, start, x_scale="jac", xtol=1e-15, ftol=1e-15).x)
+
+    def largest_difference_px(self, other: Intrinsics) -> float:
+        """The largest distance in the image between where this camera and another see a ray, px."""
+        rays, seen = self._rays()
+        return float(np.linalg.norm(project(rays, other.K, other.dist) - seen, axis=1).max())
+
+    def _rays(self) -> tuple[Floats, Floats]:
+        """Rays (n, 3) all over the image, and the pixels (n, 2) in which the camera sees them.
+
+        Source of inverse_brown_conrady: librealsense, `rs2_project_point_to_pixel`: the radial part
+        first, and the tangential part of what that gives.
+        """
+        grid = np.stack(np.meshgrid(*(np.linspace(0, n - 1, 24) for n in self.size)), axis=-1)
+        rays = deproject(grid.reshape(-1, 2), 1.0, self.K, self.dist)
+        rays = rays[np.isfinite(rays).all(axis=1)]
+        if self.model != "inverse_brown_conrady":
+            return rays, project(rays, self.K, self.dist)
+        k1, k2, p1, p2, k3 = self.coeffs
+        xy = distort(rays[:, :2], (k1, k2, 0.0, 0.0, k3))
+        xy = distort(xy, (0.0, 0.0, p1, p2, 0.0))
+        return rays, xy * [self.fx, self.fy] + [self.cx, self.cy]
+
+    @classmethod
+    def from_file(
+        cls,
+        path: str | os.PathLike[str],
+        size: Sequence[int] | None = None,
+        which: str | None = None,
+    ) -> Intrinsics:
+        """Intrinsics as ROS, OpenCV, Kalibr, COLMAP, Open3D or this course write them.
+
+        The format is recognised by what is in the file. size: (width, height), for a file of
+        OpenCV's that has none. which: of several cameras, such as "cam0". Raises ValueError in a
+        sentence for a damaged file, one of another kind, and a lens that is not Brown-Conrady.
+        """
+        fields = read_lens(path, size, which)
+        try:
+            return cls(**fields)
+        except ValueError as error:
+            raise ValueError(f"{os.path.basename(path)}: {error}") from None
 
     def to_dict(self) -> dict[str, Any]:
         """The fields as plain numbers, for JSON."""
@@ -163,7 +244,7 @@ def distort(xy: ArrayLike, dist: ArrayLike) -> Floats:
     Source: OpenCV, "Camera Calibration and 3D Reconstruction", with k4..k6 = 0.
     """
     xy = array("xy", xy, (2,), leading=True)
-    k1, k2, p1, p2, k3 = _coefficients(dist)
+    k1, k2, p1, p2, k3 = _coefficients("dist", dist)
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -184,7 +265,7 @@ def undistort(xy: ArrayLike, dist: ArrayLike) -> tuple[Floats, NDArray[np.bool_]
     back, a pixel there belongs to no ray, and the mask says so instead of inventing one.
     """
     target = array("xy", xy, (2,), leading=True)
-    dist = _coefficients(dist)
+    dist = _coefficients("dist", dist)
     ideal = np.where(np.isfinite(target), target, np.nan).copy()
     determinant = np.full(target.shape[:-1], np.nan)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -415,6 +496,11 @@ def moved(T: Floats, twists: Floats) -> Floats:
 
 # --- what a camera's numbers must be ---
 
+NO_OTHER = (
+    "rational, thin-prism and fisheye lenses are not supported: undistort the images first "
+    "(cv2.undistort, cv2.fisheye.undistortImage) and use the K of those, without distortion"
+)
+
 
 def _intrinsic_matrix(K: ArrayLike) -> Floats:
     K = array("K", K, (3, 3), finite=True)
@@ -424,10 +510,14 @@ def _intrinsic_matrix(K: ArrayLike) -> Floats:
     return K
 
 
-def _coefficients(dist: ArrayLike) -> Floats:
-    values = array("dist", dist, leading=True, finite=True)
-    want(values.shape in ((4,), (5,)), "dist", values, "(k1, k2, p1, p2[, k3])")
-    return np.append(values, 0.0) if values.shape == (4,) else values
+def _coefficients(name: str, given: ArrayLike) -> Floats:
+    """The (5,) coefficients; 4, or longer lists with nothing after k3, count as these."""
+    values = array(name, given, leading=True, finite=True)
+    flat = values.reshape(-1) if values.ndim == 2 and 1 in values.shape else values
+    fits = flat.shape in ((4,), (5,), (8,), (12,), (14,))
+    want(fits, name, values, "(k1, k2, p1, p2[, k3]), or 8, 12 or 14 with zeros after k3")
+    want(not flat[5:].any(), name, values, f"zeros after k3; {NO_OTHER}")
+    return np.append(flat, 0.0)[:5]
 
 
 def _field_of_view_deg(size: int, f: float, c: float) -> float:

@@ -1,7 +1,8 @@
-"""The hand-over between notebooks: one JSON file a notebook in `results/`.
+"""The hand-over between notebooks, and to a robot: one JSON file a notebook in `results/`.
 
 Every number carries its unit, its standard deviation, whether it is a bias or noise, and where it
-came from, so that the error budget can say whose numbers it uses.
+came from, so that the error budget can say whose numbers it uses. A lens and a camera's place go
+along whole, and `export` writes them as other programs read them.
 """
 
 from __future__ import annotations
@@ -20,10 +21,21 @@ from typing import Any, Literal, Protocol, get_args
 import numpy as np
 
 from coursekit import checks
+from coursekit.arrays import ArrayLike, Floats
 from coursekit.checks import want
+from coursekit.formats import lens as lens_files
+from coursekit.formats import numbers
+from coursekit.formats import poses as pose_files
+from coursekit.geometry import Intrinsics, cross_matrix, invert_transform
 
 ROOT = Path(__file__).resolve().parent.parent
-FORMAT = 1
+EXPORTS = tuple(dict.fromkeys((*lens_files.LENS_FORMATS, *pose_files.PLACE_FORMATS)))
+FORMAT = 2  # 1 had neither lens nor placement
+OPTICAL = "camera_color_optical_frame"  # as realsense-ros calls it: x right, y down, z forward
+PARENTS = {"eye_in_hand": "ee_gripper_link", "eye_to_hand": "base_link"}
+BASE, GRIPPER = "base_link", "ee_gripper_link"
+# The turn from a camera's link (x forward, y left, z up) to its optical frame, as ROS has it
+OPTICAL_TURN = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
 Source = Literal["live", "recorded", "simulated", "reference"]
 ErrorKind = Literal["bias", "noise"]
 
@@ -88,11 +100,63 @@ class Covariance:
         object.__setattr__(self, "matrix", tuple(map(tuple, matrix.tolist())))
 
 
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Where a camera is: T (4, 4) takes coordinates in `child` to coordinates in `parent`, m.
+
+    mount: "eye_in_hand" or "eye_to_hand". covariance (6, 6): of a small turn about the axes of
+    `parent` (rad) and a shift along them (m), (rx, ry, rz, tx, ty, tz); None where nobody knows.
+    """
+
+    parent: str
+    child: str
+    mount: str
+    T: Floats
+    covariance: Floats | None = None
+
+    def __post_init__(self) -> None:
+        checks.choice("mount", self.mount, PARENTS)
+        object.__setattr__(self, "T", checks.transform("T", self.T))
+        if self.covariance is not None:
+            known = checks.covariance("covariance", self.covariance, 6)
+            object.__setattr__(self, "covariance", known)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON has it, with the quaternion (x, y, z, w) beside the matrix."""
+        q = pose_files.described(self.T)
+        known = None if self.covariance is None else self.covariance.tolist()
+        return {
+            "parent": self.parent,
+            "child": self.child,
+            "mount": self.mount,
+            "T": self.T.tolist(),
+            "translation_m": [q[name] for name in pose_files.PLACE],
+            "quaternion_xyzw": [q[name] for name in pose_files.TURN],
+            "rpy_rad": [q[name] for name in ("roll", "pitch", "yaw")],
+            "covariance_rad_m": known,
+        }
+
+    @classmethod
+    def from_dict(cls, content: dict[str, Any]) -> Placement:
+        """Of `to_dict`; the matrix counts, what else says the same is for other readers."""
+        c = content
+        return cls(c["parent"], c["child"], c["mount"], c["T"], c["covariance_rad_m"])
+
+    def of_link(self, link: str, T_link_optical: ArrayLike) -> Placement:
+        """Where the link is that a driver hangs the optical frame on: T inv(T_link_optical)."""
+        T = self.T @ invert_transform(T_link_optical)
+        known, moved = self.covariance, np.eye(6)
+        moved[3:, :3] = -cross_matrix(T[:3, 3] - self.T[:3, 3])  # a turn of the camera moves it
+        known = None if known is None else moved @ known @ moved.T
+        return Placement(self.parent, link, self.mount, T, known)
+
+
 @dataclass(frozen=True)
 class Result:
     """What one notebook found: quantities by name, and the camera and day they come from.
 
-    covariances: of those quantities that were estimated together, by a name for the group.
+    covariances: of those quantities that were estimated together, by a name for the group. lens,
+    placement: the camera's K, size and distortion, and where it is, if the notebook found these.
     """
 
     lesson: str
@@ -102,6 +166,9 @@ class Result:
     versions: dict[str, str]
     quantities: dict[str, Quantity]
     covariances: dict[str, Covariance] = field(default_factory=dict)
+    serial: str = ""
+    lens: Intrinsics | None = None
+    placement: Placement | None = None
 
 
 def folder() -> Path:
@@ -114,11 +181,14 @@ def save(
     camera: MeasuringCamera,
     quantities: Mapping[str, Quantity],
     covariances: Mapping[str, Covariance] | None = None,
+    lens: Intrinsics | None = None,
+    placement: Placement | None = None,
 ) -> Path:
     """Write `results/<lesson>.json` in one step (a reader sees the old file or the new one).
 
-    covariances: of those quantities that were estimated together, by a name for the group. Returns
-    the path. Raises ValueError for what is no quantity and no covariance, and for a covariance of
+    covariances: of those quantities that were estimated together, by a name for the group. lens,
+    placement: for `export`; the camera's serial number goes along where it has one. Returns the
+    path. Raises ValueError for what is no quantity and no covariance, and for a covariance of
     something that is not among the quantities.
     """
     covariances = covariances or {}
@@ -129,9 +199,10 @@ def save(
         for name in checks.instance(argument, covariance, Covariance).names:
             want(name in quantities, argument, name, "the name of a quantity")
     made = (lesson, camera.source, camera.name, now(), versions())
-    result = Result(*made, dict(quantities), dict(covariances))
+    result = Result(*made, dict(quantities), dict(covariances), getattr(camera, "serial", ""))
+    whole = {"lens": lens and lens.to_dict(), "placement": placement and placement.to_dict()}
     path = _path(lesson)
-    write_json(path, {"format": FORMAT} | asdict(result))
+    write_json(path, {"format": FORMAT} | asdict(result) | whole)
     return path
 
 
@@ -147,22 +218,152 @@ def read(path: Path) -> Result:
     """A result in another folder; ValueError that names the file where it is damaged."""
     content = read_json(path)
     try:
-        if content.pop("format") != FORMAT:
+        if content.pop("format") not in (1, FORMAT):
             raise ValueError("written by another version of the course")
         quantities = {k: Quantity(**v) for k, v in content.pop("quantities").items()}
         covariances = {k: Covariance(**v) for k, v in content.pop("covariances", {}).items()}
         checks.choice("source", content["source"], get_args(Source))
+        lens, placement = content.pop("lens", None), content.pop("placement", None)
+        content["lens"] = lens and Intrinsics.from_dict(lens)
+        content["placement"] = placement and Placement.from_dict(placement)
         return Result(**content, quantities=quantities, covariances=covariances)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path.name}: {error}") from error
 
 
-def save_arrays(lesson: str, **arrays: Any) -> Path:
-    """Write the raw measurements behind a result to `results/<lesson>.npz`, in one step."""
-    path = _path(lesson).with_suffix(".npz")
-    with _whole(path) as part, part.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **arrays)
-    return path
+# --- to other programs ---
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What `export` wrote: the text of the file, where it is, and what the format made of it."""
+
+    text: str
+    path: Path | None
+    notes: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        where = [f"Wrote {self.path.name}." if self.path else self.text.rstrip()]
+        return "\n".join([*where, *(f"- {note}" for note in self.notes)])
+
+
+def export(
+    what: Any,
+    to: str,
+    out: str | os.PathLike[str] | None = None,
+    *,
+    parent: str | None = None,
+    optical: str = OPTICAL,
+    link: str | None = None,
+    T_link_optical: ArrayLike | str | None = None,
+    overwrite: bool = False,
+) -> Exported:
+    """Write a lens or a camera's place as another program reads it.
+
+    what: "03_intrinsics", "04_hand_eye" or the path of such a result; a lens file of any format;
+    or what calibrated it: `Intrinsics`, a result of `intrinsics.calibrate` or `hand_eye.solve`.
+    to: for a lens "ros", "opencv" (XML where `out` ends so), "kalibr", "colmap", "open3d", "json";
+    for a place "tf2", "urdf", "moveit", "easy_handeye2", "json". out: the file, None for none.
+
+    A place is that of the optical frame in `parent` (the gripper, or the base where the camera does
+    not move). A driver that publishes link -> optical already needs parent -> link instead, as a
+    frame has one parent only: name the `link` and give T_link_optical, (4, 4) in m, "turn" where
+    both have one origin, or "x y z qx qy qz qw" as tf2_echo says it.
+
+    Raises ValueError for what a format cannot hold, FileExistsError for a file that is there.
+    """
+    found = _exportable(what)
+    if isinstance(found, Intrinsics):
+        checks.choice("to (of a lens)", to, lens_files.LENS_FORMATS)
+        xml = out is not None and to == "opencv" and os.fspath(out).endswith(".xml")
+        text, notes = _lens_text(found, to, xml)
+    else:
+        checks.choice("to (of a camera's place)", to, (*pose_files.PLACE_FORMATS, "json"))
+        placed = Placement(parent or found.parent, optical, found.mount, found.T, found.covariance)
+        text, notes = _place_text(placed, to, link, T_link_optical)
+    path = None if out is None else Path(out)
+    if path is not None:
+        if path.exists() and not overwrite:
+            raise FileExistsError(f"{path} is there already; overwrite=True replaces it")
+        write_bytes(path, text.encode())
+    return Exported(text, path, notes)
+
+
+def placement(result: Any) -> Placement:
+    """The camera's place as `hand_eye.solve` found it, with the usual names of the two frames."""
+    known = None if result.refined is None else result.covariance[:6, :6]
+    return Placement(PARENTS[result.mount], OPTICAL, result.mount, result.X, known)
+
+
+def _exportable(what: Any) -> Intrinsics | Placement:
+    """The lens or the place in a result, in a file or in what a notebook calls it."""
+    if isinstance(what, (Intrinsics, Placement)):
+        return what
+    if hasattr(what, "X") and hasattr(what, "mount"):
+        return placement(what)
+    if hasattr(what, "intrinsics"):
+        return checks.instance("what", what.intrinsics, Intrinsics)
+    want(isinstance(what, (str, os.PathLike)), "what", what, "a result, or the path of a file")
+    path = Path(what) if Path(what).exists() else folder() / f"{what}.json"
+    want(path.is_file(), "what", os.fspath(what), f"a file, or a result in {folder().name}/")
+    try:
+        result = read(path)
+    except ValueError:  # no result of a notebook: a lens, whose reader says what else it is
+        return Intrinsics.from_file(path)
+    whole = result.lens or result.placement
+    again = f"{path.name}: holds no lens and no place of a camera, as notebooks 03 and 04 keep them"
+    if whole is None:
+        raise ValueError(f"{again}; of an older course, run the notebook again")
+    return whole
+
+
+def _lens_text(given: Intrinsics, to: str, xml: bool) -> tuple[str, tuple[str, ...]]:
+    """The text, and what became of the lens on the way."""
+    notes = []
+    fitted = given if to == "json" else given.as_brown_conrady(k3=to != "kalibr")
+    if fitted != given:
+        off = given.largest_difference_px(fitted)
+        lost = "the inverse model" if to != "kalibr" else "k3, for which Kalibr has no place"
+        notes.append(f"fitted again without {lost}: in the image off by {off:.4f} px at most")
+    if to == "colmap":
+        notes.append("COLMAP counts from the first pixel's corner: cx and cy are 0.5 px larger")
+    text = lens_files.write_lens(fitted.to_dict(), "opencv_xml" if xml else to)
+    return text, tuple(notes)
+
+
+def _place_text(
+    placed: Placement, to: str, link: str | None, T_link_optical: ArrayLike | str | None
+) -> tuple[str, tuple[str, ...]]:
+    """The text, and which frame it is of."""
+    optical = placed.child
+    notes = [f"of {optical}: if a driver publishes its place in a link, name the link instead"]
+    if link is not None:
+        if T_link_optical is None:
+            raise ValueError(
+                f"T_link_optical: where {optical} is in {link}: 'turn' where both have one origin, "
+                f"else as `ros2 run tf2_ros tf2_echo {link} {optical}` says it, for it may be "
+                "centimetres (a D435's colour camera is 15 mm beside its camera_link)"
+            )
+        T = (
+            OPTICAL_TURN
+            if isinstance(T_link_optical, str) and T_link_optical == "turn"
+            else T_link_optical
+        )
+        if isinstance(T, str):
+            values = numbers(T.split(), "T_link_optical")
+            T = pose_files.posed(values, "T_link_optical")
+        placed = placed.of_link(link, checks.transform("T_link_optical", T))
+        notes = [f"of {link}, which carries {optical}: X inv(T_link_optical)"]
+    if to == "json":
+        return json.dumps(placed.to_dict(), indent=1, allow_nan=False) + "\n", tuple(notes)
+    in_hand = placed.mount == "eye_in_hand"
+    base, gripper = (BASE, placed.parent) if in_hand else (placed.parent, GRIPPER)
+    names = {"parent": placed.parent, "child": placed.child, "base": base, "gripper": gripper}
+    kind = {"calibration_type": "eye_in_hand" if in_hand else "eye_on_base"}
+    return pose_files.write_place(placed.T, to, names | kind), tuple(notes)
+
+
+# --- files ---
 
 
 def write_json(path: Path, content: Any) -> None:

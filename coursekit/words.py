@@ -31,9 +31,9 @@ def with_notes(text: str, notes: Sequence[str]) -> str:
     return f"{text}.\n    {note}"
 
 
-def counted(n: int, thing: str) -> str:
-    """ "1 view", "3 views"."""
-    return f"{n} {thing}" + "s" * (n != 1)
+def counted(n: int, thing: str, several: str = "") -> str:
+    """ "1 view", "3 views"; several: the plural that is not made with an s."""
+    return f"{n} {thing}" if n == 1 else f"{n} {several or thing + 's'}"
 
 
 def p_text(p_value: float) -> str:

@@ -267,11 +267,18 @@ def mistaken(seed: int = 0) -> dict[str, tuple[str, Submission]]:
         factor = float(np.exp(k * law.covariance[0, 0] ** 0.5))
         return law.sigma_d_px / factor, law.sigma_d_px * factor
 
+    counts = good.stacks[1].counts.copy()
+    counts[::9, 20, 20] = 9000  # where all others are at 4500
+    spiked = (good.stacks[0], replace(good.stacks[1], counts=counts), good.stacks[2])
+    spiked = replace(good, stacks=spiked)
+    pooled = float(np.sqrt(np.nanvar(recompute(spiked).at[1].z_mm, axis=0, ddof=1).mean()))
+
     claiming, drawn = partial(with_part, good, "claims"), partial(with_part, good, "plot")
     concluding = partial(with_part, good, "conclusion")
     twice = {"exponent": 2 * free.exponent, "exponent_interval": (4 - one_sigma, 4 + one_sigma)}
     return wrong | {
         "unrounded": ("std", with_row(coarse, 0, depth_std_mm=unrounded)),
+        "mismatches": ("std", with_row(spiked, 1, depth_std_mm=pooled)),
         "unpooled": ("std", with_row(coarse, 0, depth_std_mm=float(each.mean()))),
         "millimetres": ("sigma_d", claiming(sigma_d_px=1000 * law.sigma_d_px)),
         "not_squared": ("sigma_d", claiming(sigma_d_px=by_z)),

@@ -1,21 +1,85 @@
-"""A lens, two boards, and fits to simulated sessions of them that several test modules share."""
+"""Lenses, boards, sessions and fits to simulated sessions that several test modules share."""
 
+from dataclasses import replace
 from functools import cache
 
+import numpy as np
 from common import CHARUCO, CHECKERBOARD, NIGHTLY
 
 from coursekit import intrinsics
-from coursekit.boards import Board
+from coursekit.arm import ArmErrors
+from coursekit.boards import Board, Detections
 from coursekit.geometry import Intrinsics
-from coursekit.simulation.corner_sessions import corner_session
+from coursekit.hand_eye.session import HandEyeSession
+from coursekit.simulation.arm_sessions import HandEyeMistakes, HandEyeTruth, hand_eye_session
+from coursekit.simulation.corner_sessions import Effects, Truth, corner_session, ordinary
 
 __all__ = ["CHARUCO", "CHECKERBOARD", "LENS", "NIGHTLY", "fit"]
 LENS = Intrinsics(
     640, 480, 612.0, 610.0, 322.0, 238.0, "brown_conrady", (0.08, -0.18, 0.0007, -0.0004, 0.05)
 )
+LENSES = [
+    Intrinsics(640, 480, 612, 610, 322, 238, "brown_conrady", (-0.12, 0.08, 1e-3, -8e-4, 0.02)),
+    Intrinsics(640, 480, 612, 610, 322, 238),
+    Intrinsics(848, 480, 425, 426, 424, 238, "brown_conrady", (-0.05, 0.06, 5e-4, 3e-4, -0.02)),
+    Intrinsics(1280, 720, 918, 917, 642, 362, "brown_conrady", (0.12, -0.25, 8e-4, 4e-4, 0.1)),
+]
+BOARDS = [Board("charuco", (9, 6), 0.025), Board("checkerboard", (10, 7), 0.025)]
+# Fisheyes of 120 to 160 degrees across the diagonal, and a wide lens that is a quotient of
+# polynomials: five coefficients leave 0.1 to 0.4 px of them, where the corners' noise is 0.08.
+BEYOND = [
+    (replace(LENSES[1], fx=300, fy=300), Effects(fisheye=True)),
+    (replace(LENSES[1], fx=250, fy=251), Effects(fisheye=True)),
+    (Intrinsics(1280, 720, 520, 521, 642, 362), Effects(fisheye=True)),
+    (replace(LENSES[1], fx=300, fy=300), Effects(rational=(0.3, 0.0, 0.0))),
+]
 
 
 @cache
 def fit(board: Board, seed: int, **session) -> intrinsics.IntrinsicsResult:
     """The fit to the views of one seed, made once a run; its `detections` are the views."""
     return intrinsics.calibrate(corner_session(board, LENS, seed, **session)[0], board)
+
+
+def ordinary_session(seed: int, **more) -> tuple[Detections, Truth, Board]:
+    """Both kinds of board, four lenses, 15 to 40 views and noise of 0.04 to 0.15 px in turn.
+
+    more: fields of Effects, what else the session has.
+    """
+    board, lens = BOARDS[seed % 2], LENSES[(seed // 2) % 4]
+    noise_px = 0.04 * 4 ** ((seed % 11) / 10)
+    effects = replace(ordinary(seed), **more)
+    views = 15 + (7 * seed) % 26
+    return *corner_session(board, lens, seed, views, noise_px, effects), board
+
+
+def beyond_session(seed: int) -> tuple[Detections, Truth, Board]:
+    """A session, ordinary otherwise, through a lens that five coefficients do not describe."""
+    board, (lens, effects) = BOARDS[seed % 2], BEYOND[(seed // 2) % len(BEYOND)]
+    street = replace(ordinary(seed), fisheye=effects.fisheye, rational=effects.rational)
+    return *corner_session(board, lens, seed, 20 + (7 * seed) % 21, 0.08, street), board
+
+
+def ordinary_arm_session(seed: int, **more) -> tuple[HandEyeSession, HandEyeTruth]:
+    """Both mounts, 10 to 30 poses, an arm that errs per pose by 0.1 to 0.5 degrees and 0.5 to 2 mm
+    (every third with heavy tails), every other one with zeros of joints and gear play besides.
+
+    more: fields of HandEyeMistakes. Every fourth is reported without joint angles.
+    """
+    rng = np.random.default_rng([seed, 7])
+    share = rng.random()
+    habits = {
+        "scatter_deg": 0.1 * 5**share,
+        "scatter_m": 0.0005 * 4**share,
+        "scatter_tails": seed % 3 == 2,
+    }
+    session, truth = hand_eye_session(
+        ("eye_in_hand", "eye_to_hand")[seed % 2],
+        seed,
+        n=10 + seed % 21,
+        corner_noise_px=rng.uniform(0.05, 0.2),
+        arm_errors=ArmErrors() if (seed // 2) % 2 else None,
+        mistakes=HandEyeMistakes(**habits | more),
+        images=ordinary(seed),
+    )
+    return (replace(session, q=None, dq=None) if seed % 4 == 3 else session), truth

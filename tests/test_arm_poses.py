@@ -8,7 +8,7 @@ from common import refusals
 from scipy.spatial.transform import Rotation
 
 from coursekit.boards import Board
-from coursekit.boards.view import BORDER_PX
+from coursekit.boards.board import BORDER_PX
 from coursekit.geometry import project, transform_points
 from coursekit.hand_eye import MOUNTS
 from coursekit.simulation import arm_poses as poses

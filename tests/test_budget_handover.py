@@ -122,7 +122,7 @@ def test_nothing_yet(folders: tuple[Path, Path]) -> None:
     ("old", "new", "named"),
     [
         ("}", "", "not a JSON file"),
-        ('"format": 1', '"format": 0', "another version"),
+        ('"format": 2', '"format": 0', "another version"),
         ('"value": 0.0', '"value": null', "value"),
         ('"04_hand_eye"', '"03_intrinsics"', "lesson: got '03_intrinsics', want 04_hand_eye"),
         ('"rz"', '"turn"', "holds no rz with a sigma"),

@@ -24,6 +24,7 @@ from coursekit.simulation.arm_sessions import (
     rendered_session,
     truth_of,
 )
+from coursekit.simulation.corner_sessions import Effects
 from coursekit.specifications import DATA
 from tools import make_data
 
@@ -124,6 +125,33 @@ def test_each_mistake_does_what_it_says() -> None:
     larger, truth = made(square_scale=1.05)
     assert larger.solve(free_scale=True).scale == pytest.approx(1.05, abs=0.001)
     np.testing.assert_allclose(healthy.times, SECONDS * np.arange(25))
+
+
+@pytest.mark.parametrize("tails", [False, True])
+def test_an_arm_errs_by_its_scatter_at_each_pose_on_its_own(tails: bool) -> None:
+    """With the std asked for, independent from pose to pose; heavy tails have some far larger."""
+    habits = HandEyeMistakes(scatter_m=1e-3, scatter_deg=0.2, scatter_tails=tails)
+    off = []
+    for seed in range(12):
+        session, truth = hand_eye_session("eye_in_hand", seed, 25, mistakes=habits)
+        off.append(pose_difference(session.T_base_gripper, truth.T_base_gripper))
+    off = np.stack(off) / np.repeat([np.radians(0.2), 1e-3], 3)
+    middle = 0.765 / np.sqrt(3) if tails else 0.674  # of |t| with 3 degrees of freedom, of |normal|
+    assert np.median(np.abs(off)) == pytest.approx(middle, abs=0.06)
+    assert abs(np.mean(np.sign(off[:, 1:] * off[:, :-1]))) < 0.12
+    far = (np.abs(off) > 4).sum()  # of 1,800: 0.1 of normal ones, 11 of t, six of one pose together
+    assert (far > 2) == tails
+
+
+def test_the_images_of_an_arm_may_be_ordinary_too() -> None:
+    """A wavy board and shared errors; the poses and the laboratory's noise stay as they are."""
+    plain, truth = hand_eye_session("eye_in_hand", 4, 10)
+    wavy, same = hand_eye_session("eye_in_hand", 4, 10, images=Effects(wave_m=4e-4, claimed=0.1))
+    assert np.array_equal(truth.T_camera_board, same.T_camera_board)
+    moved = [np.abs(b.pixels - a.pixels).max() for a, b in zip(plain.seen, wavy.seen, strict=True)]
+    assert min(moved) > 0.1
+    assert max(moved) < 3.0
+    assert wavy.seen[0].noise_px == pytest.approx(0.01)
 
 
 @pytest.mark.parametrize("by", [1, -1, 2])

@@ -19,10 +19,9 @@ import numpy as np
 import pytest
 
 from coursekit import lessons
-from coursekit.lessons import CHECKPOINTS, EXERCISES, progress
+from coursekit.lessons import CHECKPOINTS, EXERCISES, questions
 from coursekit.lessons.exercises import Exercise, Model
-from coursekit.lessons.progress import Verdict
-from coursekit.lessons.questions import EXAMPLES, Choice, Number, panel
+from coursekit.lessons.questions import EXAMPLES, Choice, Number, Verdict, panel
 
 NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 FILES = [Path(lessons.__file__).with_name(f"{lesson}.toml") for lesson in lessons.LESSONS]
@@ -436,7 +435,7 @@ def test_no_message_tells_a_number() -> None:
 @pytest.mark.parametrize("given", ["", "two", "nan", "inf", None, "20 00", [2000], "3,000"])
 def test_what_is_no_number_is_not_an_attempt(given) -> None:
     assert PITCH.answer(given).kind == "not attempted"
-    assert progress.read_attempts() == {}
+    assert questions.read_attempts() == {}
 
 
 def test_a_letter_that_is_none() -> None:
@@ -463,7 +462,7 @@ def test_the_widget_commits() -> None:
     field.value = "C"
     button.click()
     assert "right" in said.value
-    kinds = [a["kind"] for a in progress.read_attempts()["pinhole.half_size"]]
+    kinds = [a["kind"] for a in questions.read_attempts()["pinhole.half_size"]]
     assert kinds == ["wrong", "right"]
 
 
@@ -495,7 +494,7 @@ def test_evidence_of_the_core() -> None:
 def test_a_damaged_record_is_set_aside(own_results: Path) -> None:
     (own_results / "progress.json").write_text("{half", encoding="utf-8")
     PITCH.answer(2000)
-    assert len(progress.read_attempts()["pinhole.pitch"]) == 1
+    assert len(questions.read_attempts()["pinhole.pitch"]) == 1
     assert (own_results / "progress.damaged.json").read_text(encoding="utf-8") == "{half"
 
 

@@ -52,7 +52,7 @@ def test_damaged_files_are_named() -> None:
         "",
         "[]",
         "\x00",
-        text.replace('"format": 1', '"format": 99'),
+        text.replace('"format": 2', '"format": 99'),
         text.replace('"value": 1.0', '"value": null'),
         text.replace('"unit"', '"units"'),
         text.replace('"simulated"', '"invented"'),
@@ -95,19 +95,6 @@ def test_a_failed_write_leaves_the_old_file(own_results: Path) -> None:
     assert path.read_text(encoding="utf-8") == before
     assert len(list(own_results.iterdir())) == 1
     assert json.loads(before)["quantities"]["fx"]["value"] == 1.0
-
-
-def test_arrays_beside_the_result(own_results: Path) -> None:
-    depth = np.arange(12, dtype=np.uint16).reshape(3, 2, 2)
-    path = results.save_arrays("02_depth_noise", depth_counts_300_mm=depth)
-    assert path == own_results / "02_depth_noise.npz"
-    with np.load(path) as loaded:
-        assert np.array_equal(loaded["depth_counts_300_mm"], depth)
-        assert loaded["depth_counts_300_mm"].dtype == np.uint16
-    with pytest.raises(ValueError, match=r"[Oo]bject"):
-        results.save_arrays("02_depth_noise", bad=np.array([{}], dtype=object))
-    with np.load(path) as loaded:  # the old file is whole
-        assert list(loaded) == ["depth_counts_300_mm"]
 
 
 def quantity(**changes):

@@ -11,8 +11,14 @@ from scipy.spatial.transform import Rotation
 from simulated_corners import CHARUCO, CHECKERBOARD, LENS
 
 from coursekit.boards import Board
-from coursekit.geometry import Intrinsics
-from coursekit.simulation.corner_sessions import Effects, bowed, corner_session, rolling_shutter
+from coursekit.geometry import Intrinsics, project
+from coursekit.simulation.corner_sessions import (
+    Effects,
+    bowed,
+    corner_session,
+    ordinary,
+    rolling_shutter,
+)
 
 BOWED, LARGER = bowed(CHECKERBOARD, 1e-3), 1.03 * CHECKERBOARD.points
 
@@ -164,12 +170,90 @@ def session(board=CHARUCO, **changes):
     return corner_session(board, LENS, seed=0, **changes)
 
 
+# --- ordinary sessions ---
+
+
+def test_paper_is_as_wavy_and_as_oblique_as_was_asked_for() -> None:
+    """Heights over the best plane have their rms; fields of one reach differ between seeds."""
+    effects = Effects(wave_m=3e-4, wave_reach=0.2, print_error=3e-3)
+    shapes = [
+        corner_session(CHECKERBOARD, LENS, seed, 1, 0, effects)[1].points for seed in range(40)
+    ]
+    plane = np.column_stack([CHECKERBOARD.points[:, :2], np.ones(len(CHECKERBOARD.points))])
+    for points in shapes[:5]:
+        off = points[:, 2] - plane @ np.linalg.lstsq(plane, points[:, 2], rcond=None)[0]
+        assert np.sqrt(np.mean(off**2)) == pytest.approx(3e-4, rel=1e-6)
+    errors = np.stack([np.linalg.lstsq(plane[:, :2], p[:, :2], rcond=None)[0] for p in shapes])
+    wide, high = errors[:, 0, 0] - 1, errors[:, 1, 1] - 1
+    for part in (wide, high, errors[:, 1, 0]):
+        assert 2e-3 < part.std() < 4e-3
+    assert np.allclose(errors[:, 0, 1], 0)
+    assert abs(np.corrcoef(wide, high)[0, 1]) < 0.5
+
+
+def test_neighbours_share_a_part_of_their_errors_and_the_detector_says_less() -> None:
+    still, _ = corner_session(CHECKERBOARD, LENS, 3, 30, 0.0)
+    effects = Effects(shared=1.0, claimed=0.1)
+    found, _ = corner_session(CHECKERBOARD, LENS, 3, 30, 0.1, effects)
+    errors = np.stack([b.pixels - a.pixels for a, b in zip(still, found, strict=True)])
+    assert np.sqrt(np.mean(errors**2)) == pytest.approx(0.1 * np.sqrt(2), rel=0.1)
+    lattice = errors.reshape(30, 6, 9, 2) / errors.std()
+    near, far = (lattice[:, :, k:] * lattice[:, :, : 9 - k] for k in (1, 7))
+    assert 0.3 < near.mean() < 0.6  # half of exp(-1/8)
+    assert abs(far.mean()) < 0.15
+    assert {round(view.noise_px, 12) for view in found} == {0.01}
+
+
+def test_a_fisheye_grows_with_the_angle_and_a_rational_lens_is_opencvs() -> None:
+    lens = Intrinsics(640, 480, 250.0, 251.0, 322.0, 238.0)
+    found, truth = corner_session(CHECKERBOARD, lens, 2, 12, 0.0, Effects(fisheye=True))
+    for view, T in zip(found, truth.T_camera_board, strict=True):
+        x, y, z = (truth.points[view.ids] @ T[:3, :3].T + T[:3, 3]).T
+        across = np.hypot(x, y)
+        ray = np.arctan2(across, z) / across
+        expected = np.column_stack([250 * x * ray + 322, 251 * y * ray + 238])
+        assert np.abs(view.pixels - expected).max() < 1e-6
+    assert np.degrees(max(np.arctan2(np.hypot(*p[:2]), p[2]) for p in rays_of(truth))) > 55
+    bent = replace(LENS, fx=300.0, fy=300.0)
+    found, truth = corner_session(CHARUCO, bent, 2, 6, 0.0, Effects(rational=(0.3, 0.05, 0.0)))
+    for view, T in zip(found, truth.T_camera_board, strict=True):
+        x, y, z = (truth.points[view.ids] @ T[:3, :3].T + T[:3, 3]).T
+        x, y, (k1, k2, p1, p2, k3) = x / z, y / z, bent.coeffs
+        r2 = x * x + y * y
+        radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + 0.3 * r2 + 0.05 * r2**2)
+        u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        expected = np.column_stack([300 * u + bent.cx, 300 * v + bent.cy])
+        assert np.abs(view.pixels - expected).max() < 1e-6
+
+
+def rays_of(truth) -> np.ndarray:
+    """Where the corners of all poses are in the camera's frame, (n, 3)."""
+    R, t = truth.T_camera_board[:, :3, :3], truth.T_camera_board[:, None, :3, 3]
+    return (truth.points @ np.swapaxes(R, 1, 2) + t).reshape(-1, 3)
+
+
+def test_an_ordinary_session_has_no_mistake() -> None:
+    """No seed draws a fault, and another seed draws other sizes."""
+    drawn = [ordinary(seed) for seed in range(20)]
+    assert len({effects.wave_m for effects in drawn}) == 20
+    for effects in drawn:
+        mistakes = {"bow_m", "blur_px", "spoiled_px", "bad_corners", "inner_only"}
+        assert not any(getattr(effects, name) for name in mistakes)
+        assert effects.readout_s * effects.speed_m_s < 1e-4
+        assert effects.focus_drift < 1e-3
+
+
 FAR, FAST = np.array([[0.0, 0.1, 0.5]]), np.array([0.0, 500.0, 0.0])
 
 test_what_cannot_be_is_refused = refusals(
     *named(Effects, focus_drift=[-0.1], bow_m=[float("nan")], max_tilt_deg=[80.0]),
-    *named(Effects, inner_only=[0.4], blur_share=[1.5], square_scale=[0.0]),
+    *named(Effects, inner_only=[0.4], blur_share=[1.5], square_scale=[0.0], wave_reach=[0.0]),
+    *named(Effects, rational=[(0.1, 0.2)], wave_m=[-1e-3], shared=[-1.0]),
     *named(session, views=[0], noise_px=[-1]),
     ("board: 3.000 x 2.100 m does not fit", lambda: session(replace(CHECKERBOARD, square_m=0.3))),
-    ("velocity: 500 m/s", lambda: rolling_shutter(FAR, FAST, 0.02, 480, LENS.K, None)),
+    (
+        "velocity: 500 m/s",
+        lambda: rolling_shutter(FAR, FAST, 0.02, 480, lambda p: project(p, LENS.K)),
+    ),
 )

@@ -58,9 +58,12 @@ def a_page():
 # ---- structure ----------------------------------------------------------------------------------
 
 
+MORE = ("corrections.html", "formats.html")
+
+
 def test_there_is_a_page_for_each_notebook(pages):
     names = [name for name in pages if not name.startswith("reference/")]
-    assert names == ["index.html", *(f"{p.stem}.html" for p in NOTEBOOKS), "corrections.html"]
+    assert names == ["index.html", *(f"{p.stem}.html" for p in NOTEBOOKS), *MORE]
     for page in pages.values():
         assert page.html["lang"] == "en"
         assert page.title.string

@@ -220,7 +220,9 @@ def test_holes_jumps_and_frozen_pixels_are_counted_and_left_out():
     stats = stereo.window_stats(stack, (0, 0, 40, 40))
     invalid = 1 - (np.isfinite(stack) & (stack > 0)).mean()
     assert stats.invalid_fraction == pytest.approx(invalid)
-    assert stats.jump_fraction == pytest.approx(58 / (stack > 0).sum(), rel=0.15)
+    assert stats.n_mismatches == pytest.approx(58, rel=0.15)
+    assert f"{stats.n_mismatches} mismatches left out" in " ".join(str(stats).split())
+    assert not stats.not_gaussian
     assert stats.pixel_std_m == pytest.approx(5e-4, rel=0.03)
     assert stats.depth_m == pytest.approx(0.5, abs=2e-4)
 
@@ -743,11 +745,11 @@ NO_BASELINE = (None, 0.0, -0.05, math.nan, "50 mm")
 NEEDS_BASELINE = (
     lambda baseline_m: stereo.depth_from_disparity([10.0], FX, baseline_m),
     lambda baseline_m: stereo.depth_noise([1.0], FX, baseline_m, 0.08),
-    lambda baseline_m: stereo.fit_noise(NEAR, NEAR**2 * 1e-3, 100, FX, baseline_m),
+    lambda baseline_m: stereo.fit_noise(NEAR, NEAR**2 * 1e-3, 100, FX, baseline_m).sigma_d_px,
     lambda baseline_m: stereo.fit_bias(NEAR, FX, baseline_m, NEAR, 1e-4),
 )
 OUTSIDE = ((-1, 0, 5, 5), (26, 0, 5, 5), (0, 26, 5, 5), (0, 0, 0, 5), (0, 0, 5), (0.5, 0, 5, 5))
-NO_DISTANCES = ([0.6, 0.45], [0.45, 0.45], [-0.1, 0.45], [], [0.3, np.nan])
+NO_DISTANCES = ([0.0, 0.45], [-0.1, 0.45], [], [0.3, np.nan])
 
 test_what_cannot_be_is_refused = refusals(
     *((r"^baseline_m: got", lambda f=f, b=b: f(b)) for f in NEEDS_BASELINE for b in NO_BASELINE),
@@ -766,7 +768,7 @@ test_what_cannot_be_is_refused = refusals(
     ("^series_m: no pixel", lambda: stereo.averaging_curve(np.full((10, 4, 4), np.nan))),
     *named(noise_fit, distances_m=[*NO_DISTANCES, "near"]),
     *named(noise_fit, stds_m=[[1e-3], [1e-3, -1e-3], [0.0, np.nan]], dof=[0, [10, 10, 10]]),
-    *named(bias_fit, distances_m=[NEAR[::-1]], depths_m=[[0.3, 0.45], [0.3, 0.45, np.nan]]),
+    *named(bias_fit, distances_m=[-NEAR], depths_m=[[0.3, 0.45], [0.3, 0.45, np.nan]]),
     *named(bias_fit, depth_errors_m=[None, 0.0]),
     *named(width_fit, width_errors_m=[[1e-3]], width_m=[None]),
     *each("^depths_m, widths_m: got", bias_fit, "depths_m", None),

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from sample_submissions import DISTANCES, honest, with_part, with_row
 
 from coursekit import cli
+from coursekit.stereo import window_stats
 from coursekit.submission.flags import Fingerprint, copies, fingerprint
 from coursekit.submission.format import Claims, Conclusion, Plot, Stack, Submission
 from coursekit.submission.recompute import MISTAKES, RULES, grading_rules, recompute
@@ -168,6 +169,32 @@ def test_the_sentence_of_a_turned_sign():
     says = item(with_row(honest(11), 2, depth_bias_mm=2.05), "bias", 2).says
     assert says.startswith("Bias at 0.60 m: you say +2.05 mm, your raw depths say -2.05 mm (±")
     assert says.endswith("wrong because its sign is turned: bias is measured minus true.")
+
+
+HOLED = MISTAKEN["sign"][1]  # has raw depths with holes
+
+
+def test_the_grader_leaves_out_the_mismatches_that_the_notebook_leaves_out_and_says_how_many():
+    _, spiked = MISTAKEN["mismatches"]
+    stack = spiked.stacks[1]
+    stats = window_stats(stack.counts, (0, 0, 40, 40), spiked.camera.depth_scale_m)
+    assert stats.n_mismatches == 12
+    assert "it holds 12 mismatches" in item(spiked, "std", 1).says
+    right = with_row(spiked, 1, depth_std_mm=1e3 * stats.pixel_std_m)
+    assert item(right, "std", 1).verdict == "right"
+    assert item(right, "std", 1).says.endswith("right (12 mismatches left out).")
+    noise, without = (recompute(s).at[1].noise_of_mean_mm(100) for s in (spiked, HOLED))
+    assert noise == pytest.approx(without, rel=0.02)
+
+
+def test_the_largest_count_is_an_invalid_sample_for_the_grader_too():
+    stacks = tuple(
+        replace(stack, counts=np.where(stack.counts == 0, 65535, stack.counts))
+        for stack in HOLED.stacks
+    )
+    ended, holed = (recompute(s).at[0] for s in (replace(HOLED, stacks=stacks), HOLED))
+    assert ended.invalid.value == holed.invalid.value > 0
+    assert ended.bias.value == holed.bias.value
 
 
 def test_every_mistake_has_a_credit_and_a_sample_and_points_are_a_hundred():

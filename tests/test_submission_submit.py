@@ -15,7 +15,7 @@ from sample_submissions import PARAGRAPH, honest
 import coursekit as ck
 from coursekit import cli, results
 from coursekit.cameras.simulated import SimulatedCamera
-from coursekit.lessons import progress
+from coursekit.lessons import questions
 from coursekit.results import Quantity
 from coursekit.submission import submit as handing_in
 from coursekit.submission.format import Conclusion, Plot, TableRow, read_bundle, slug, write_bundle
@@ -282,7 +282,7 @@ def test_paths_are_said_as_somebody_in_the_course_would_type_them(tmp_path, monk
 
 def test_what_was_answered_goes_along(kept, own_results):
     results.write_json(
-        own_results / progress.FILE,
+        own_results / questions.RECORD,
         {
             "depth_noise.width": [{"kind": "wrong"}, {"kind": "right"}],
             "depth_noise.robust_depth": [{"kind": "core right"}],

@@ -35,6 +35,7 @@ PARTS = Path(__file__).resolve().parent / "site"
 COPIED = ("style.css", "STIXTwoMath.woff", "STIXTwoMath.txt")
 README = ROOT / "README.md"
 CORRECTIONS = ROOT / "data" / "corrections.md"
+FORMATS = ROOT / "data" / "formats.md"
 
 WIDE_PX = 600  # a figure wider than this scrolls by itself on a phone, rather than shrink
 PROGRESS_BAR = re.compile(r"\s*\d+%\|")
@@ -81,7 +82,8 @@ class Page:
 def page_names() -> dict[Path, str]:
     """The page that each source becomes."""
     notebooks = {path: f"{path.stem}.html" for path in find([])}
-    return {README: "index.html", **notebooks, CORRECTIONS: "corrections.html"}
+    more = {CORRECTIONS: "corrections.html", FORMATS: "formats.html"}
+    return {README: "index.html", **notebooks, **more}
 
 
 # ---- Markdown -----------------------------------------------------------------------------------
@@ -241,7 +243,8 @@ def markdown_page(path: Path, only_opening: bool = False) -> Page:
 
 def site() -> dict[str, bytes]:
     """All files of the site by their path in it."""
-    start, corrections = markdown_page(README, only_opening=True), markdown_page(CORRECTIONS)
+    start = markdown_page(README, only_opening=True)
+    corrections, formats = markdown_page(CORRECTIONS), markdown_page(FORMATS)
     notebooks = [notebook_page(path) for path in find([])]
     templates = Environment(
         loader=FileSystemLoader(PARTS, encoding="utf-8"),
@@ -250,16 +253,17 @@ def site() -> dict[str, bytes]:
     )
     rendered = {
         start.name: templates.get_template("index.html").render(
-            start=start, notebooks=notebooks, corrections=corrections
+            start=start, notebooks=notebooks, corrections=corrections, formats=formats
         )
     }
     around = [None, *notebooks, None]
     template = templates.get_template("page.html")
     for previous, page, following in zip(around, notebooks, around[2:], strict=False):
         rendered[page.name] = template.render(page=page, previous=previous, next=following)
-    rendered[corrections.name] = template.render(page=corrections, previous=None, next=None)
+    for page in (corrections, formats):
+        rendered[page.name] = template.render(page=page, previous=None, next=None)
     files = {name: (PARTS / name).read_bytes() for name in COPIED}
-    for page in (start, *notebooks, corrections):
+    for page in (start, *notebooks, corrections, formats):
         files |= page.files
     files |= {name: text.encode("utf-8") for name, text in rendered.items()}
     return files | reference.files()

@@ -19,8 +19,8 @@ import numpy as np
 import coursekit as ck
 from coursekit.arm import ArmErrors
 from coursekit.boards import Board
+from coursekit.boards.board import seen
 from coursekit.boards.detector import SESSION
-from coursekit.boards.view import seen
 from coursekit.budget.handover import REFERENCE
 from coursekit.cameras.capture import session_card
 from coursekit.cameras.simulated import SimulatedCamera

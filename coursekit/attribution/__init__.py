@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 from coursekit.attribution.ledger import Entry, Ledger
-from coursekit.attribution.simulate import SimulatedMisses, four_sets, simulate_misses
-from coursekit.attribution.verdict import Attribution, Blame, attribute
+from coursekit.attribution.verdict import (
+    Attribution,
+    Blame,
+    SimulatedMisses,
+    attribute,
+    four_sets,
+    simulate_misses,
+)
 
 __all__ = [
     "Attribution",

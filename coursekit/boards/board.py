@@ -9,7 +9,7 @@ of a session; whoever calibrates with them asks `check_detections` first.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any, Literal, get_args, overload
@@ -19,7 +19,15 @@ import numpy as np
 
 from coursekit.arrays import AnyArray, Bools, Floats, Grey, NDArray
 from coursekit.checks import array, choice, instance, number, want, whole
-from coursekit.geometry import invert_transform, make_transform, transform_points
+from coursekit.geometry import (
+    Intrinsics,
+    deproject,
+    fold_radius,
+    invert_transform,
+    make_transform,
+    project,
+    transform_points,
+)
 from coursekit.words import counted
 
 BoardKind = Literal["checkerboard", "charuco"]
@@ -55,6 +63,9 @@ class Board:
     odd number of rows old and new boards are the same print, and only the one who reads the pose
     can know which origin is meant.
 
+    first_marker: the number of a ChArUco board's first marker; boards that are seen together have
+    different ones.
+
     Raises ValueError for fields that make no board.
 
     >>> board = Board("charuco", (9, 6), 0.025)
@@ -68,6 +79,7 @@ class Board:
     marker_m: float | None = None
     dictionary: str = "DICT_5X5_250"
     old_origin: bool = False
+    first_marker: int = 0
 
     def __post_init__(self) -> None:
         fewest = FEWEST_SQUARES[choice("kind", self.kind, get_args(BoardKind))]
@@ -83,12 +95,14 @@ class Board:
         if self.kind == "checkerboard":
             extras = (self.marker_m, self.old_origin)
             want(extras == (None, False), "marker_m, old_origin", extras, "none on a checkerboard")
+            want(self.first_marker == 0, "first_marker", self.first_marker, "0 on a checkerboard")
             return
         default = round(MARKER_SHARE * self.square_m, 9)  # 0.01875, not 0.018750000000000003
         marker_m = _side("marker_m", default if self.marker_m is None else self.marker_m)
         object.__setattr__(self, "marker_m", marker_m)
         want(marker_m < self.square_m, "marker_m", marker_m, f"less than {self.square_m} m")
-        held, needed = len(_dictionary(self.dictionary).bytesList), int(self.white.sum())
+        first = whole("first_marker", self.first_marker, "a whole number from 0 on", least=0)
+        held, needed = len(_dictionary(self.dictionary).bytesList), first + int(self.white.sum())
         want(
             needed <= held,
             "dictionary",
@@ -192,7 +206,8 @@ class Board:
         margin = 0.5 * (1.0 - self.marker_share)
         markers = []
         for marker_id, (row, column) in enumerate(np.argwhere(self.white).tolist()):
-            image = cv2.aruco.generateImageMarker(dictionary, marker_id, n, borderBits=1)
+            number = self.first_marker + marker_id
+            image = cv2.aruco.generateImageMarker(dictionary, number, n, borderBits=1)
             markers.append((column + margin, row + margin, (image > 0).astype(float)))
         return tuple(markers)
 
@@ -205,8 +220,9 @@ class Board:
         """The `cv2.aruco.CharucoBoard` of this board; ValueError for a checkerboard."""
         if self.marker_m is None:
             raise ValueError("kind: a checkerboard has no cv2.aruco.CharucoBoard")
+        numbers = self.first_marker + np.arange(self.white.sum())
         board = cv2.aruco.CharucoBoard(
-            self.squares, self.square_m, self.marker_m, _dictionary(self.dictionary)
+            self.squares, self.square_m, self.marker_m, _dictionary(self.dictionary), numbers
         )
         board.setLegacyPattern(self.old_origin)
         return board
@@ -444,3 +460,68 @@ def _frozen(values: AnyArray) -> AnyArray:
     """The same array, read-only from now on."""
     values.flags.writeable = False
     return values
+
+
+# --- what a camera sees of a board ---
+
+BORDER_PX = 6.0  # a corner nearer to the image's border has no room for its refinement window
+
+
+def seen(
+    points: Floats, T_camera_board: Floats, lens: Intrinsics, border_px: float | Floats = BORDER_PX
+) -> Bools:
+    """Which points of a board the camera sees from each pose, (..., N).
+
+    points (N, 3): in the board's frame, m. T_camera_board (..., 4, 4): m. border_px: how far from
+    the image's border a pixel must lie, one number or (2,) for columns and rows.
+
+    >>> lens = Intrinsics(640, 480, 600.0, 600.0, 319.5, 239.5)
+    >>> T = np.eye(4)
+    >>> T[2, 3] = 0.5  # straight ahead
+    >>> seen(np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]]), T, lens).tolist()
+    [True, False]
+    """
+    R, t = T_camera_board[..., :3, :3], T_camera_board[..., None, :3, 3]
+    inside = points @ np.swapaxes(R, -1, -2) + t
+    pixels = project(inside, lens.K, lens.dist)
+    last = np.array(lens.size) - 1 - border_px
+    found = np.asarray(((pixels >= border_px) & (pixels <= last)).all(axis=-1))
+    if lens.dist is not None:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            slope = np.hypot(inside[..., 0], inside[..., 1]) / inside[..., 2]
+        found &= slope < fold_radius(lens.dist)
+    return found
+
+
+def slide_into_view(
+    aim_px: Floats,
+    distance_m: float,
+    R: Floats,
+    middle: Floats,
+    lens: Intrinsics,
+    enough: Callable[[Floats], bool],
+    steps: int = 21,
+) -> Floats | None:
+    """The pose T_camera_board (4, 4) nearest to an aim that shows enough of a board, or None.
+
+    aim_px (2,): where the board's middle should be in the image. It goes on to the middle of the
+    image in so many steps, at the same distance_m (Z of the board's middle) and orientation R
+    (3, 3), until `enough` says yes to a pose. middle (3,): of the board, in its own frame, m.
+
+    >>> lens = Intrinsics(640, 480, 600.0, 600.0, 319.5, 239.5)
+    >>> corner = np.zeros((1, 3))
+    >>> whole = lambda T: bool(seen(corner, T, lens, border_px=100).all())
+    >>> T = slide_into_view(np.array([0.0, 240.0]), 0.5, np.eye(3), np.zeros(3), lens, whole)
+    >>> project(T[:3, 3], lens.K).round().tolist()
+    [112.0, 240.0]
+    """
+    centre = (np.array(lens.size) - 1) / 2
+    shares = np.linspace(1.0, 0.0, steps)[:, None]
+    rays = deproject(centre + shares * (aim_px - centre), np.ones(steps), lens.K, lens.dist)
+    T = np.eye(4)
+    T[:3, :3] = R
+    for ray in rays[np.isfinite(rays).all(axis=1)]:
+        T[:3, 3] = distance_m * ray - R @ middle
+        if enough(T):
+            return T
+    return None

@@ -38,6 +38,7 @@ Patch = NDArray[np.float32]
 
 REACH = 0.4  # half the window's side, in squares
 LEAST_REACH_PX = 2.0  # ... and at least this
+LEAST_SQUARE_PX2 = 1.0  # the area of a square, px^2
 SMOOTH_PX = 1.0  # standard deviation of the smoothing
 KERNEL = (7, 7)
 RIM_PX = 4  # beside the image's rim, what smoothing and differences made up from outside
@@ -110,6 +111,8 @@ def refine_corners(
     pixels = np.full((len(start), 2), np.nan)
     covariances = np.full((len(start), 2, 2), np.nan)
     for k, (centre, step) in enumerate(zip(start, steps, strict=True)):
+        if not np.abs(step).max() < max(grey.shape) or abs(np.linalg.det(step)) < LEAST_SQUARE_PX2:
+            continue  # a window larger than the image, or none: such corners are on no board
         window = _window(step, bool(board.falling[ids[k]]), board)
         found = _corner(image, centre, window, FARTHEST_MOVE * np.linalg.norm(step, axis=0).min())
         if found is None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import re
+import struct
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
@@ -18,16 +19,46 @@ from typing import Any
 import cv2
 import numpy as np
 
-from coursekit.arrays import Grey, NDArray
+from coursekit.arrays import AnyArray, Grey, NDArray
 from coursekit.boards.board import Board, BoardNotFound, Detection, Detections, OtherBoard, Skipped
 from coursekit.boards.corners import blur_covariance, refine_corners, steps
-from coursekit.boards.explain import explain
-from coursekit.boards.find import find_corners
+from coursekit.boards.explain import BLANK_GREY, blank, explain
+from coursekit.boards.find import OFF_PLANE, find_corners, on_plane
 from coursekit.checks import want
 
 FEWEST_CORNERS = 6
 SMALLEST_IMAGE_PX = 40  # shorter side of an image in which a board can be told
+NARROWEST = 40  # long sides to the short one
+MOST_PIXELS, MOST_BYTES = 250_000_000, 2_000_000_000  # more is no photograph
+RANGE = 12, 243  # grey levels of a hundredth and of 99 hundredths of a scaled image
 SESSION = "session.json"  # written beside the images by the course itself
+JPEG, PNG = b"\xff\xd8", b"\x89PNG"
+SIZE_SEGMENTS = [
+    bytes([0xC0 + k]) for k in range(16) if k not in (4, 8, 12)
+]  # JPEG: they hold the size
+ALPHA = (b"\4", b"\6")  # PNG: kinds of colour with transparency
+AS_STORED = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+NO_IMAGE = "not an image that OpenCV can read: save it as PNG or JPEG, or take it out of the folder"
+OTHERS = (  # suffixes and first bytes of what OpenCV cannot read, or only a thumbnail of
+    (
+        ".heic .heif",
+        rb"....ftyp(hei|hev|mif1|msf1)",
+        "a HEIC photograph: export it as JPEG or PNG, in its full size",
+    ),
+    (
+        ".cr2 .cr3 .nef .nrw .arw .dng .raf .orf .rw2 .pef .srw .raw",
+        rb"....ftypcrx|FUJIFILM|IIRO|IIRS|IIU|II\*\0....CR",
+        "a camera's raw file: develop it to PNG or TIFF, without correction of the lens",
+    ),
+    (
+        ".mp4 .mov .avi .mkv .webm .m4v .wmv .mpg",
+        rb"....ftyp(isom|iso\d|mp4|M4V|qt)|RIFF....AVI|\x1aE\xdf\xa3",
+        "a film: save single pictures of it as PNG",
+    ),
+    (".pdf", rb"%PDF", "a PDF: save its photographs as PNG"),
+    (".bag .db3 .mcap", rb"#ROSBAG|SQLite format 3", "a recording: ck.open_camera(path) plays it"),
+    (".npy .npz", rb"\x93NUMPY", "arrays: load them and give the arrays"),
+)
 
 
 # --- one image ---
@@ -36,12 +67,13 @@ SESSION = "session.json"  # written beside the images by the course itself
 def detect(image: NDArray[np.uint8], board: Board, name: str = "") -> Detection:
     """The corners of `board` in one image, with their noise and the image's blur.
 
-    image: (H, W) grey or (H, W, 3) RGB, uint8. A checkerboard must be seen whole, a ChArUco board
-    in part. Corners are refined in a window of 0.4 of a square (module `corners`). On a
-    checkerboard the colours of the squares tell which corner is the first, as in `Board.image`;
-    where they cannot (two odd or two even numbers of squares) it is the turn whose x axis points
-    most to the right, which may change from view to view: harmless for K, not for what needs the
-    pose.
+    image: (H, W) grey or (H, W, 3) RGB, uint8, or uint16 of any depth, which its own range scales.
+    A checkerboard must be seen whole, a ChArUco board in part. Corners are refined in a window of
+    0.4 of a square (module `corners`). On a checkerboard the colours of the squares tell which
+    corner is the first, as in `Board.image`; where they cannot (two odd or two even numbers of
+    squares) it is the turn whose x axis points most to the right, which may change from view to
+    view: harmless for K, not for what needs the pose. A mirrored ChArUco board is told from a true
+    one; a mirrored checkerboard cannot be, its picture is that of a turned one.
 
     Raises BoardNotFound, which says what is there instead, and ValueError for what is no image.
 
@@ -51,22 +83,39 @@ def detect(image: NDArray[np.uint8], board: Board, name: str = "") -> Detection:
     (12, [81.5, 81.5])
     """
     grey = _grey(image)
-    if min(grey.shape) < SMALLEST_IMAGE_PX:
-        raise BoardNotFound(
-            f"the picture is {grey.shape[1]}x{grey.shape[0]} px: too small to show a board"
-        )
+    try:
+        return _detect(grey, board, name)
+    except BoardNotFound:
+        raise
+    except Exception as error:  # no picture, however strange, may end a session of many
+        raise BoardNotFound(f"the search failed ({_words(error)}): leave it out") from error
+
+
+def _words(error: Exception) -> str:
+    """An error in one short line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"[:120]
+
+
+def _detect(grey: Grey, board: Board, name: str) -> Detection:
+    height, width = grey.shape
+    size = f"the picture is {width}x{height} px: too"
+    if grey.size > MOST_PIXELS:
+        raise BoardNotFound(f"{size} large, make it smaller")
+    if min(grey.shape) < SMALLEST_IMAGE_PX or max(grey.shape) > NARROWEST * min(grey.shape):
+        raise BoardNotFound(f"{size} small or narrow to show a board")
     found = find_corners(grey, board)
     if found is None or not _usable(found[0], board):
         raise BoardNotFound(explain(grey, board, 0 if found is None else len(found[0])))
     ids, start = found
     pixels, covariances = refine_corners(grey, start, steps(start, ids, board), ids, board)
     good = np.isfinite(pixels[:, 0])
+    good[good] = on_plane(ids[good], pixels[good], (width, height), board, OFF_PLANE[1])
     ids, pixels, covariances = ids[good], pixels[good], covariances[good]
     if not _usable(ids, board):
         raise BoardNotFound(explain(grey, board, len(ids)))
     noise_px = float(np.sqrt(np.trace(covariances, axis1=1, axis2=2).mean() / 2))
     blur = blur_covariance(grey, pixels, ids, steps(pixels, ids, board), board)
-    return Detection(ids, pixels, (grey.shape[1], grey.shape[0]), name, noise_px, blur)
+    return Detection(ids, pixels, (width, height), name, noise_px, blur)
 
 
 def _usable(ids: NDArray[np.intp], board: Board) -> bool:
@@ -81,12 +130,31 @@ def _grey(image: object) -> Grey:
     """The image as a contiguous (H, W) array; ValueError for what is no image."""
     pixels = np.asarray(image)
     shape = pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] == 3)
-    if pixels.dtype != np.uint8 or not shape or pixels.size == 0:
+    if pixels.dtype not in (np.uint8, np.uint16) or not shape or pixels.size == 0:
         got = f"{pixels.dtype} of shape {pixels.shape}"
-        raise ValueError(f"image: got {got}, want uint8 (H, W) grey or (H, W, 3) RGB")
+        raise ValueError(f"image: got {got}, want uint8 or uint16 (H, W) grey or (H, W, 3) RGB")
     if pixels.ndim == 3:
         pixels = np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), cv2.COLOR_RGB2GRAY))
-    return np.ascontiguousarray(pixels)
+    return np.ascontiguousarray(_eight_bits(pixels))
+
+
+def _eight_bits(pixels: AnyArray) -> Grey:
+    """Grey levels of whatever kind (H, W) as uint8: others than uint8 by their own range.
+
+    So 10, 12 or 14 bits in a 16-bit image count as what they are. A hundredth of the pixels may be
+    beyond either end of the range, which leaves room for noise at the end of uint8's.
+    """
+    if pixels.dtype == np.uint8:
+        return pixels
+    some = pixels[:: pixels.shape[0] // 1000 + 1, :: pixels.shape[1] // 1000 + 1]
+    some = some[np.isfinite(some)]
+    low, high = np.quantile(some, [0.01, 0.99]) if some.size else (0.0, 0.0)
+    if not high - low > (BLANK_GREY if pixels.dtype.kind in "iu" else 0.0):
+        raise BoardNotFound(blank(low, high))
+    dark, bright = RANGE
+    scale = (bright - dark) / (high - low)
+    levels = np.nan_to_num((pixels.astype(np.float32) - low) * scale + dark, nan=dark)
+    return np.rint(levels.clip(0, 255)).astype(np.uint8)
 
 
 # --- many images ---
@@ -125,7 +193,7 @@ def detect_all(
         for name, source in tqdm(sources, unit="image", leave=False, disable=quiet):
             try:
                 views.append(detect(_read(source), board, name))
-            except (BoardNotFound, _Unreadable) as reason:
+            except BoardNotFound as reason:
                 kind = "other_board" if isinstance(reason, OtherBoard) else ""
                 skipped.append(Skipped(name, str(reason), kind))
     except KeyboardInterrupt:
@@ -134,20 +202,16 @@ def detect_all(
     return _of_one_size(views, skipped, [name for name, _ in sources])
 
 
-class _Unreadable(Exception):
-    """A file is no image; the message says what it is."""
-
-
 def _sources(images: Any) -> list[tuple[str, Any]]:
     """Name and source (a path or an array) of each image."""
     if isinstance(images, (str, os.PathLike)):
         folder = Path(images)
         want(folder.is_dir(), "images", os.fspath(images), "a folder that exists")
-        files = [p for p in folder.iterdir() if p.is_file()]
+        files = [p for p in folder.iterdir() if p.is_file() or p.is_symlink()]  # also broken ones
         files = [p for p in files if p.name != SESSION and not p.name.startswith(".")]
         if not files:
             raise ValueError(f"images: {os.fspath(images)!r} holds no files")
-        return [(path.name, path) for path in sorted(files, key=_natural)]
+        return [(path.name, path) for path in sorted(files, key=natural)]
     if not isinstance(images, Iterable):
         kind = type(images).__name__
         raise ValueError(f"images: got a {kind}, want a folder, or paths, arrays or frames")
@@ -172,48 +236,76 @@ def _named(number: int, item: Any) -> tuple[str, Any]:
     )
 
 
-def _natural(path: Path) -> list[Any]:
+def natural(path: Path) -> list[Any]:
     """A key that sorts view2 before view10."""
     parts = re.split(r"(\d+)", path.name.lower())
     return [int(part) if part.isdecimal() else part for part in parts]
 
 
-def _read(source: Any) -> NDArray[np.uint8]:
-    """The grey image of a path, or the array itself; `_Unreadable` where there is none."""
+def _read(source: Any) -> AnyArray:
+    """The grey image of a path, or the array itself; BoardNotFound where there is none."""
     if isinstance(source, np.ndarray):
         return source
     try:
+        if source.stat().st_size > MOST_BYTES:
+            raise BoardNotFound(f"the file has {source.stat().st_size / 1e9:.1f} GB: no photograph")
         data = source.read_bytes()
     except OSError as error:
-        raise _Unreadable(f"cannot be read ({error.strerror or error})") from error
+        raise BoardNotFound(f"cannot be read ({error.strerror or error})") from error
     if not data:
-        raise _Unreadable("the file is empty")
-    if _is_cut_off(data):  # OpenCV would fill the rest with grey
-        raise _Unreadable("the file is cut off, its end is missing")
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+        raise BoardNotFound("the file is empty")
+    if not data.startswith((JPEG, PNG)):  # whatever the name says
+        for suffixes, start, what in OTHERS:
+            if source.suffix.lower() in suffixes.split() or re.match(start, data, re.DOTALL):
+                raise BoardNotFound(what)
+    (width, height), cut_off = _header(data)
+    if width * height > MOST_PIXELS:  # before it takes its memory
+        raise BoardNotFound(f"the picture is {width}x{height} px: too large, make it smaller")
+    if cut_off:  # OpenCV would fill the rest with grey
+        raise BoardNotFound("the file is cut off, its end is missing")
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error as error:
-        raise _Unreadable(f"not an image that OpenCV can read ({error.err})") from error
+        return _eight_bits(_decoded(data))
+    except BoardNotFound:
+        raise
+    except Exception as error:  # whatever a broken file makes the decoders raise
+        raise BoardNotFound(f"{NO_IMAGE} ({_words(error)})") from error
+
+
+def _decoded(data: bytes) -> AnyArray:
+    """The grey image in a file's bytes, of whatever depth; what is transparent is white paper."""
+    coded = np.frombuffer(data, np.uint8)
+    image = cv2.imdecode(coded, AS_STORED | cv2.IMREAD_ANYDEPTH)
     if image is None:
-        raise _Unreadable("not an image that OpenCV can read")
-    return np.asarray(image, np.uint8)
+        raise BoardNotFound(NO_IMAGE)
+    if data.startswith(PNG) and (data[25:26] in ALPHA or b"tRNS" in data[:4096]):
+        layers: AnyArray = np.asarray(
+            cv2.imdecode(coded, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+        )
+        white = 255 if image.dtype == np.uint8 else 65535
+        alpha = layers[..., -1] / white
+        if layers.shape[2:] == (4,) and alpha.any() and alpha.min() < 1:
+            image = np.rint(white + alpha * (image - float(white))).astype(image.dtype)
+    return np.asarray(image)
 
 
-def _is_cut_off(data: bytes) -> bool:
-    """Whether a JPEG or PNG file lacks its end.
+def _header(data: bytes) -> tuple[tuple[int, int], bool]:
+    """What a JPEG or PNG file says: width and height, px, and whether its end is missing.
 
-    A JPEG's end marker is looked for after the start of its own data: one before that ends the
-    thumbnail that cameras put into the header.
+    (0, 0) where nothing is known. A JPEG's end marker is looked for after the start of its own
+    data: one before that ends the thumbnail that cameras put into the header.
     """
-    if data.startswith(b"\x89PNG"):
-        return b"IEND" not in data[-64:]
-    if not data.startswith(b"\xff\xd8"):
-        return False
-    at = 2
+    if data.startswith(PNG):
+        width, height = struct.unpack(">II", data[16:24].rjust(8, b"\0"))
+        return (width, height), b"IEND" not in data[-64:]
+    if not data.startswith(JPEG):
+        return (0, 0), False
+    at, size = 2, (0, 0)
     while data[at : at + 1] == b"\xff" and data[at + 1 : at + 2] != b"\xda":
-        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    return b"\xff\xd9" not in data[at:]
+        length, _, height, width = struct.unpack(">HBHH", data[at + 2 : at + 9].rjust(7, b"\0"))
+        if data[at + 1 : at + 2] in SIZE_SEGMENTS:
+            size = (width, height)
+        at += 2 + length
+    return size, b"\xff\xd9" not in data[at:]
 
 
 def _of_one_size(views: list[Detection], skipped: list[Skipped], names: list[str]) -> Detections:
@@ -223,6 +315,8 @@ def _of_one_size(views: list[Detection], skipped: list[Skipped], names: list[str
     for view in views:
         if view.size != common:
             reason = "{}x{} px, where most are {}x{}: one calibration is for one size"
+            if view.size == common[::-1]:
+                reason += "; give the pixels as the sensor has them, not turned"
             skipped.append(Skipped(view.name, reason.format(*view.size, *common), "other_size"))
     skipped.sort(key=lambda skip: names.index(skip.name))
     return Detections([view for view in views if view.size == common], skipped)

@@ -1,45 +1,72 @@
 """Why a board was not found, in words that name the likely cause.
 
-An image is asked in turn: is it blank? Does it show markers, and of which dictionary, on which
-plan? A checkerboard, and of which size? Is it blurred? The first answer that explains the failure
-is given, starting with what is seen and ending with what to change.
+An image is asked in turn: is it blank? Does it show markers, as they are, mirrored or with white
+for black, of which dictionary, on which plan? A checkerboard, and of which size? A grid of circles?
+Is it blurred? The first answer that explains the failure is given, starting with what is seen and
+ending with what to change.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-from itertools import product
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from coursekit.arrays import Floats, Grey, NDArray
 from coursekit.boards.board import DICTIONARIES, FEWEST_SQUARES, Board, OtherBoard
-from coursekit.boards.find import SEARCHES, checkerboard_grid, shrunk
+from coursekit.boards.find import (
+    ANY_SIZE_PX,
+    checkerboard_seen,
+    off_homography,
+    real_beyond,
+    shrunk,
+)
 
-COMMON_CORNERS = ((9, 6), (8, 6), (7, 6), (8, 5), (7, 5), (11, 8), (10, 7), (7, 7), (6, 5), (5, 4))
-LONGEST_PX = 1600  # an image is looked at no larger than this,
-CHECKERBOARD_PX = 800  # and for checkerboards of unknown size than this
+LONGEST_PX = 1600  # an image is looked at no larger than this
 BLANK_GREY = 15.0  # levels between the darkest and the brightest hundredth
 BLURRED_PX = 5.0  # the sharpest edges of a picture that shows a board are steeper than this
 FAMILIES = tuple(  # the largest dictionary of each; the smaller ones are their beginnings
     name for name in DICTIONARIES if not name.endswith(("_50", "_100", "_250"))
 )
 FAMILY_LENGTHS = (50, 100, 250, 1000)
+WAYS: dict[str, Callable[[Grey], Grey]] = {  # to look for markers, and what they then are
+    "": lambda grey: grey,
+    "mirrored": lambda grey: np.ascontiguousarray(grey[:, ::-1]),
+    "with white for black": lambda grey: 255 - grey,
+}
+CURES = {
+    "mirrored": "switch the camera's mirror off, or turn the images back: image[:, ::-1]",
+    "with white for black": "give the negatives: 255 - image",
+}
 FEWEST_MARKERS = 4
+FEWEST_ON_PLAN = 6  # markers: any four lie on some plan
 MOST_SQUARES = 20  # each way that are tried
 OFF_PLAN = 0.1  # squares: markers of the right board lie on its plan within this
 SHARE_ON_PLAN = 0.95  # a board with the other origin has 8 of 9 in the right place
+SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], np.float32)
+FAR = 8.0  # half sides of a marker: its neighbours on a board are nearer
+CUT = 0.25  # of the corners in the line beyond a checkerboard are real: something hides the others
+FEWEST_CIRCLES, LEAST_ROUND = 12, 0.82
+OFF_ROW = 0.25  # of the distance between two circles: the third in their row is off by less
+NOT_USABLE = "not usable here, print a board with ck.boards.save_sheet"
 
 
 class _Markers(NamedTuple):
-    """Markers seen: their dictionary, numbers (M,) and centres (M, 2) px."""
+    """Markers seen: in which of WAYS, their dictionary, numbers (M,) and corners (M, 4, 2) px."""
 
+    way: str
     dictionary: str
     ids: NDArray[np.intp]
-    centres: Floats
+    corners: Floats
+
+    @property
+    def centres(self) -> Floats:
+        """(M, 2) px."""
+        return self.corners.mean(axis=1)
 
 
 def explain(grey: Grey, board: Board, corners: int) -> str:
@@ -51,9 +78,7 @@ def explain(grey: Grey, board: Board, corners: int) -> str:
     small = shrunk(grey, LONGEST_PX)
     low, high = np.quantile(small, [0.01, 0.99])
     if high - low < BLANK_GREY:
-        return (
-            f"the picture is blank: nearly all of it has grey levels from {low:.0f} to {high:.0f}"
-        )
+        return blank(low, high)
     asked = f"the {board.text} asked for"
     if reason := _what_else(small, board):
         raise OtherBoard(f"not {asked}, but {reason}")
@@ -65,30 +90,31 @@ def explain(grey: Grey, board: Board, corners: int) -> str:
     return _nothing(small, board)
 
 
+def blank(low: float, high: float) -> str:
+    """What to say of an image whose grey levels hardly differ."""
+    return f"the picture is blank: nearly all of it has grey levels from {low:.0f} to {high:.0f}"
+
+
 def _what_else(grey: Grey, board: Board) -> str:
     """Another board that is seen, and what to change; "" for none."""
-    markers = _best_markers(grey, board)
-    if markers and board.kind == "charuco":
-        return _other_markers(markers, board)
-    if markers:
-        count = f"{len(markers.ids)} markers of {markers.dictionary}"
-        return f"{count}: this is a ChArUco board, use Board('charuco', ...)"
-    squares = _checkerboard_seen(grey, board)
-    if squares is None:
-        return ""
-    seen = "a checkerboard of {}x{} squares".format(*squares)
-    if board.kind == "charuco":
-        return f"{seen}, without markers: use Board('checkerboard', {squares}, ...)"
-    if sorted(squares) == sorted(count + 1 for count in board.squares):
-        return f"{seen}: you gave inner corners, squares are one more in each direction"
-    return f"{seen}: use squares={squares}"
+    if markers := _markers(grey, board):
+        return _marked(markers, board)
+    blurred = _edges_px(grey) > BLURRED_PX
+    if reason := _checkered(shrunk(grey, ANY_SIZE_PX), board, blurred):
+        return reason
+    return f"a grid of circles: {NOT_USABLE}" if not blurred and _has_circles(grey) else ""
+
+
+def _edges_px(grey: Grey) -> float:
+    """How wide the sharpest edges of an image are, px."""
+    smooth = cv2.GaussianBlur(grey.astype(np.float32), (5, 5), 1.0)
+    steepest = np.quantile(np.hypot(*np.gradient(smooth)), 0.999)
+    return float(np.subtract(*np.quantile(smooth, [0.99, 0.01])) / max(steepest, 1e-3))
 
 
 def _nothing(grey: Grey, board: Board) -> str:
     """No board of any kind: the advice that fits the picture."""
-    smooth = cv2.GaussianBlur(grey.astype(np.float32), (5, 5), 1.0)
-    steepest = np.quantile(np.hypot(*np.gradient(smooth)), 0.999)
-    width_px = np.subtract(*np.quantile(smooth, [0.99, 0.01])) / max(steepest, 1e-3)
+    width_px = _edges_px(grey)
     if width_px > BLURRED_PX:
         return (
             f"no board seen, and the picture is blurred (its sharpest edges are {width_px:.0f} px "
@@ -105,80 +131,137 @@ def _nothing(grey: Grey, board: Board) -> str:
     )
 
 
-# --- checkerboards of another size ---
+# --- checkerboards of another size, circles ---
 
 
-def _checkerboard_seen(grey: Grey, board: Board) -> tuple[int, int] | None:
-    """(columns, rows) of SQUARES of a checkerboard that is whole in the image, or None.
+def _checkered(grey: Grey, board: Board, blurred: bool) -> str:
+    """A checkerboard of another size is seen; "" for none.
 
     Turned by a quarter it is the same board: the longer side is where `board` has it.
-
-    OpenCV's search for boards of any size says whether there is one at all; the size that it
-    reports is often one off, so likely ones are put to the search for a given size: one more each
-    way than asked for (a miscount), near what is seen, near what is asked for, common ones.
     """
-    small = shrunk(grey, CHECKERBOARD_PX)
-    flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
-    found, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), flags)
-    if not found:
-        return None
-    (columns, rows), (seen_rows, seen_columns) = board.corners, meta.shape[:2]
-    near = tuple(product((0, -1, 1), repeat=2))
-    likely = [(columns + 1, rows + 1), (seen_columns, seen_rows)]
-    likely += [(seen_columns + a, seen_rows + b) for a, b in near]
-    likely += [(columns + a, rows + b) for a, b in near]
-    tried = {tuple(sorted(board.corners))}
-    for corners in (*likely, *COMMON_CORNERS):
-        few, many = sorted(corners)
-        if few < FEWEST_SQUARES["checkerboard"] - 1 or (few, many) in tried:
+    grid = checkerboard_seen(grey)
+    if grid is None:
+        return ""
+    few, many = sorted(count + 1 for count in grid.shape[:2])
+    squares = (many, few) if board.squares[0] >= board.squares[1] else (few, many)
+    size = "{}x{} squares".format(*squares)
+    cut = _is_cut(grey, grid)
+    found = board.kind == "checkerboard" and squares == board.squares  # but not as it should be
+    if found or (cut and blurred):  # a blur hides the outer corners
+        return ""
+    if board.kind == "charuco":
+        return (
+            f"a checkerboard of {size}, without markers: use Board('checkerboard', {squares}, ...)"
+        )
+    if cut and np.less_equal(squares, board.squares).all():
+        return (
+            f"part of a checkerboard, {size} of it: all of it must be in the picture, with nothing "
+            "in front"
+        )
+    if sorted(squares) == sorted(count + 1 for count in board.squares):
+        return (
+            f"a checkerboard of {size}: you gave inner corners, squares are one more in each "
+            "direction"
+        )
+    return f"a checkerboard of {size}: use squares={squares}"
+
+
+def _is_cut(grey: Grey, grid: Floats) -> bool:
+    """Whether the outer squares around these corners leave the image, or more corners follow."""
+    around = np.pad(grid, ((1, 1), (1, 1), (0, 0)), mode="reflect", reflect_type="odd")
+    outside = (around < -2) | (around > np.array(grey.shape[::-1]) + 1)
+    return bool(outside.any() or max(real_beyond(grey, grid)) > CUT)
+
+
+def _has_circles(grey: Grey) -> bool:
+    """Whether there are many round blobs, dark or bright, most of them in rows of three."""
+    opencv: Any = cv2  # whose type stubs lack the blobs
+    settings = opencv.SimpleBlobDetector_Params()
+    settings.minArea, settings.maxArea = 20, grey.size / 50
+    settings.filterByCircularity, settings.minCircularity = True, LEAST_ROUND
+    for image in (grey, 255 - grey):
+        blobs = opencv.SimpleBlobDetector_create(settings).detect(image)
+        if len(blobs) < FEWEST_CIRCLES:
             continue
-        tried.add((few, many))
-        if checkerboard_grid(small, corners, SEARCHES[:1]) is not None:
-            return (many + 1, few + 1) if columns >= rows else (few + 1, many + 1)
-    return None
+        centres = np.array([blob.pt for blob in blobs])
+        tree = cKDTree(centres)
+        distance, index = tree.query(centres, k=2)
+        step = centres[index[:, 1]] - centres
+        off = [tree.query(third)[0] for third in (centres - step, centres + 2 * step)]
+        if (np.min(off, axis=0) < OFF_ROW * distance[:, 1]).mean() > 0.8:
+            return True
+    return False
 
 
 # --- other markers, or the same on another plan ---
 
 
-def _best_markers(grey: Grey, board: Board) -> _Markers | None:
-    """The dictionary with the most markers in the image, the board's own where it has enough."""
+def _markers(grey: Grey, board: Board) -> _Markers | None:
+    """The markers of the dictionary and the way that show the most, the board's own where equal."""
     names = [board.dictionary] if board.kind == "charuco" else []
-    seen = [_markers(grey, name) for name in (*names, *FAMILIES)]
-    best = max(seen, key=lambda markers: len(markers.ids))
-    return best if len(best.ids) >= FEWEST_MARKERS else None
-
-
-def _markers(grey: Grey, name: str) -> _Markers:
-    """The markers of one dictionary in the image."""
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
-    corners, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(grey)
-    centres = np.array([corner.reshape(4, 2).mean(axis=0) for corner in corners], np.float64)
-    numbers = np.empty(0, np.intp) if ids is None else ids.ravel().astype(np.intp)
-    return _Markers(name, numbers, centres.reshape(-1, 2))
-
-
-def _other_markers(markers: _Markers, board: Board) -> str:
-    """Markers are seen, of this dictionary or another; "" where they fit the board asked for."""
-    name = _short_name(markers, board)
-    count = f"{len(markers.ids)} markers of {name}"
-    if name != board.dictionary:
-        return f"{count}: use dictionary={name!r}"
-    if _on_plan(markers, board):
-        return ""
-    counts = range(FEWEST_SQUARES["charuco"], MOST_SQUARES + 1)
-    sizes = ((columns, rows) for columns in counts for rows in counts)
-    for squares in sorted(sizes, key=lambda size: (size[0] * size[1], size)):  # fewest first
-        if (squares[0] * squares[1] + 1) // 2 <= markers.ids.max():
+    names += [name for name in FAMILIES if name not in names]
+    dictionaries = [cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)) for name in names]
+    detector = cv2.aruco.ArucoDetector(dictionaries)
+    best = None
+    for way, seen_so in WAYS.items():
+        corners, ids, _, which = detector.detectMarkersMultiDict(seen_so(grey))
+        if len(corners) == 0:
             continue
-        for other in _plans(board, squares):
-            if _on_plan(markers, other):
-                changes = [f"squares={squares}"] * (squares != board.squares)
-                if other.old_origin != board.old_origin and squares[1] % 2 == 0:
-                    changes.append(f"old_origin={other.old_origin}")
-                as_on = "{}x{} squares".format(*squares)
-                return f"{count} as on a board of {as_on} or more: use {', '.join(changes)}"
-    return f"{count} that lie as on no board of up to {MOST_SQUARES}x{MOST_SQUARES} squares"
+        counts = np.bincount(which.ravel(), minlength=len(names))
+        most = int(counts.argmax())
+        if counts[most] >= FEWEST_MARKERS and (best is None or counts[most] > len(best.ids)):
+            own = which.ravel() == most
+            boxes = np.array(corners, np.float64).reshape(-1, 4, 2)[own]
+            best = _Markers(way, names[most], ids.ravel()[own].astype(np.intp), boxes)
+    return best
+
+
+def _marked(markers: _Markers, board: Board) -> str:
+    """What markers show, of this dictionary or another; "" where they fit the board asked for."""
+    seen = f"{len(markers.ids)} markers of {_short_name(markers, board)}"
+    if markers.way:
+        return f"{len(markers.ids)} markers, all {markers.way}: {CURES[markers.way]}"
+    if _is_grid(markers):
+        return (
+            f"a grid of tags (AprilGrid, GridBoard), no ChArUco board: {NOT_USABLE} ({seen} seen)"
+        )
+    if board.kind == "checkerboard":
+        return f"{seen}: this is a ChArUco board, use Board('charuco', ...)"
+    return _other_charuco(markers, board, seen)
+
+
+def _other_charuco(markers: _Markers, board: Board, seen: str) -> str:
+    """What is different about a ChArUco board, so many markers of which are seen; "" for nothing"""
+    name, enough = _short_name(markers, board), len(markers.ids) >= FEWEST_ON_PLAN
+    plans = _plans(board, name, markers.ids) if enough else ()
+    plan = next((plan for plan in plans if _on_plan(markers, plan)), None)
+    if plan is None and name != board.dictionary:
+        return f"{seen}: use dictionary={name!r}"
+    if plan is None:
+        lost = f"{seen} that lie as on no board of up to {MOST_SQUARES}x{MOST_SQUARES} squares"
+        return lost if enough else ""
+    fields = ("dictionary", "squares", "first_marker", "old_origin")
+    new = [(field, getattr(plan, field)) for field in fields]
+    changes = [f"{field}={value!r}" for field, value in new if value != getattr(board, field)]
+    if changes:
+        size = "{}x{} squares".format(*plan.squares)
+        return f"{seen} as on a board of {size} or more: use {', '.join(changes)}"
+    return ""
+
+
+def _is_grid(markers: _Markers) -> bool:
+    """Whether a marker's nearest neighbour lies beside it; on a ChArUco board it is at a corner."""
+    beside = []
+    for box in markers.corners.astype(np.float32):
+        to_square = cv2.getPerspectiveTransform(box, SQUARE)
+        others = cv2.perspectiveTransform(markers.centres[None], to_square)[0]
+        distance = np.linalg.norm(others, axis=1)
+        distance[distance < 1.0] = np.inf  # itself
+        nearest = distance.argmin()
+        if distance[nearest] < FAR:
+            few, many = np.sort(np.abs(others[nearest]))
+            beside.append(few < np.tan(np.pi / 8) * many)
+    return len(beside) > 0 and bool(np.mean(beside) > 0.5)
 
 
 def _short_name(markers: _Markers, board: Board) -> str:
@@ -193,26 +276,36 @@ def _short_name(markers: _Markers, board: Board) -> str:
     return f"{family}_{max(shortest, 250)}"
 
 
-def _plans(board: Board, squares: tuple[int, int]) -> Iterator[Board]:
-    """The board with so many squares, with its own origin and with the other one."""
-    for old_origin in (board.old_origin, not board.old_origin):
-        try:
-            yield replace(board, squares=squares, old_origin=old_origin)
-        except ValueError:  # more squares than the dictionary has markers
-            return
+def _plans(board: Board, dictionary: str, ids: NDArray[np.intp]) -> Iterator[Board]:
+    """What the board may be, the likeliest first: as asked for, of another size, counted from
+    another first marker; each with its own origin and with the other one."""
+    first, (columns, rows) = board.first_marker, board.squares
+    counts = range(FEWEST_SQUARES["charuco"], MOST_SQUARES + 1)
+    tries = [(first, columns, rows), (int(ids.min()), columns, rows)]
+    for start in (first, int(ids.min())):
+        fewest = {n: max(2 * (ids.max() - start + 1) // n, counts[0]) for n in counts}
+        sizes = [(n, m) for n in counts for m in range(fewest[n], fewest[n] + 3)]
+        sizes = [(n, m) for n, m in sizes if ids.max() - start < (n * m + 1) // 2 and m in counts]
+        tries += [(start, *size) for size in sorted(sizes, key=lambda size: size[0] * size[1])]
+    tries += [(start, columns, rows) for start in range(ids.min(), -1, -1)[1:columns]]
+    for start, *size in tries:
+        for old_origin in (board.old_origin, not board.old_origin)[: 1 + (size[1] + 1) % 2]:
+            plan: dict[str, Any] = {
+                "squares": (size[0], size[1]),
+                "first_marker": start,
+                "old_origin": old_origin,
+            }
+            try:
+                yield replace(board, dictionary=dictionary, **plan)
+            except ValueError:  # more squares than the dictionary has markers
+                continue
 
 
 def _on_plan(markers: _Markers, board: Board) -> bool:
     """Whether the markers lie where the board has them, up to a homography."""
-    plan: Any = board.marker_centres
-    known = markers.ids < len(plan)
+    plan, numbers = board.marker_centres, markers.ids - board.first_marker
+    known = (numbers >= 0) & (numbers < len(plan))
     if known.sum() < max(FEWEST_MARKERS, SHARE_ON_PLAN * len(known)):
         return False
-    on_board, centres = plan[markers.ids[known]], markers.centres[known]
-    H, _ = cv2.findHomography(centres, on_board, cv2.RANSAC, OFF_PLAN)
-    if H is None:
-        return False
-    mapped = np.c_[centres, np.ones(len(centres))] @ H.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        off = np.linalg.norm(mapped[:, :2] / mapped[:, 2:] - on_board, axis=1)
+    off = off_homography(markers.centres[known], plan[numbers[known]], OFF_PLAN)
     return bool((off < 3 * OFF_PLAN).mean() >= SHARE_ON_PLAN)

@@ -6,7 +6,6 @@ tells which corner is the first. `refine_corners` makes fractions of a pixel of 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -17,33 +16,82 @@ from coursekit.boards.board import Board
 
 Corners = tuple[NDArray[np.intp], Floats]  # ids (N,) and pixels (N, 2)
 
-# Longest side in px at which a board is looked for; a larger image is made smaller first, and
-# looked at again in the next size when nothing is found.
-LOOKED_AT_PX = {"checkerboard": (1000, 2000), "charuco": (2000, 4000)}
-SEARCHES = (cv2.findChessboardCorners, cv2.findChessboardCornersSB)  # the quick one first
+ANY_SIZE_PX = 800  # longest side in px at which checkerboards of any size are looked for
 LOOK_AT = ((0.25, 0.25), (0.3, 0.12), (0.12, 0.3))  # squares from a corner along x and y
 LEAST_REAL = 0.7  # of the corners in each row and column of a checkerboard are real,
 MOST_BEYOND = 0.5  # and in the lines beyond them no more
+MOST_LINES = 40  # of corners each way
+OFF_PLANE = 0.4, 0.2  # squares: a corner is no farther from its place, as found and as refined
+LEAST_ON_PLANE = 0.7  # of the corners
+# Lenses that are tried: what is seen at r half diagonals from the middle would be seen without the
+# lens at r / (1 + k r^2) (Fitzgibbon 2001); the most negative is a fisheye's.
+LENSES = (0.0, -0.1, -0.2, -0.35, -0.5, -0.7, -0.9, 0.1, 0.2, 0.4)
 
 
 def find_corners(grey: Grey, board: Board) -> Corners | None:
     """The board's corners in a grey image: ids (N,) and pixels (N, 2), or None.
 
     A checkerboard is found whole or not at all. OpenCV's older search finds boards that touch
-    other dark things, its newer one (after Duda and Frese 2018) blurred and noisy ones: the second
-    is tried where the first finds nothing.
+    other dark things, its newer one (after Duda and Frese 2018) blurred and noisy ones. The older
+    one may take 20 s of a large cluttered image, so it looks at small images, and where its first
+    glance shows nothing it looks again only when all else has failed and no other board is seen.
+
+    Corners that lie far from where a plane and a lens would have them are left out; where they are
+    many, what was found is no board.
     """
-    look = _charuco if board.kind == "charuco" else _checkerboard
-    for longest_px in LOOKED_AT_PX[board.kind]:
+    tried = set()
+    for longest_px, look in LOOKS[board.kind]:
         small = shrunk(grey, longest_px)
+        if (small.shape, look) in tried:
+            continue
+        tried.add((small.shape, look))
         found = look(small, board)
         if found is not None:
             ids, pixels = found
-            scale = np.array(grey.shape[::-1]) / small.shape[::-1]
-            return ids, (pixels + 0.5) * scale - 0.5
-        if small is grey:
-            break
+            near = on_plane(ids, pixels, small.shape[::-1], board, OFF_PLANE[0])
+            if near.any():
+                scale = np.array(grey.shape[::-1]) / small.shape[::-1]
+                return ids[near], (pixels[near] + 0.5) * scale - 0.5
+        if look is _either:
+            other = checkerboard_seen(shrunk(grey, ANY_SIZE_PX))
+            if other is not None and sorted(other.shape[:2]) != sorted(board.corners):
+                break
     return None
+
+
+def on_plane(
+    ids: NDArray[np.intp], pixels: Floats, size: tuple[int, ...], board: Board, most: float
+) -> Bools:
+    """(N,): which corners lie where the board's plane has them, seen through one of LENSES.
+
+    size: (width, height), px. most: how far from there they may be, squares. None do where fewer
+    than LEAST_ON_PLANE would: then what was found is no board.
+    """
+    if len(ids) <= 4:  # any four corners lie on a plane
+        return np.ones(len(ids), bool)
+    plane = board.points[ids, :2] / board.square_m
+    rays = (pixels - (np.array(size) - 1) / 2) / (0.5 * np.hypot(size[0], size[1]))
+    best = np.zeros(len(ids), bool)
+    for k in LENSES:
+        straight = rays / (1 + k * (rays**2).sum(axis=1, keepdims=True))
+        near = off_homography(straight, plane, most) < most
+        if near.sum() > best.sum():
+            best = near
+        if best.all():
+            break
+    return best if best.mean() >= LEAST_ON_PLANE else np.zeros_like(best)
+
+
+def off_homography(points: Floats, plane: Floats, most: float) -> Floats:
+    """How far (N,) points (N, 2) are from their places (N, 2) on a plane, after the homography
+    that brings most of them nearer than `most`; infinite where there is none."""
+    H, _ = cv2.findHomography(points, plane, cv2.RANSAC, most)
+    if H is None:
+        return np.full(len(points), np.inf)
+    mapped = np.c_[points, np.ones(len(points))] @ H.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        off = np.linalg.norm(mapped[:, :2] / mapped[:, 2:] - plane, axis=1)
+    return np.where(np.isfinite(off), off, np.inf)
 
 
 def shrunk(grey: Grey, longest_px: int) -> Grey:
@@ -52,7 +100,7 @@ def shrunk(grey: Grey, longest_px: int) -> Grey:
     if shrink >= 1.0:
         return grey
     height, width = grey.shape
-    size = (round(width * shrink), round(height * shrink))
+    size = (max(round(width * shrink), 1), max(round(height * shrink), 1))
     return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
@@ -71,40 +119,80 @@ def _charuco(grey: Grey, board: Board) -> Corners | None:
     return numbers[order], pixels.reshape(-1, 2).astype(np.float64)[order]
 
 
-def _checkerboard(grey: Grey, board: Board) -> Corners | None:
-    grid = checkerboard_grid(grey, board.corners)
-    if grid is None:
-        return None
-    return np.arange(len(board.points)), _oriented(grey, grid, board).reshape(-1, 2)
+def _quick(grey: Grey, board: Board) -> Corners | None:
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
+    return _checkerboard(grey, board, *cv2.findChessboardCorners(grey, board.corners, None, flags))
 
 
-def checkerboard_grid(
-    grey: Grey, corners: tuple[int, int], searches: Sequence[Any] = SEARCHES
-) -> Floats | None:
-    """(rows, columns, 2) px of a checkerboard with (columns, rows) inner corners, or None.
+def _newer(grey: Grey, board: Board) -> Corners | None:
+    return _checkerboard(grey, board, *cv2.findChessboardCornersSB(grey, board.corners))
+
+
+def _either(grey: Grey, board: Board) -> Corners | None:
+    """As the older search has it, but only where the newer one finds the board: it is quicker."""
+    found = _newer(grey, board)
+    return found and (_older(grey, board) or found)
+
+
+def _older(grey: Grey, board: Board) -> Corners | None:
+    return _checkerboard(grey, board, *cv2.findChessboardCorners(grey, board.corners))
+
+
+LOOKS = {  # the longest side in px to which an image is made smaller first, and the search
+    "checkerboard": ((1000, _quick), (1000, _either), (2000, _newer), (1000, _older)),
+    "charuco": ((2000, _charuco), (4000, _charuco)),
+}
+
+
+def _checkerboard(grey: Grey, board: Board, found: bool, pixels: Any) -> Corners | None:
+    """What a search found, if it is the whole board.
 
     Where a row of corners is outside the image, OpenCV's searches may take the pattern's outer edge
     for it, and all corners move by one; so every row and column must consist of real corners. And
     they may take a part of a larger board: beyond the last row and column there must be none.
     """
-    for search in searches:
-        found, pixels = search(grey, corners)
-        if found:
-            grid = pixels.reshape(corners[1], corners[0], 2).astype(np.float64)
-            real = _is_saddle(grey, grid)
-            least = min(real.mean(axis=0).min(), real.mean(axis=1).min())
-            if least > LEAST_REAL and _share_real_beyond(grey, grid) < MOST_BEYOND:
-                return grid
-    return None
+    if not found:
+        return None
+    columns, rows = board.corners
+    grid = pixels.reshape(rows, columns, 2).astype(np.float64)
+    if not _is_whole(grey, grid):
+        return None
+    return np.arange(len(board.points)), _oriented(grey, grid, board).reshape(-1, 2)
 
 
-def _share_real_beyond(grey: Grey, grid: Floats) -> float:
-    """The largest share of real corners in the four lines next to the grid."""
+def checkerboard_seen(grey: Grey) -> Floats | None:
+    """The inner corners (rows, columns, 2), px, of a checkerboard of whatever size, or None.
+
+    OpenCV's search for boards of any size often reports one line too few or too many, so lines of
+    corners that are none are dropped, and real ones beyond the last are added.
+    """
+    flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
+    found, pixels, meta = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), flags)
+    if not found:
+        return None
+    grid = pixels.reshape(*meta.shape[:2], 2).astype(np.float64)
+    for _ in range(4):  # sides
+        while len(grid) > 2 and _is_saddle(grey, grid)[0].mean() <= LEAST_REAL:
+            grid = grid[1:]
+        while len(grid) < MOST_LINES and real_beyond(grey, grid)[0] >= MOST_BEYOND:
+            grid = np.concatenate([2 * grid[:1] - grid[1:2], grid])
+        grid = np.rot90(grid)
+    return grid if min(grid.shape[:2]) > 2 and _is_whole(grey, grid) else None
+
+
+def _is_whole(grey: Grey, grid: Floats) -> bool:
+    real = _is_saddle(grey, grid)
+    least = min(real.mean(axis=0).min(), real.mean(axis=1).min())
+    return bool(least > LEAST_REAL and max(real_beyond(grey, grid)) < MOST_BEYOND)
+
+
+def real_beyond(grey: Grey, grid: Floats) -> list[float]:
+    """The share of real corners in the four lines next to the grid: above, below, left, right."""
     around = ((1, 1), (1, 1), (0, 0))
     wide = np.pad(grid, around, mode="reflect", reflect_type="odd")  # one line more on each side
     real = _is_saddle(grey, wide)
     lines = (real[0, 1:-1], real[-1, 1:-1], real[1:-1, 0], real[1:-1, -1])
-    return float(max(line.mean() for line in lines))
+    return [float(line.mean()) for line in lines]
 
 
 def _is_saddle(grey: Grey, grid: Floats) -> Bools:

@@ -78,6 +78,7 @@ def caption(board: Board) -> str:
     if board.marker_m is not None:
         text += f", marker {1000 * board.marker_m:g} mm, {board.dictionary}"
         text += ", origin before OpenCV 4.6" if board.old_origin else ""
+        text += f", first marker {board.first_marker}" if board.first_marker else ""
     return text
 
 

@@ -9,7 +9,8 @@ from coursekit.cameras import conventions
 from coursekit.cameras.camera import Camera, place
 from coursekit.cameras.frames import CameraError, Frame, Frames
 from coursekit.cameras.librealsense import LibraryMissing, connected_realsenses
-from coursekit.cameras.realsense import RealSense, RecordedSet
+from coursekit.cameras.realsense import ImageFolder, RealSense, RecordedSet
+from coursekit.cameras.recording import INDEX, INTRINSICS
 from coursekit.cameras.simulated import SimulatedCamera
 
 __all__ = ["Camera", "CameraError", "Frame", "Frames", "conventions", "open_camera", "place"]
@@ -17,16 +18,17 @@ __all__ = ["Camera", "CameraError", "Frame", "Frames", "conventions", "open_came
 VARIABLE = "COURSEKIT_CAMERA"
 CAMERA_NAMES = (
     'want "auto", "simulated", a serial number, the path of a .db3 or .bag recording, '
-    "or a folder of them"
+    "or a folder of them or of depth images"
 )
 
 
 def open_camera(which: str | os.PathLike[str] = "auto", infrared: bool = False) -> Camera:
     """The camera that `which` names, open and ready.
 
-    which: "simulated"; the path of a .db3 or .bag recording, or of a folder that
-    `Camera.record_set` wrote; the serial number (digits) of a RealSense; or "auto", which is what
-    the environment variable COURSEKIT_CAMERA names, else the first RealSense on USB, else the
+    which: "simulated"; the path of a .db3 or .bag recording, of a folder that `Camera.record_set`
+    wrote, or of one with 16-bit PNGs of depth and an intrinsics.json (`ImageFolder`); the serial
+    number (digits) of a RealSense; or "auto", which is what the environment variable
+    COURSEKIT_CAMERA names, else the first RealSense on USB, else the
     simulated camera. infrared: whether a live camera is to give its two infrared images with each
     frame; the others give them when they have them. Raises ValueError when `which` is none of
     these, and CameraError with what to do when the camera or file does not open: a RealSense that
@@ -75,4 +77,7 @@ def _live(serial: str, infrared: bool) -> Camera:
 
 def _recording(path: Path) -> Camera:
     path = path.expanduser()
-    return RecordedSet(path) if path.is_dir() else RealSense(path=path)
+    if not path.is_dir():
+        return RealSense(path=path)
+    images = (path / INTRINSICS).exists() or any(path.glob("*.png"))
+    return ImageFolder(path) if images and not (path / INDEX).exists() else RecordedSet(path)

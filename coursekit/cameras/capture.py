@@ -28,9 +28,9 @@ from scipy.spatial.transform import Rotation
 from coursekit import checks, results
 from coursekit.arrays import Bools, Floats, Image
 from coursekit.boards import Board, BoardNotFound, Detection, Detections, Skipped, detect
+from coursekit.boards.board import seen, slide_into_view
 from coursekit.boards.detector import FEWEST_CORNERS, SESSION
 from coursekit.boards.find import find_corners
-from coursekit.boards.view import seen, slide_into_view
 from coursekit.cameras.camera import Camera
 from coursekit.cameras.frames import CameraError
 from coursekit.cameras.simulated import SimulatedCamera

@@ -12,6 +12,7 @@ from coursekit.arrays import AnyArray, Floats, Image, NDArray
 from coursekit.geometry import Intrinsics, align_depth_to_color, deproject_image
 from coursekit.words import counted
 
+NO_DEPTH = np.iinfo(np.uint16).max  # what some devices say of what is too far or not seen
 FRAMES_PER_S = 30  # of all streams that the course opens, simulates and records
 
 
@@ -47,10 +48,11 @@ class Description:
 class Frame:
     """One depth image and the images taken with it.
 
-    depth (H, W) uint16: counts of `depth_scale_m` metres, 0 invalid. color (h, w, 3) uint8 RGB or
-    None. time_s: the camera's clock. T_color_depth (4, 4): depth frame to colour frame. infrared:
-    what the depth was matched from, left and right, each (H, W) uint8 and with the pixels of the
-    depth image on the left; None where the camera does not give it.
+    depth (H, W) uint16: counts of `depth_scale_m` metres, 0 invalid; the largest count, where they
+    end, is made 0. color (h, w, 3) uint8 RGB or None. time_s: the camera's clock. T_color_depth
+    (4, 4): depth frame to colour frame. infrared: what the depth was matched from, left and right,
+    each (H, W) uint8 and with the pixels of the depth image on the left; None where the camera does
+    not give it.
     """
 
     depth: NDArray[np.uint16]
@@ -62,6 +64,11 @@ class Frame:
     color_intrinsics: Intrinsics | None = None
     T_color_depth: Floats | None = None
     infrared: tuple[Image, Image] | None = None
+
+    def __post_init__(self) -> None:
+        ends = self.depth == NO_DEPTH
+        if ends.any():
+            object.__setattr__(self, "depth", np.where(ends, np.uint16(0), self.depth))
 
     @property
     def depth_m(self) -> NDArray[np.float32]:

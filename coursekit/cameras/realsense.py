@@ -1,4 +1,5 @@
-"""RealSense cameras on USB, recordings of them, and sets of recordings, which a folder holds.
+"""RealSense cameras on USB, recordings of them, and what a folder holds: a set of recordings, or
+depth images of any other camera.
 
 Cameras and recordings are one class, because librealsense plays both.
 """
@@ -17,12 +18,13 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from coursekit import specifications
+from coursekit import checks, results, specifications
 from coursekit.arrays import AnyArray, Image
 from coursekit.cameras.camera import Camera
 from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Description, Frame
 from coursekit.cameras.librealsense import device_info, load_librealsense, start_problem
 from coursekit.cameras.recording import (
+    INTRINSICS,
     Index,
     RecordedScene,
     check_depth_scale,
@@ -31,6 +33,7 @@ from coursekit.cameras.recording import (
     depth_frame_numbers,
 )
 from coursekit.geometry import Intrinsics, make_transform
+from coursekit.words import counted
 
 DEPTH_SIZE, COLOR_SIZE = (848, 480), (640, 480)
 WARM_UP_FRAMES = 30  # automatic exposure settles in about a second
@@ -66,7 +69,8 @@ class RealSense(Camera):
         if (serial is None) == (path is None):
             raise ValueError("serial, path: got both or neither, want exactly one")
         self._rs = load_librealsense()
-        self._path, self._pipeline, self._infrared = path, None, infrared
+        self._running: _Running | None = None
+        self._path, self._infrared = path, infrared
         self._what = f"the RealSense {serial}"
         self.source, self.serial, self.can_place = "live", serial or "", path is None
         if path is not None:
@@ -96,11 +100,7 @@ class RealSense(Camera):
             pipeline = self._rs.pipeline()
             config = self._playback_config(pipeline) if self._path else self._live_config()
             self._profile = pipeline.start(config)
-            if self._path:
-                # resume() waits for the reading thread, and for 10 s if that reaches the end of a
-                # short or damaged file first; so it waits in a thread of its own.
-                playback = self._profile.get_device().as_playback()
-                threading.Thread(target=playback.resume, daemon=True).start()
+            playback = self._profile.get_device().as_playback() if self._path else None
         except CameraError:
             raise
         except RuntimeError as error:
@@ -111,7 +111,8 @@ class RealSense(Camera):
                 f"{self._what} cannot be read: it is damaged, incomplete or not from a RealSense; "
                 f"copy it again or record it anew (librealsense says: {reason})"
             ) from error
-        self._pipeline = pipeline
+        self._running = running = _Running(pipeline, playback)
+        self._stop = weakref.finalize(self, running.stop)
 
     def _live_config(self) -> Any:
         rs, config = self._rs, self._rs.config()
@@ -156,7 +157,7 @@ class RealSense(Camera):
         return {p.stream_index() for p in grey if p.stream_type() == rs.stream.infrared} >= {1, 2}
 
     def _check_open(self) -> None:
-        if self._pipeline is None:
+        if self._running is None:
             raise CameraError(f"{self._what} is closed: open it again with open_camera()")
 
     def _depth_sensor(self) -> Any:
@@ -164,12 +165,9 @@ class RealSense(Camera):
 
     def close(self) -> None:
         """Stop the camera, or close the file; a second call does nothing."""
-        pipeline, self._pipeline = self._pipeline, None
-        if pipeline is not None:
-            if self._path is not None:
-                _halt(pipeline, self._profile.get_device().as_playback())
-            with contextlib.suppress(RuntimeError):  # an unplugged camera cannot be stopped
-                pipeline.stop()
+        running, self._running = self._running, None
+        if running is not None:
+            self._stop()
 
     # --- what the device says about itself -----------------------------------------------------
 
@@ -250,14 +248,14 @@ class RealSense(Camera):
         """The next group of images; None once a recording has ended."""
         ended = False
         for _ in range(MOST_POLLS):
-            if self._pipeline is None:
-                raise CameraError(f"{self._what} was closed while it was giving frames")
             try:
-                arrived, frameset = self._pipeline.try_wait_for_frames(POLL_MS)
+                arrived, frameset = self._running.poll() if self._running else (None, None)
             except RuntimeError as error:
                 raise CameraError(
                     f"{self._what} stopped giving frames ({error}): {UNPLUGGED}"
                 ) from error
+            if arrived is None:
+                raise CameraError(f"{self._what} was closed while it was giving frames")
             if arrived:
                 return frameset
             if ended:
@@ -396,17 +394,60 @@ class RealSense(Camera):
         )
 
 
-def _halt(pipeline: Any, playback: Any) -> None:
-    """Bring a playback's reading thread to rest, so that the pipeline can be stopped.
+class _Running:
+    """A pipeline that runs, and for a recording the thread that wakes its playback and, at the end,
+    brings it to rest.
 
-    At the end of the file that thread stops the sensors itself; when the pipeline stops them at the
-    same moment, librealsense frees its callbacks twice and may end the process (its issue 9446).
-    pause() returns once the thread rests, which it does only while somebody takes its images.
+    `stop` must have been called before the interpreter ends: a thread that is still inside
+    librealsense then, in resume() or waiting for frames, ends the process with an abort.
+    playback: of a pipeline that was started with its playback paused; None of a live camera.
     """
-    pause = threading.Thread(target=playback.pause, daemon=True)
-    pause.start()
-    while pause.is_alive():  # at most librealsense's own 10 s
-        pipeline.try_wait_for_frames(1)
+
+    def __init__(self, pipeline: Any, playback: Any) -> None:
+        self._pipeline = pipeline
+        self._using, self._ending = threading.RLock(), threading.Event()
+        self._attendant: threading.Thread | None = None
+        if playback is not None:
+            attend = functools.partial(_attend, playback, self._ending)
+            self._attendant = threading.Thread(target=attend, daemon=True)
+            self._attendant.start()
+
+    def poll(self) -> tuple[bool | None, Any]:
+        """Whether images came within POLL_MS, and these; None and None once it is stopped."""
+        with self._using:
+            if self._ending.is_set():
+                return None, None
+            return self._pipeline.try_wait_for_frames(POLL_MS)
+
+    def stop(self) -> None:
+        """Bring everything to rest: a thread that polls, the playback, the pipeline.
+
+        At the end of its file a playback's reading thread stops the sensors itself; when the
+        pipeline stops them at the same moment, librealsense frees its callbacks twice and may end
+        the process (its issue 9446). So that thread has to rest first, which pause() waits for; and
+        it comes to rest only while somebody takes its images.
+        """
+        self._ending.set()
+        attendant = self._attendant
+        if attendant is threading.current_thread():  # where Python collects a forgotten camera
+            attendant = None
+        with self._using, contextlib.suppress(RuntimeError):  # an unplugged one cannot be stopped
+            try:
+                while attendant and attendant.is_alive():  # at most librealsense's own 10 s
+                    self._pipeline.try_wait_for_frames(1)
+            finally:
+                self._pipeline.stop()
+
+
+def _attend(playback: Any, ending: threading.Event) -> None:
+    """Wake a paused playback, and pause it again when it is to end.
+
+    One thread does both, so that they come in this order: resume() returns only when the reading
+    thread has come so far.
+    """
+    playback.resume()
+    ending.wait()
+    playback.pause()
 
 
 # --- images ------------------------------------------------------------------------------------
@@ -477,7 +518,7 @@ def specified(name: str) -> specifications.Device | None:
     return specifications.device(found) if found else None
 
 
-# --- sets of recordings ------------------------------------------------------------------------
+# --- folders --------------------------------------------------------------------------------------
 
 
 class RecordedSet(Camera):
@@ -532,3 +573,70 @@ class RecordedSet(Camera):
 
     def stream(self) -> Generator[Frame, None, None]:
         return self._played.stream()
+
+
+class ImageFolder(Camera):
+    """Depth images of any camera in a folder: 16-bit PNGs, in the order of the numbers in their
+    names, beside an intrinsics.json.
+
+    That file holds the fields of `Intrinsics` and depth_scale_m (metres a count), and may hold
+    baseline_m (of a stereo camera), name and frames_per_s. There is no colour. Raises CameraError
+    for a folder without both, or with a file that is damaged.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        path, self._what = folder / INTRINSICS, f"the folder {folder.name}"
+        numbers = re.compile(r"(\d+)")  # a text's odd parts: img_2 comes before img_10
+        self._images = sorted(
+            folder.glob("*.png"),
+            key=lambda png: [int(t) if i % 2 else t for i, t in enumerate(numbers.split(png.stem))],
+        )
+        if not self._images or not path.exists():
+            missing = INTRINSICS if self._images else "16-bit PNGs"
+            raise CameraError(
+                f"{self._what} lacks {missing}: to be a camera it holds 16-bit PNGs of depth and "
+                f"{INTRINSICS} with width, height, fx, fy, cx, cy (px) and depth_scale_m"
+            )
+        try:
+            given = results.read_json(path)
+            self.depth_scale_m = check_depth_scale(given.pop("depth_scale_m", None))
+            self.baseline_m = given.pop("baseline_m", None)
+            if self.baseline_m is not None:
+                self.baseline_m = checks.positive("baseline_m", self.baseline_m)
+            self.name = str(given.pop("name", "Depth camera"))
+            self._frames_per_s = checks.positive(
+                "frames_per_s", given.pop("frames_per_s", FRAMES_PER_S)
+            )
+            given["coeffs"] = tuple(given.get("coeffs", (0.0,) * 5))
+            self.depth = Intrinsics(**given)
+        except (TypeError, ValueError) as error:
+            raise CameraError(f"{path} cannot be used ({error}): correct it") from error
+        self.source, self.serial, self.color, self.T_color_depth = "recorded", "", None, None
+
+    def __repr__(self) -> str:
+        baseline = "none" if self.baseline_m is None else f"{1000 * self.baseline_m:.1f} mm"
+        return (
+            f"{self.name} ({self._what}, {counted(len(self._images), 'image')}): depth "
+            f"{self.depth.width}x{self.depth.height}, no colour, baseline {baseline}, depth unit "
+            f"{1000 * self.depth_scale_m:g} mm"
+        )
+
+    def stream(self) -> Generator[Frame, None, None]:
+        import cv2
+
+        size = (self.depth.height, self.depth.width)
+        for number, path in enumerate(self._images, start=1):
+            data = np.fromfile(path, np.uint8)  # imread takes no accents on Windows
+            image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+            if image is None or image.dtype != np.uint16 or image.shape != size:
+                got = "no image" if image is None else f"{image.dtype} {image.shape}"
+                wanted = f"16-bit grey of {size}, as {INTRINSICS} says"
+                raise CameraError(f"{path} is {got}: want {wanted}")
+            depth, time_s = image.astype(np.uint16), number / self._frames_per_s
+            yield Frame(depth, None, self.depth_scale_m, time_s, number, self.depth)
+
+    def lock(self) -> str:
+        return "Images in a folder cannot be changed: exposure and focus are as they were."
+
+    def close(self) -> None:
+        pass  # no file stays open

@@ -29,7 +29,9 @@ STREAMS = {  # by our name: librealsense's kind and format, bytes a pixel, index
     "left": ("infrared", "y8", 1, 1, 2),
     "right": ("infrared", "y8", 1, 2, 3),
 }
-INDEX = "index.json"
+OWN_TOPICS = ("/device_", "/file_version")  # of librealsense, the latter in capitals before 2018
+TOPIC = re.compile(rb"(.{4})topic=", re.DOTALL)
+INDEX, INTRINSICS = "index.json", "intrinsics.json"
 SAME_PLACE_M = 0.0005  # distances closer than this are one place
 
 
@@ -60,6 +62,62 @@ def check_recording(path: Path) -> None:
             f"{path} is not a {path.suffix} recording, though its name says so: "
             "open a file that a RealSense program or camera.record() wrote"
         )
+    topics = _topics_of_db3(path) if path.suffix == ".db3" else _topics_of_bag(path)
+    if topics and not any(topic.lower().startswith(OWN_TOPICS) for topic in topics):
+        shown = min(topics, key=lambda topic: ("depth" not in topic, "info" in topic, topic))
+        raise CameraError(
+            f"{path} is a recording of ROS topics ({shown} ...), which librealsense cannot play: "
+            "record with `coursekit record` or realsense-viewer"
+        )
+
+
+def _truncated(path: Path, there: int, wanted: int) -> CameraError:
+    return CameraError(
+        f"{path} is truncated: {there / 1e6:.2f} MB of at least {wanted / 1e6:.2f} MB are there; "
+        "copy it again or record it anew"
+    )
+
+
+def _topics_of_db3(path: Path) -> list[str]:
+    """The topics that a rosbag2 file holds; CameraError for fewer bytes than its header says.
+
+    https://www.sqlite.org/fileformat.html, 1.3: the size of a page, the number of pages, and
+    whether the latter is up to date.
+    """
+    with path.open("rb") as file:
+        header = file.read(100).ljust(100, b"\0")
+    there, number = path.stat().st_size, int.from_bytes
+    page = number(header[16:18], "big")
+    wanted = (65536 if page == 1 else page) * number(header[28:32], "big")
+    if there < 100 or (header[24:28] == header[92:96] and there < wanted):
+        raise _truncated(path, there, max(wanted, 100))
+    with _database(path) as file:
+        if file.execute("SELECT 1 FROM sqlite_master WHERE name = 'topics'").fetchone():
+            return [str(name) for (name,) in file.execute("SELECT name FROM topics")]
+    return []
+
+
+def _topics_of_bag(path: Path) -> list[str]:
+    """The topics in the index at the end of a bag; CameraError for a bag that ends before it does.
+
+    http://wiki.ros.org/Bags/Format/2.0: the first record says where the index begins, which is a
+    row of headers and data, each after its length; in a header so is each field, name=value.
+    """
+    there = path.stat().st_size
+    with path.open("rb") as file:
+        start = re.search(rb"index_pos=(.{8})", file.read(4096), re.DOTALL)
+        index = int.from_bytes(start.group(1), "little") if start else 0
+        if start and not 0 < index < there:
+            raise _truncated(path, there, max(index, there))
+        file.seek(index)
+        data = file.read() if index else b""
+    at = 0
+    while at < len(data):
+        at += 4 + int.from_bytes(data[at : at + 4], "little")
+    if at > len(data):
+        raise _truncated(path, there, there + at - len(data))
+    ends = ((m.end(), int.from_bytes(m.group(1), "little")) for m in re.finditer(TOPIC, data))
+    return [data[end : end + length - 6].decode("utf-8", "replace") for end, length in ends]
 
 
 def depth_frame_numbers(path: Path) -> list[int]:
@@ -310,7 +368,7 @@ class Index:
         if not path.exists():
             raise CameraError(
                 f"{folder} is a folder: name the .db3 or .bag file in it, "
-                "or a folder that camera.record_set() wrote"
+                f"or a folder that camera.record_set() wrote, or with 16-bit PNGs and {INTRINSICS}"
             )
         try:
             scenes = [RecordedScene(**entry) for entry in results.read_json(path)["scenes"]]

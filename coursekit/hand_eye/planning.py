@@ -14,7 +14,7 @@ import numpy as np
 from coursekit.arm import FkErrors
 from coursekit.arrays import ArrayLike, Floats, Mask
 from coursekit.boards import Board, Detection
-from coursekit.boards.view import seen
+from coursekit.boards.board import seen
 from coursekit.checks import want
 from coursekit.geometry import Intrinsics
 from coursekit.hand_eye.poses import IN_METRES, SCATTER, by_X_and_Y, camera_board, check_poses

@@ -4,12 +4,15 @@ A session is arm poses and what the camera saw at each, in memory or in a folder
 images, `poses.csv` with one row for each, and `session.json` with the mount, the board and the
 intrinsics. The columns of poses.csv, in any order, others are ignored:
 
-    file                        the image's name in the folder
-    x, y, z                     T_base_gripper's translation, m           } these seven,
-    qx, qy, qz, qw              and its rotation as a unit quaternion     } or
+    file                        the image, in the folder or one below  (or image, filename, ...)
+    x, y, z                     T_base_gripper's translation, m           } these
+    qx, qy, qz, qw              and its rotation as a unit quaternion,    }
+    or rx, ry, rz               or as `from_folder` is told               } or
     q0 .. q5                    joint angles, rad                         } these six, or both
     dq0 .. dq5                  joint velocities at that moment, rad/s (optional)
     time                        of the image, s (optional)
+
+Columns may name their unit: x_mm, "rz (deg)"; `formats.poses` says what else a table may be.
 
 `solve` finds X and Y of `hand_eye.poses`: by a closed form, and from there, unless only that was
 asked for, by the joint refinement. The result says how well X is known and what is left over.
@@ -17,27 +20,28 @@ asked for, by the joint refinement. The result says how well X is known and what
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import f as f_distribution
 
 from coursekit.arm import Arm, FkErrors, widowx
 from coursekit.arrays import ArrayLike, Floats, Integers
 from coursekit.boards import Board, Detection, Detections, detect_all
 from coursekit.boards.board import Skipped
-from coursekit.boards.detector import SESSION
+from coursekit.boards.detector import SESSION, natural
 from coursekit.checks import array, choice, instance, transform, want
-from coursekit.geometry import Intrinsics, invert_transform, make_transform, pose_difference
+from coursekit.formats import poses as pose_files
+from coursekit.formats.poses import JOINTS, PLACE, THREE, TURN, VELOCITIES, PoseRow
+from coursekit.geometry import Intrinsics, invert_transform, pose_difference
 from coursekit.hand_eye import refinement, views
 from coursekit.hand_eye.closed_form import CLOSED_FORMS, FEWEST_POSES, closed_form
 from coursekit.hand_eye.poses import (
@@ -56,11 +60,8 @@ from coursekit.words import Estimate, wrapped
 
 METHODS = ("refine", *CLOSED_FORMS)
 POSES = "poses.csv"
-PLACE = ("x", "y", "z")
-TURN = ("qx", "qy", "qz", "qw")
-JOINTS = tuple(f"q{joint}" for joint in range(6))
-OPTIONAL = {"times": ("time",), "q": JOINTS, "dq": tuple(f"d{name}" for name in JOINTS)}
-UNIT_TOLERANCE = 1e-3  # of a quaternion's length: four digits
+IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+OPTIONAL = {"times": ("time",), "q": JOINTS, "dq": VELOCITIES}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -185,26 +186,43 @@ class HandEyeSession:
         board: Board | None = None,
         intrinsics: Intrinsics | None = None,
         progress: bool = True,
+        *,
+        rotation: str | None = None,
+        length: str | None = None,
+        angle: str | None = None,
+        in_order: bool = False,
     ) -> HandEyeSession:
-        """A session from images and `poses.csv`; see the module for its columns.
+        """A session from images and `poses.csv`, or from another calibrator's pose samples.
 
-        mount, board, intrinsics: what session.json says unless given. Rows without joint angles
-        need none, rows without a pose get it from the WidowX's kinematics. A row that cannot be
-        used and an image without a board are listed in `skipped`, with the line and the reason.
-        Raises ValueError where the folder, the table or one of its columns is missing, and where
-        fewer than three pairs are left.
+        folder: with both in it (see the module for the table's columns), or a file of pose pairs of
+        easy_handeye2 (.samples) or MoveIt's calibrator (.yaml), which needs the mount only.
+        mount, board, intrinsics: what session.json says unless given. rotation, length, angle: what
+        the table's columns do not say: how rx, ry, rz turn ("rotation_vector" for Universal Robots;
+        the order of Euler angles, "xyz" for roll, pitch, yaw about fixed axes, "ZYX" for KUKA's A,
+        B, C), "mm", "deg". in_order: a table without a column for the images goes with them in the
+        order of their names.
+
+        Rows without joint angles need none, rows without a pose get it from the WidowX's
+        kinematics. A row that cannot be used and an image without a board are listed in `skipped`,
+        with the line and the reason. Raises ValueError where the folder, the table or one of its
+        columns is missing, where nobody says what a column is, and where fewer than three pairs are
+        left.
         """
         place = Path(folder)
+        if place.is_file():
+            arm, seen, mount_ = pose_files.read_samples(place, mount)
+            return cls("eye_in_hand" if mount_ == "eye_in_hand" else "eye_to_hand", arm, seen)
         want(place.is_dir(), "folder", os.fspath(folder), "a folder that exists")
         card = _card(place)
         mount = mount or _from_card(card, "mount")
         board = board or _board(_from_card(card, "board"))
         intrinsics = intrinsics or Intrinsics.from_dict(_from_card(card, "intrinsics"))
-        rows, skipped = _table(place)
-        files = [place / file for file in rows]
-        seen = detect_all(files, board, progress) if files else Detections()
-        skipped += seen.skipped
-        found = {view.name: view for view in seen}
+        rows, skipped = _table(place, in_order, rotation=rotation, length=length, angle=angle)
+        found: dict[str, Detection] = {}
+        for below, files in groupby(sorted(rows), os.path.dirname):  # views have bare names
+            some = detect_all([place / file for file in files], board, progress)
+            found |= {os.path.join(below, view.name): view for view in some}
+            skipped += some.skipped
         used = [file for file in rows if file in found]
         if len(used) < FEWEST_POSES:
             raise ValueError(
@@ -213,9 +231,9 @@ class HandEyeSession:
                 + "".join(f"; {skip!r}" for skip in skipped[:3])
             )
         T, columns = _stacked(rows[file] for file in used)
-        seen = Detections(found[file] for file in used)
+        views_ = Detections(found[file] for file in used)
         names, unused = tuple(used), tuple(skipped)
-        return cls(mount, T, seen, board, intrinsics, names=names, skipped=unused, **columns)
+        return cls(mount, T, views_, board, intrinsics, names=names, skipped=unused, **columns)
 
     def save(
         self,
@@ -263,10 +281,6 @@ class HandEyeSession:
 # --- reading a folder ---
 
 
-class _BadRow(Exception):
-    """A row cannot be used; the message says why."""
-
-
 def _card(folder: Path) -> dict[str, Any]:
     """What session.json says, {} where there is none."""
     path = folder / SESSION
@@ -292,34 +306,62 @@ def _board(card: dict[str, Any]) -> Board:
         raise ValueError(f"board: {SESSION} does not describe one ({error})") from error
 
 
-def _table(folder: Path) -> tuple[dict[str, dict[str, Any]], list[Skipped]]:
+def _table(
+    folder: Path, in_order: bool, **notation: str | None
+) -> tuple[dict[str, dict[str, Any]], list[Skipped]]:
     """The usable rows of poses.csv by their file, and what is wrong with the others."""
     path = folder / POSES
     if not path.exists():
         raise ValueError(f"folder: has no {POSES}, the table of arm poses")
+    table, read = pose_files.read_table(path, **notation)
+    columns = set(table.places)
+    files = sorted((p for p in folder.rglob("*") if p.is_file()), key=natural)
+    if in_order:
+        images = [file for file in files if file.suffix.lower() in IMAGES]
+        pair = f"{len(read)}, one a row: with in_order they go together"
+        want(len(images) == len(read) and "file" not in columns, "images", len(images), pair)
+        named = zip(read, images, strict=True)
+        read = [replace(row, file=file.relative_to(folder).as_posix()) for row, file in named]
+        columns |= {"file"}
+    _check_columns(columns)
     rows: dict[str, dict[str, Any]] = {}
     skipped = []
-    with path.open(newline="", encoding="utf-8-sig") as lines:
-        table = csv.DictReader(lines, skipinitialspace=True)
-        columns = {name.strip() for name in table.fieldnames or ()}
-        _check_columns(columns)
-        for values in table:
-            cells = {key.strip(): (value or "").strip() for key, value in values.items() if key}
-            file = cells.get("file", "")
-            try:
-                if file in rows:
-                    raise _BadRow("the file has a row already; which of the two is right?")
-                rows[file] = _read_row(file, cells, columns, folder)
-            except _BadRow as reason:
-                where = f"{POSES}, line {table.line_num}" + (f" ({file})" if file else "")
-                skipped.append(Skipped(where, str(reason)))
+    for row in read:
+        file, problem = _image(folder, files, row.file) if row.file else ("", "no file is named")
+        if file in rows:
+            problem = "the file has a row already; which of the two is right?"
+        if problem or row.problem:
+            where = f"{POSES}, line {row.line}" + (f" ({row.file})" if row.file else "")
+            skipped.append(Skipped(where, problem or row.problem))
+        else:
+            rows[file] = _read_row(row, columns)
     return rows, skipped
+
+
+def _image(folder: Path, files: Sequence[Path], file: str) -> tuple[str, str]:
+    """Where in the folder an image is that a row names, and what is wrong with that.
+
+    The name may have a path in front that another computer had, or lack one.
+    """
+    given = folder / file
+    near = [one for one in files if one.name == given.name]
+    if given in near:
+        near = [given]
+    if len(near) > 1:
+        return file, f"there are {len(near)} files of this name in the folder; which one?"
+    if not near:
+        return file, "there is no such file in the folder"
+    return near[0].relative_to(folder).as_posix(), ""
 
 
 def _check_columns(columns: set[str]) -> None:
     if "file" not in columns:
-        raise ValueError(f"folder: {POSES} has no column 'file'; its columns are {sorted(columns)}")
-    missing = [name for name in (*PLACE, *TURN) if name not in columns]
+        raise ValueError(
+            f"folder: {POSES} has no column 'file'; its columns are {sorted(columns)}. Name the "
+            "images, or say in_order=True where row and image go together in the order of names"
+        )
+    turn = THREE if columns.issuperset(THREE) else TURN
+    missing = [name for name in (*PLACE, *turn) if name not in columns]
     if missing and not columns.issuperset(JOINTS):
         raise ValueError(
             f"folder: {POSES} has no column {missing[0]!r}, and not all of {', '.join(JOINTS)} "
@@ -327,41 +369,15 @@ def _check_columns(columns: set[str]) -> None:
         )
 
 
-def _read_row(
-    file: str, cells: Mapping[str, str], columns: set[str], folder: Path
-) -> dict[str, Any]:
+def _read_row(row: PoseRow, columns: set[str]) -> dict[str, Any]:
     """T (4, 4), and of `OPTIONAL` what the table has, None for the rest."""
-    if not file:
-        raise _BadRow("no file is named")
-    if not (folder / file).is_file():
-        raise _BadRow("there is no such file in the folder")
-    row: dict[str, Any] = {
-        name: _numbers(cells, names) if columns.issuperset(names) else None
+    found: dict[str, Any] = {
+        name: np.array([row.values[one] for one in names]) if columns.issuperset(names) else None
         for name, names in OPTIONAL.items()
     }
-    if row["times"] is not None:
-        row["times"] = row["times"][0]
-    if not columns.issuperset((*PLACE, *TURN)):
-        return row | {"T": widowx().forward(row["q"])}
-    place, turn = _numbers(cells, PLACE), _numbers(cells, TURN)
-    length = float(np.linalg.norm(turn))
-    if abs(length - 1) > UNIT_TOLERANCE:
-        raise _BadRow(f"the quaternion has length {length:.4g}, want 1")
-    return row | {"T": make_transform(Rotation.from_quat(turn), place)}
-
-
-def _numbers(cells: Mapping[str, str], names: Sequence[str]) -> Floats:
-    values = []
-    for name in names:
-        text = cells.get(name, "")
-        try:
-            value = float(text)
-        except ValueError:
-            raise _BadRow(f"{name} is {text!r}, no number") from None
-        if not np.isfinite(value):
-            raise _BadRow(f"{name} is {text}, want a finite number")
-        values.append(value)
-    return np.array(values)
+    if found["times"] is not None:
+        found["times"] = found["times"][0]
+    return found | {"T": widowx().forward(found["q"]) if row.T is None else row.T}
 
 
 def _stacked(rows: Iterable[dict[str, Any]]) -> tuple[Floats, dict[str, Any]]:
@@ -640,7 +656,9 @@ class HandEyeResult(Estimate):
 
         With `fk` it is rough: how much play a unit has differs from unit to unit.
         """
-        return float(f_distribution.sf(self.excess, *self._degrees))
+        from scipy.stats import f  # two seconds to load; a camera's first frame needs none of it
+
+        return float(f.sf(self.excess, *self._degrees))
 
     # --- in words ---
 

@@ -27,8 +27,8 @@ from typing import Any
 import numpy as np
 
 from coursekit.arrays import Floats
-from coursekit.lessons import progress
-from coursekit.lessons.progress import Verdict
+from coursekit.lessons import questions
+from coursekit.lessons.questions import Verdict
 
 Step = Callable[..., Any]
 Model = Callable[..., Any]
@@ -123,7 +123,7 @@ class Exercise:
 
     def check(self, function: Callable[..., Any]) -> Verdict:
         """The verdict on a learner's function; never raises, and notes the attempt."""
-        return progress.noted(self.judge(function))
+        return questions.noted(self.judge(function))
 
     def judge(self, function: Callable[..., Any]) -> Verdict:
         """The verdict on a learner's function, without noting it."""

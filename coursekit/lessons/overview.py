@@ -9,10 +9,9 @@ from typing import Any
 
 from coursekit import results
 from coursekit.lessons import depth_noise, error_budget, hand_eye, intrinsics, pinhole
-from coursekit.lessons import progress as record
+from coursekit.lessons import questions as record
 from coursekit.lessons.exercises import Exercise
-from coursekit.lessons.progress import Verdict
-from coursekit.lessons.questions import Checkpoint, Objective, load_questions
+from coursekit.lessons.questions import Checkpoint, Objective, Verdict, load_questions
 from coursekit.words import html_table, table
 
 LESSONS = ("pinhole", "depth_noise", "intrinsics", "hand_eye", "error_budget")  # by notebook

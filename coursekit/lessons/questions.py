@@ -11,12 +11,11 @@ import html
 import math
 import re
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from coursekit.lessons import progress
-from coursekit.lessons.progress import Verdict
+from coursekit import results
 
 EXAMPLES = "0.37 or 150"  # of numbers, and no checkpoint's answer
 LENGTHS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
@@ -57,7 +56,7 @@ class Checkpoint:
 
     def answer(self, given: Any) -> Verdict:
         """The verdict on an answer; the first one given is what `progress` keeps as first try."""
-        return progress.noted(self.judge(given), str(given))
+        return noted(self.judge(given), str(given))
 
     def judge(self, given: Any) -> Verdict:
         """The verdict on an answer, without noting it."""
@@ -245,7 +244,7 @@ def panel(checkpoint: Checkpoint) -> Any:
 
 def _earlier(name: str) -> str:
     """What the student did here before, for the widget only: stored outputs never show it."""
-    attempts = progress.read_attempts().get(name, [])
+    attempts = read_attempts().get(name, [])
     if not attempts:
         return ""
     last = attempts[-1]
@@ -285,3 +284,82 @@ def load_questions(lesson: str) -> tuple[tuple[Checkpoint, ...], tuple[Objective
 
 def _single_spaced(text: str) -> str:
     return " ".join(text.split())
+
+
+# --- what is said back, and the record of it: progress.json in results/; no lesson prints it ---
+
+RECORD = "progress.json"
+VerdictKind = Literal["right", "core right", "wrong", "raised", "not attempted"]
+
+# Okabe-Ito; the word beside it says the same, so nothing hangs on the colour.
+SIDE_COLORS = {
+    "right": "#009E73",
+    "core right": "#009E73",
+    "wrong": "#D55E00",
+    "raised": "#D55E00",
+    "not attempted": "#56B4E9",
+}
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A headline and a few lines; `named` is the misconception that was recognised, if one was.
+
+    In the texts *asterisks* set emphasis and `backticks` code.
+    """
+
+    subject: str
+    kind: VerdictKind
+    headline: str
+    lines: tuple[str, ...] = ()
+    named: str | None = None
+
+    def __repr__(self) -> str:
+        return "\n".join([self.headline, *self.lines])
+
+    def _repr_html_(self) -> str:
+        body = "".join(f"<div>{_markup(line)}</div>" for line in self.lines)
+        return (
+            f'<div style="border-left: 4px solid {SIDE_COLORS[self.kind]}; padding: 2px 0 2px 12px;'
+            f' line-height: 1.4; max-width: 52em">'
+            f"<b>{_markup(self.headline)}</b>{body}</div>"
+        )
+
+
+def _markup(text: str) -> str:
+    """The text as HTML, everything in it escaped but for the two kinds of marks."""
+    text = html.escape(text, quote=False)
+    text = re.sub(r"`([^`]+)`", r"<code>\1</code>", text)
+    return re.sub(r"\*([^*\s][^*]*)\*", r"<em>\1</em>", text)
+
+
+def noted(verdict: Verdict, answer: str = "") -> Verdict:
+    """Add an attempt to the record, unless the verdict says that there was none.
+
+    A verdict that cannot be saved says so in its last line.
+    """
+    if verdict.kind == "not attempted":
+        return verdict
+    attempt = {"kind": verdict.kind, "answer": answer, "date": results.now()}
+    try:
+        attempts = read_attempts()
+        attempts.setdefault(verdict.subject, []).append(attempt)
+        results.write_json(results.folder() / RECORD, attempts)
+    except OSError as error:
+        return replace(verdict, lines=(*verdict.lines, f"(Your progress is not saved: {error})"))
+    return verdict
+
+
+def read_attempts() -> dict[str, list[dict[str, Any]]]:
+    """All attempts by name, oldest first; a damaged file is set aside, not overwritten.
+
+    Each attempt has the keys kind (as in `Verdict`), answer and date.
+    """
+    path = results.folder() / RECORD
+    if not path.exists():
+        return {}
+    try:
+        return dict(results.read_json(path))
+    except ValueError:
+        path.replace(path.with_suffix(".damaged.json"))
+        return {}

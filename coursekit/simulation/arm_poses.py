@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from coursekit.arm import Arm
 from coursekit.arrays import ArrayLike, Bools, Floats, Integers
 from coursekit.boards import Board
-from coursekit.boards.view import seen
+from coursekit.boards.board import seen
 from coursekit.checks import choice, number, transform, transforms, whole
 from coursekit.geometry import Intrinsics, invert_transform, make_transform
 from coursekit.hand_eye.poses import MOUNTS, Mount

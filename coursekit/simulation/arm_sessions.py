@@ -26,8 +26,8 @@ from scipy.spatial.transform import Rotation
 from coursekit.arm import ArmErrors, SimulatedArm, widowx
 from coursekit.arrays import Floats, Grey
 from coursekit.boards import Board, BoardNotFound, Detection, Detections, detect
+from coursekit.boards.board import seen
 from coursekit.boards.detector import FEWEST_CORNERS, SESSION
-from coursekit.boards.view import seen
 from coursekit.checks import choice, number, positive, want, whole
 from coursekit.geometry import (
     invert_transform,
@@ -48,7 +48,12 @@ from coursekit.simulation.arm_poses import (
     random_poses,
 )
 from coursekit.simulation.board_images import render_board
-from coursekit.simulation.corner_sessions import corner_noise
+from coursekit.simulation.corner_sessions import (
+    Effects,
+    corner_noise,
+    printed,
+    with_street_errors,
+)
 from coursekit.specifications import device
 
 Design = Literal["careful", "grid", "single_axis", "small_rotations"]
@@ -82,6 +87,12 @@ class HandEyeMistakes:
     what is claimed. wrong_mount: the other mount is declared. outliers: in so many views the arm is
     not where it reports, by outlier_m and outlier_deg. joint_offset_deg: the zero of one joint
     between shoulder and wrist is off by so much.
+
+    No mistake, but what arms do: scatter_m, scatter_deg: at every pose the gripper is somewhere
+    else than the arm says, independently, by this std along and about each axis; of what is sold as
+    "repeatability" 0.1 mm is the best and a hobby arm's 1 to 2 mm and half a degree. With heavy
+    tails (`scatter_tails`) some poses are off by much more: Student's t with 3 degrees of freedom,
+    with the same std. A camera in the hand, or one that swings on a stand, does the same.
     """
 
     design: Design = "careful"
@@ -100,6 +111,9 @@ class HandEyeMistakes:
     outlier_m: float = 0.03
     outlier_deg: float = 5.0
     joint_offset_deg: float = 0.0
+    scatter_m: float = 0.0
+    scatter_deg: float = 0.0
+    scatter_tails: bool = False
 
     def __post_init__(self) -> None:
         choice("design", self.design, get_args(Design))
@@ -171,13 +185,16 @@ def hand_eye_session(
     corner_noise_px: float = 0.1,
     arm_errors: ArmErrors | None = None,
     mistakes: HandEyeMistakes | None = None,
+    images: Effects | None = None,
 ) -> tuple[HandEyeSession, HandEyeTruth]:
     """A session at corner level, and the truth behind it.
 
     mount: whose `default_setup` is used, with camera and board moved a little by the seed. n: arm
     poses, at most 25 where the design is not careful. corner_noise_px: std of one coordinate of a
-    corner. arm_errors: sizes of the arm's hidden errors, None for an arm that has none. The same
-    arguments give the same session. Raises ValueError for bad arguments.
+    corner. arm_errors: sizes of the arm's hidden errors, None for an arm that has none. images: the
+    board's real shape and the corners' errors, as in `corner_sessions.ordinary`; what concerns
+    motion and lens is left out. The same arguments give the same session. Raises ValueError for bad
+    arguments.
 
     >>> on_a_grid = HandEyeMistakes(design="grid")
     >>> session, truth = hand_eye_session("eye_in_hand", seed=1, mistakes=on_a_grid)
@@ -186,8 +203,14 @@ def hand_eye_session(
     """
     number("corner_noise_px", corner_noise_px, "a number, 0 or more", least=0.0)
     truth, q, dq = _poses(mount, seed, n, arm_errors, mistakes or HandEyeMistakes())
-    rng = _stream(seed, b"corners")
-    found = [_corners(truth, view, rng, corner_noise_px) for view in range(len(q))]
+    board, effects, street = truth.setup.board, images or Effects(), _stream(seed, b"street")
+    points = printed(board, effects, street) * truth.mistakes.square_scale
+    rng, ids, found = _stream(seed, b"corners"), np.arange(len(points)), []
+    for view in range(len(q)):
+        sigma_px = corner_noise_px * np.exp(effects.noise_spread * street.normal())
+        noise = corner_noise(rng, len(points), sigma_px)
+        noise = with_street_errors(noise, sigma_px, board, ids, effects, street)
+        found.append(_corners(truth, view, points, noise, effects.claimed * sigma_px))
     return _reported(truth, q, dq, Detections(found)), truth
 
 
@@ -274,6 +297,7 @@ def _poses(
     bumps = _stream(seed, b"bumps")
     for view in outliers:  # the image was taken while the arm swung, or somebody leant on it
         true[view] = turned(true[view], _twist(bumps, mistakes.outlier_m, mistakes.outlier_deg))
+    true = turned(true, _scatter(_stream(seed, b"scatter"), len(q), mistakes))
     Y, slipped_at = _slipping(rig.Y, seed, len(q), mistakes)
     T_camera_board = camera_board(true, rig.X, Y, rig.mount)
     bad = tuple(sorted(outliers.tolist()))
@@ -337,6 +361,15 @@ def _slipping(Y: Floats, seed: int, n: int, mistakes: HandEyeMistakes) -> tuple[
     return stands, at
 
 
+def _scatter(rng: np.random.Generator, n: int, mistakes: HandEyeMistakes) -> Floats:
+    """What each pose is off by on its own, twists (n, 6), rad and m."""
+    std = np.repeat([np.radians(mistakes.scatter_deg), mistakes.scatter_m], 3)
+    drawn = rng.normal(size=(n, 6))
+    if mistakes.scatter_tails:  # a t has the variance dof / (dof - 2) = 3
+        drawn /= np.sqrt(rng.chisquare(3, (n, 1)))
+    return drawn * std
+
+
 def _twist(rng: np.random.Generator, shift_m: float, turn_deg: float) -> Floats:
     """A turn and a shift (6,) of these sizes about and along directions of their own."""
     turn, shift = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
@@ -344,13 +377,14 @@ def _twist(rng: np.random.Generator, shift_m: float, turn_deg: float) -> Floats:
 
 
 def _corners(
-    truth: HandEyeTruth, view: int, rng: np.random.Generator, noise_px: float
+    truth: HandEyeTruth, view: int, points: Floats, noise: Floats, noise_px: float
 ) -> Detection:
-    """What a detector reports of one view: all corners with room in the image."""
-    board, lens, T = truth.setup.board, truth.setup.intrinsics, truth.T_camera_board[view]
-    points = board.points * truth.mistakes.square_scale
-    pixels = project(transform_points(T, points), lens.K, lens.dist)
-    pixels += corner_noise(rng, len(pixels), noise_px)
+    """What a detector reports of one view: all corners with room in the image.
+
+    points (N, 3): where the board's corners really are on it, m. noise (N, 2): their errors, px.
+    """
+    lens, T = truth.setup.intrinsics, truth.T_camera_board[view]
+    pixels = project(transform_points(T, points), lens.K, lens.dist) + noise
     ids = np.flatnonzero(seen(points, T, lens))
     if len(ids) < FEWEST_CORNERS:
         raise ValueError(f"mistakes: the board leaves the image in view {view}; take smaller ones")

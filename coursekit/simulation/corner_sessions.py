@@ -2,20 +2,25 @@
 
 A session takes milliseconds, so statistics over hundreds of them are affordable. Each effect that
 spoils a calibration is in here with its physics: the board's shape in metres, the focal length of
-each view, and for a rolling shutter the row at which each corner is really seen.
+each view, and for a rolling shutter the row at which each corner is really seen. What no session of
+the street is without, and what is no mistake, is in here too: see `ordinary`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from typing import Any
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coursekit.arrays import Bools, Floats, Integers
 from coursekit.boards import Board, Detection, Detections
-from coursekit.boards.view import BORDER_PX, seen, slide_into_view
-from coursekit.checks import number, positive, whole
+from coursekit.boards.board import BORDER_PX, seen, slide_into_view
+from coursekit.checks import array, number, positive, whole
 from coursekit.geometry import Intrinsics, project, transform_points
 
 PARTIAL_SHARE = 0.4  # a ChArUco view shows at least this share of the corners
@@ -25,6 +30,9 @@ BLUR_NOISE_GAIN = 0.15  # growth of the corner variance per unit of relative blu
 POSES_TRIED = 60  # for each view, before giving up
 NEAREST_M, FARTHEST_M = 0.3, 0.8
 ROW_STEPS, ROW_TOLERANCE_PX = 50, 1e-9
+WIDEST_RAD = np.radians(80)  # from the axis, where a fisheye is still looked through
+WAVES = 32  # that a random smooth field is made of
+SHARED_SQUARES = 2.0  # errors of corners that are farther apart than this have little in common
 
 
 @dataclass(frozen=True)
@@ -40,6 +48,16 @@ class Effects:
     view is off by this much, each in a direction of its own. bad_corners: so many single corners,
     in different views, are off by bad_corner_px. square_scale: real size of a square over the size
     that the board claims. noise_spread: relative std of the corner noise from view to view.
+
+    Of an ordinary session: wave_m, wave_reach: rms height of the paper's irregular waves over the
+    best plane, m, and how far a wave reaches, in diagonals of the pattern. print_error: std of the
+    relative error of the print's width and of its height, each on its own, and of its right angles.
+    shared: std of errors that neighbouring corners of a view share, over the noise. corner_spread:
+    as noise_spread, from corner to corner of a view, which makes the noise's tails heavy. shake_px:
+    std of the length of the motion blur in every view. claimed: what the detector says of its
+    noise, over what it is. rational: k4, k5 and k6 of OpenCV's rational model, after the lens's own
+    coefficients; fisheye: the image grows with the angle (equidistant) instead of its tangent, the
+    lens's coefficients apart.
     """
 
     bow_m: float = 0.0
@@ -55,14 +73,27 @@ class Effects:
     bad_corner_px: float = 3.0
     square_scale: float = 1.0
     noise_spread: float = 0.0
+    wave_m: float = 0.0
+    wave_reach: float = 0.3
+    print_error: float = 0.0
+    shared: float = 0.0
+    corner_spread: float = 0.0
+    shake_px: float = 0.0
+    claimed: float = 1.0
+    rational: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    fisheye: bool = False
 
     def __post_init__(self) -> None:
         most = {"max_tilt_deg": 60.0, "inner_only": 0.3, "blur_share": 1.0}
+        array("rational", self.rational, (3,), finite=True)
         for field in fields(self):
+            if field.type not in ("float", "int"):
+                continue
             least, highest = -np.inf if field.name == "bow_m" else 0.0, most.get(field.name, np.inf)
             wanted = f"a finite number from {least:g} to {highest:g}"
             number(field.name, getattr(self, field.name), wanted, least=least, most=highest)
         positive("square_scale", self.square_scale)
+        positive("wave_reach", self.wave_reach)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +104,7 @@ class Truth:
     focal_scale (n,): of each view. velocity_m_s (n, 3): of the board in the camera's frame.
     blurred: the indices of the views with motion blur. spoiled_view: an index, or None.
     bad_corners: (view, corner id) of each. depth_m: the true Z of each corner, m, (N_i,) a view.
+    points (N, 3): where the board's corners really are in its own frame, m.
     """
 
     lens: Intrinsics
@@ -84,6 +116,42 @@ class Truth:
     spoiled_view: int | None
     bad_corners: tuple[tuple[int, int], ...]
     depth_m: tuple[Floats, ...]
+    points: Floats
+
+
+def ordinary(seed: int) -> Effects:
+    """What a session of the street has without any mistake, its sizes drawn by the seed.
+
+    **Assumed**, around what a fit with a free place for each corner finds in six real sets of
+    tests/real: paper 0.05 to 0.5 mm rms from its plane (real: 0.11 and 0.35 mm, and rough: a wave
+    reaches a square or two), printed some tenths of a per cent too wide, high or oblique (0.02 to
+    0.64 %), corners whose noise differs from view to view (by 18 to 34 %) and of which neighbours
+    share a part (correlation 0.08 to 0.42), of which the detector may state a thirtieth (real
+    photographs; of JPEGs from `board_images.as_taken` a quarter to the whole). A lens that breathes
+    0.03 % and a board held so still that it moves less than 0.1 mm while an image is read: nobody
+    could call that a fault.
+
+    >>> ordinary(1).bow_m, 5e-5 <= ordinary(1).wave_m <= 5e-4
+    (0.0, True)
+    """
+    rng = np.random.default_rng([seed, 3])
+
+    def between(least: float, most: float) -> float:
+        return float(np.exp(rng.uniform(np.log(least), np.log(most))))
+
+    return Effects(
+        focus_drift=3e-4,
+        readout_s=0.02,
+        speed_m_s=0.003,
+        noise_spread=between(0.1, 0.4),
+        wave_m=between(5e-5, 5e-4),
+        wave_reach=between(0.08, 0.6),
+        print_error=between(2e-4, 4e-3),
+        shared=between(0.3, 1.5),
+        corner_spread=between(0.05, 0.3),
+        shake_px=between(0.1, 0.8),
+        claimed=between(0.03, 1.0),
+    )
 
 
 def corner_session(
@@ -115,8 +183,10 @@ def corner_session(
     poses = view_poses(board, lens, np.random.default_rng([seed, 0]), views, effects)
     rng = np.random.default_rng([seed, 1])
     draw = _Draw(rng, views, effects)
+    street = np.random.default_rng([seed, 2])  # drawn after and apart: the rest stays as it is
+    points = printed(board, effects, street)
     looks = [
-        _look(board, lens, poses[i], effects, draw.focal_scale[i], draw.velocity_m_s[i])
+        _look(board, points, lens, poses[i], effects, draw.focal_scale[i], draw.velocity_m_s[i])
         for i in range(views)
     ]
     # single bad corners, in different views as far as they go round
@@ -127,14 +197,18 @@ def corner_session(
         blur = SHARP_BLUR_PX**2 * np.eye(2)
         if i in draw.blurred:
             blur = blur + effects.blur_px**2 / 12 * np.outer(draw.along[i], draw.along[i])
+        shaken = effects.shake_px * street.normal() * draw.along[i]
+        blur = blur + np.outer(shaken, shaken) / 12
         sigma_px = noise_px * draw.noise_scale[i]
         noise = corner_noise(rng, len(ids), sigma_px, blur)
+        noise = with_street_errors(noise, sigma_px, board, ids, effects, street)
         spoiled = effects.spoiled_px * (i == draw.spoiled_view)
         bad = np.isin(ids, [corner for view, corner in wrong if view == i])
         wild = _directions(rng, ids.size) * np.where(bad, effects.bad_corner_px, spoiled)[:, None]
         measured = _measured_blur(rng, blur)
         found = pixels + noise + wild
-        detections.append(Detection(ids, found, lens.size, f"view {i:02d}", sigma_px, measured))
+        said_px = effects.claimed * sigma_px
+        detections.append(Detection(ids, found, lens.size, f"view {i:02d}", said_px, measured))
     depth_m = tuple(Z for _, _, Z in looks)
     truth = Truth(
         lens=lens,
@@ -146,6 +220,7 @@ def corner_session(
         spoiled_view=draw.spoiled_view,
         bad_corners=wrong,
         depth_m=depth_m,
+        points=points,
     )
     return Detections(detections), truth
 
@@ -181,15 +256,15 @@ def _pose_in_view(
     effects: Effects,
 ) -> Floats:
     """One pose (4, 4), tilted about the direction `azimuth`, its middle aimed at `target` (2,)."""
+    aimed = _as_pinhole(lens, effects) if _beyond(effects) else lens
     for _ in range(POSES_TRIED):
         tilt = np.radians(effects.max_tilt_deg) * np.sqrt(rng.random())
         axis = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
         roll = Rotation.from_euler("z", rng.uniform(-np.pi / 4, np.pi / 4))
         R = (Rotation.from_rotvec(tilt * axis) * roll).as_matrix()
         distance_m = rng.uniform(NEAREST_M, FARTHEST_M)
-        T = slide_into_view(
-            target, distance_m, R, board.middle, lens, lambda T: _enough(board, lens, T, effects)
-        )
+        enough = partial(_enough, board, lens, effects=effects)
+        T = slide_into_view(target, distance_m, R, board.middle, aimed, enough)
         if T is not None:
             return T
     raise ValueError(
@@ -198,19 +273,44 @@ def _pose_in_view(
     )
 
 
+def _as_pinhole(lens: Intrinsics, effects: Effects) -> Intrinsics:
+    """A pinhole camera that sees as far to the side as a lens beyond the five coefficients."""
+    slopes = np.tan(np.linspace(0.01, WIDEST_RAD, 400))
+    seen_at = _through(lens, effects)(slopes[:, None] * [1.0, 0.0, 0.0] + [0.0, 0.0, 1.0])
+    reach_px = np.hypot(*lens.size) / 2
+    across = np.maximum.accumulate(seen_at[:, 0] - lens.cx)
+    slope = slopes[min(np.searchsorted(across, reach_px), len(slopes) - 1)]
+    return replace(lens, fx=reach_px / slope, fy=reach_px / slope, model="none")
+
+
 def _enough(board: Board, lens: Intrinsics, T: Floats, effects: Effects) -> bool:
     """Whether so much of the board is seen that it makes a view."""
     if effects.inner_only or board.kind == "charuco":
         visible = _visible(board, lens, T, effects)
         share = 1.0 if effects.inner_only else PARTIAL_SHARE
         return bool(visible.sum() >= max(share * len(visible), min(12, len(visible))))
-    return bool(seen(np.concatenate([board.points, board.outline]), T, lens).all())
+    return bool(_seen(np.concatenate([board.points, board.outline]), T, lens, effects).all())
 
 
 def _visible(board: Board, lens: Intrinsics, T: Floats, effects: Effects) -> Bools:
     """Which corners (N,) are in the image, as far from its border as they must be."""
     border_px = np.maximum(BORDER_PX, effects.inner_only * np.array(lens.size))
-    return seen(board.points, T, lens, border_px)
+    return _seen(board.points, T, lens, effects, border_px)
+
+
+def _seen(
+    points: Floats,
+    T: Floats,
+    lens: Intrinsics,
+    effects: Effects,
+    border_px: float | Floats = BORDER_PX,
+) -> Bools:
+    """As `seen`, through the session's own lens."""
+    if not _beyond(effects):
+        return seen(points, T, lens, border_px)
+    inside = transform_points(T, points)
+    pixels, last = _through(lens, effects)(inside), np.array(lens.size) - 1 - border_px
+    return ((pixels >= border_px) & (pixels <= last)).all(axis=1) & (inside[:, 2] > 0)
 
 
 # --- what is seen of them ---
@@ -235,15 +335,70 @@ class _Draw:
 
 
 def _look(
-    board: Board, lens: Intrinsics, T: Floats, effects: Effects, scale: float, velocity: Floats
+    board: Board,
+    shape: Floats,
+    lens: Intrinsics,
+    T: Floats,
+    effects: Effects,
+    scale: float,
+    velocity: Floats,
 ) -> tuple[Integers, Floats, Floats]:
     """The ids of the corners in the image, their pixels (N, 2) without noise, and their Z (N,)."""
     ids = np.flatnonzero(_visible(board, lens, T, effects))
-    points = transform_points(T, bowed(board, effects.bow_m)[ids] * effects.square_scale)
-    K = lens.K
-    K[[0, 1], [0, 1]] *= scale
-    pixels = rolling_shutter(points, velocity, effects.readout_s, lens.height, K, lens.dist)
-    return ids, pixels, points[:, 2]
+    points = transform_points(T, shape[ids])
+    see = _through(replace(lens, fx=lens.fx * scale, fy=lens.fy * scale), effects)
+    return ids, rolling_shutter(points, velocity, effects.readout_s, lens.height, see), points[:, 2]
+
+
+def _beyond(effects: Effects) -> bool:
+    """Whether the lens is none of the five coefficients'."""
+    return effects.fisheye or any(effects.rational)
+
+
+def _through(lens: Intrinsics, effects: Effects) -> Callable[[Floats], Floats]:
+    """How points (N, 3) in front of the session's lens become pixels (N, 2)."""
+    if not _beyond(effects):
+        return lambda points: project(points, lens.K, lens.dist)
+    bent = np.zeros(5) if lens.dist is None else lens.dist
+    see: Any = cv2.projectPoints
+    dist = np.concatenate([bent, effects.rational])
+    if effects.fisheye:
+        see, dist = cv2.fisheye.projectPoints, np.zeros(4)
+
+    def pixels(points: Floats) -> Floats:
+        found, _ = see(points[:, None], np.zeros(3), np.zeros(3), lens.K, dist)
+        return np.asarray(found[:, 0], np.float64)
+
+    return pixels
+
+
+def printed(board: Board, effects: Effects, rng: np.random.Generator) -> Floats:
+    """Where the board's corners (N, 3), m, really are in its frame."""
+    points = bowed(board, effects.bow_m) * effects.square_scale
+    wide, high, oblique = effects.print_error * rng.normal(size=3)
+    points[:, :2] @= np.array([[1 + wide, 0.0], [oblique, 1 + high]])
+    across, down = board.points[:, :2].max(axis=0) - board.points[:, :2].min(axis=0)
+    waves = smooth_waves(rng, effects.wave_reach * np.hypot(across, down))
+    heights = wavy(board.points[:, :2], waves)
+    plane = np.column_stack([board.points[:, :2], np.ones(len(points))])
+    heights -= plane @ np.linalg.lstsq(plane, heights, rcond=None)[0]
+    points[:, 2] += effects.wave_m * heights / np.sqrt(np.mean(heights**2))
+    return points
+
+
+def smooth_waves(rng: np.random.Generator, reach: float) -> Floats:
+    """A random smooth field over the plane as waves (WAVES, 3): radians a unit in x and y, phase.
+
+    Places farther apart than `reach` (of the plane's unit) have little in common: the correlation
+    over a distance d is exp(-d^2 / 2 reach^2), as Rahimi and Recht's random features make it.
+    """
+    turns = rng.normal(size=(WAVES, 2)) / reach
+    return np.column_stack([turns, rng.uniform(0, 2 * np.pi, WAVES)])
+
+
+def wavy(places: Floats, waves: Floats) -> Floats:
+    """The field (N,) of `smooth_waves` at places (N, 2); its variance is 1 on average."""
+    return np.sqrt(2 / len(waves)) * np.cos(places @ waves[:, :2].T + waves[:, 2]).sum(axis=1)
 
 
 def bowed(board: Board, bow_m: float) -> Floats:
@@ -264,21 +419,26 @@ def bowed(board: Board, bow_m: float) -> Floats:
 
 
 def rolling_shutter(
-    points: Floats, velocity: Floats, readout_s: float, rows: int, K: Floats, dist: Floats | None
+    points: Floats,
+    velocity: Floats,
+    readout_s: float,
+    rows: int,
+    see: Callable[[Floats], Floats],
 ) -> Floats:
     """Pixels (N, 2) of moving points, each at the time at which its row is read.
 
     points (N, 3): at mid readout, camera frame, m. velocity (3,): m/s. readout_s: from the first
-    to the last of `rows`. The row depends on where the point is and that on the row: solved by
-    iteration, which contracts as long as the image moves less than a row in a row's time.
+    to the last of `rows`. see: makes pixels of points that stand still. The row depends on where
+    the point is and that on the row: solved by iteration, which contracts as long as the image
+    moves less than a row in a row's time.
     Raises ValueError when it does not.
     """
-    pixels = project(points, K, dist)
+    pixels = see(points)
     if readout_s == 0 or not np.any(velocity):
         return pixels
     for _ in range(ROW_STEPS):
         time = ((pixels[:, 1] + 0.5) / rows - 0.5) * readout_s
-        moved = project(points + time[:, None] * velocity, K, dist)
+        moved = see(points + time[:, None] * velocity)
         change = np.abs(moved - pixels).max(initial=0.0)
         pixels = moved
         if change < ROW_TOLERANCE_PX:
@@ -306,6 +466,24 @@ def corner_noise(
     sharp = SHARP_BLUR_PX**2 * np.eye(2)
     growth = np.eye(2) + BLUR_NOISE_GAIN * (blur - sharp) / SHARP_BLUR_PX**2
     return noise @ np.linalg.cholesky(growth).T
+
+
+def with_street_errors(
+    noise: Floats,
+    sigma_px: float,
+    board: Board,
+    ids: Integers,
+    effects: Effects,
+    rng: np.random.Generator,
+) -> Floats:
+    """A view's noise (N, 2), px, of this std, spread from corner to corner, and what they share.
+
+    effects: corner_spread and shared.
+    """
+    squares = np.column_stack(np.divmod(ids, board.corners[0]))
+    shared = [wavy(squares, smooth_waves(rng, SHARED_SQUARES)) for _ in range(2)]
+    spread = np.exp(effects.corner_spread * rng.normal(size=(len(ids), 1)))
+    return noise * spread + effects.shared * sigma_px * np.column_stack(shared)
 
 
 def _directions(rng: np.random.Generator, count: int) -> Floats:

@@ -31,8 +31,9 @@ class LawFit(Estimate):
 
     names (k), theta (k,): the parameters, which `value`, `sigma` and `Estimate.interval` take by
     name. covariance (k, k): theirs, if the stated errors are right. chi2: the sum of the squared
-    residuals; n_residuals: how many there were. fx (px), baseline_m: what the camera reports.
-    notes: what a reader must know.
+    residuals; n_residuals: how many there were. fx (px), baseline_m: what the camera reports, the
+    latter None where it has none. notes: what a reader must know. scatter_dof: how many squares
+    the scatter between repeats was estimated from, where it is part of the errors.
     """
 
     names: tuple[str, ...]
@@ -42,8 +43,9 @@ class LawFit(Estimate):
     n_residuals: int
     n_distances: int
     fx: float
-    baseline_m: float
+    baseline_m: float | None
     notes: tuple[str, ...] = ()
+    scatter_dof: float = math.inf
 
     def value(self, name: str) -> float:
         """The estimate of one of `names`."""
@@ -69,13 +71,15 @@ class LawFit(Estimate):
     def quantile(self, level: float = 0.95) -> float:
         """How many sigmas an interval of probability `level` reaches to either side.
 
-        Of a normal distribution where the fit is consistent; else Student's t, and more by the
-        factor by which the residuals are larger than their errors.
+        Of a normal distribution where the fit is consistent, or Student's t where the errors rest
+        on repeats; else Student's t, and more by the factor by which the residuals are larger than
+        their errors.
         """
-        from scipy.stats import norm
+        from scipy.stats import norm, t
 
         if self.consistent:
-            return float(norm.ppf((1 + level) / 2))
+            of_errors = norm if math.isinf(self.scatter_dof) else t(self.scatter_dof)
+            return float(of_errors.ppf((1 + level) / 2))
         return super().quantile(level) * math.sqrt(self.chi2 / self.dof)
 
     def _half_band(self, slopes: list[Floats]) -> Floats:
@@ -103,10 +107,10 @@ def _least_squares(
     }
 
 
-def _increasing(name: str, values: ArrayLike) -> Floats:
+def _positive(name: str, values: ArrayLike) -> Floats:
     z = np.atleast_1d(array(name, values, leading=True))
-    fits = z.ndim == 1 and z.size > 0 and np.isfinite(z).all() and z[0] > 0
-    want(fits and (np.diff(z) > 0).all(), name, z, "positive distances in m that increase")
+    fits = z.ndim == 1 and z.size > 0 and np.isfinite(z).all() and (z > 0).all()
+    want(fits, name, z, "positive distances in m")
     return z
 
 
@@ -117,23 +121,31 @@ def _increasing(name: str, values: ArrayLike) -> Floats:
 class NoiseFit(LawFit):
     """sigma_Z = (r^2 sigma_d / (fx B)) (Z / r)^exponent, fitted; r = reference_m.
 
-    Parameters: "ln_sigma_d" and, where it is not held, "exponent". held: what the exponent was
-    held at, None where it was fitted or where one distance cannot give one.
+    Parameters: "ln_std" (of std in m at r) and, where it is not held, "exponent". held: what the
+    exponent was held at, None where it was fitted or where one distance cannot give one. scatter:
+    by which part the stds of repeats at one distance differ beyond their errors; 0 without repeats.
     """
 
     reference_m: float
     held: float | None
+    scatter: float = 0.0
 
     @property
     def sigma_d_px(self) -> float:
-        """Disparity noise at the reference distance (at any distance if the exponent is 2), px."""
-        return math.exp(self.value("ln_sigma_d"))
+        """Disparity noise at the reference distance (at any distance if the exponent is 2), px.
+
+        Like its interval it raises ValueError for a camera without a baseline: it has no disparity.
+        """
+        return self._to_px(self.value("ln_std"))
 
     @property
     def sigma_d_interval_px(self) -> Interval:
         """The 95 % interval of `sigma_d_px`."""
-        low, high = self.interval("ln_sigma_d")
-        return math.exp(low), math.exp(high)
+        low, high = self.interval("ln_std")
+        return self._to_px(low), self._to_px(high)
+
+    def _to_px(self, ln_std: float) -> float:
+        return math.exp(ln_std) * fx_baseline(self.fx, self.baseline_m) / self.reference_m**2
 
     @property
     def exponent(self) -> float | None:
@@ -149,13 +161,18 @@ class NoiseFit(LawFit):
         """The fitted law and its 95 % band at distances (...): (std, low, high), each (...), m."""
         ratio = np.log(array("distances_m", distances_m, leading=True) / self.reference_m)
         power = 2.0 if self.exponent is None else self.exponent
-        scale = self.reference_m**2 * self.sigma_d_px / (self.fx * self.baseline_m)
-        middle, half = scale * np.exp(power * ratio), self._half_band([np.ones_like(ratio), ratio])
+        middle = np.exp(self.value("ln_std") + power * ratio)
+        half = self._half_band([np.ones_like(ratio), ratio])
         return middle, middle * np.exp(-half), middle * np.exp(half)
 
     def __repr__(self) -> str:
-        low, high = self.sigma_d_interval_px
-        text = f"sigma_d = {self.sigma_d_px:.3f} px (95 %: {low:.3f} to {high:.3f})"
+        if self.baseline_m is None:
+            std, low, high = (1e3 * float(v) for v in self.std_m(self.reference_m))
+            text = f"std of depth at {self.reference_m:.2f} m = {std:.3f} mm "
+            text += f"(95 %: {low:.3f} to {high:.3f})"
+        else:
+            low, high = self.sigma_d_interval_px
+            text = f"sigma_d = {self.sigma_d_px:.3f} px (95 %: {low:.3f} to {high:.3f})"
         if self.exponent is None:
             text += ", no exponent"
         elif self.exponent_interval is None:
@@ -177,19 +194,23 @@ def fit_noise(
 ) -> NoiseFit:
     """sigma_d, and the exponent of Z unless it is held, from std of depth at several distances.
 
-    distances_m (K,): increasing, m. stds_m (K,): std over time of one pixel's depth as measured,
-    rounding included, m; NaN is left out. dof (K,) or one number: independent squares in each, as
-    `WindowStats.pixel_dof` says. depth_scale_m: the depth unit, to correct for; None leaves the
-    rounding in. exponent: 2 to hold it, None to fit it.
+    distances_m (K,): m, in any order; a distance may come again. stds_m (K,): std over time of one
+    pixel's depth as measured, rounding included, m; NaN is left out. baseline_m: None for a camera
+    that has none: its std is fitted over distance, and there is no sigma_d. dof (K,) or one number:
+    independent squares in each, as `WindowStats.pixel_dof` says. depth_scale_m: the depth unit, to
+    correct for; None leaves the rounding in. exponent: 2 to hold it, None to fit it.
 
     Model: dof_i s_i^2 / V_i is chi-squared with dof_i, V_i = `rounded_variance` of the law; so
     ln s_i has known mean and variance (digamma, trigamma) and the fit is weighted least squares
-    on it. Intervals are 1.96 standard errors, of ln sigma_d and of the exponent. Where the
+    on it. Intervals are 1.96 standard errors, of ln sigma_d and of the exponent. How much a std
+    changes from run to run, when camera and wall are set up anew, only repeats of a distance show:
+    what they scatter beyond that model (Paule and Mandel, J. Res. NBS 87 (1982), 377-385) is added
+    to the error of each, and Student's t has the degrees of freedom that it rests on. Where the
     residuals are larger than that model lets them be (chi-squared beyond 5 %), the standard errors
     are scaled to the residuals and Student's t takes the place of 1.96.
     One distance holds the exponent at 2 to get sigma_d, reports no exponent, and says so.
-    Raises ValueError for distances that do not increase, stds that are negative or all zero or
-    NaN, a dof that is not positive, and a missing baseline.
+    Raises ValueError for distances, stds or a dof that are not positive, or stds that are all zero
+    or NaN.
 
     >>> stds_m = [0.00057, 0.00129, 0.00358]
     >>> fit_noise([0.4, 0.6, 1.0], stds_m, dof=800, fx=447.0, baseline_m=0.05, exponent=2)
@@ -197,38 +218,67 @@ def fit_noise(
     """
     from scipy.special import digamma, polygamma
 
-    product = fx_baseline(fx, baseline_m)
+    if baseline_m is not None:
+        fx_baseline(fx, baseline_m)
     z, s, nu, left_out = _noise_points(distances_m, stds_m, dof)
     reference = float(np.exp(np.log(z).mean()))
     expected = np.log(s) - (digamma(nu / 2) - np.log(nu / 2)) / 2
     error = np.sqrt(polygamma(1, nu / 2)) / 2
-    start = {"ln_sigma_d": float(np.mean(np.log(s * product / z**2)))}
-    if exponent is None and len(z) > 1:
+    scatter, scatter_dof = _scatter(z, expected, error)
+    error = np.hypot(error, scatter)
+    n_distances = len(np.unique(z))
+    start = {"ln_std": float(np.mean(np.log(s) - 2 * np.log(z / reference)))}
+    if exponent is None and n_distances > 1:
         start["exponent"] = 2.0
     power = 2.0 if exponent is None else float(exponent)
 
     def residuals(theta: Floats) -> Floats:
         powers = theta[1] if len(theta) > 1 else power
-        sigma = reference**2 / product * np.exp(theta[0] + powers * np.log(z / reference))
+        sigma = np.exp(theta[0] + powers * np.log(z / reference))
         variance = rounded_variance(sigma, depth_scale_m) if depth_scale_m else sigma**2
         return (expected - np.log(variance) / 2) / error
 
     fit = NoiseFit(
         **_least_squares(residuals, start),
-        n_distances=len(z),
-        fx=float(fx),
-        baseline_m=product / float(fx),
+        n_distances=n_distances,
+        fx=positive("fx", fx),
+        baseline_m=None if baseline_m is None else float(baseline_m),
         reference_m=reference,
         held=None if exponent is None else power,
+        scatter=scatter,
+        scatter_dof=scatter_dof,
     )
-    return replace(fit, notes=(*left_out, *_noise_notes(fit, z, depth_scale_m)))
+    return replace(fit, notes=(*left_out, *_noise_notes(fit, np.unique(z), depth_scale_m)))
+
+
+def _scatter(z: Floats, values: Floats, errors: Floats) -> tuple[float, float]:
+    """The std by which values (K,) at equal z (K,) differ beyond their errors (K,), and its dof.
+
+    Paule and Mandel's: with it the weighted squares about each distance's mean are as many as there
+    are repeats. The dof are those of the sum with the errors, by Satterthwaite; infinite for none.
+    """
+    from scipy.optimize import brentq
+
+    _, group = np.unique(z, return_inverse=True)
+    repeats = len(z) - int(group.max()) - 1
+
+    def excess(variance: float) -> float:
+        weights = 1 / (errors**2 + variance)
+        mean = np.bincount(group, weights * values) / np.bincount(group, weights)
+        return float(weights @ np.square(values - mean[group])) - repeats
+
+    if repeats == 0 or excess(0.0) <= 0:
+        return 0.0, math.inf
+    most = float(np.ptp(values)) ** 2 * len(z)
+    variance = float(brentq(excess, 0.0, most))
+    return math.sqrt(variance), repeats * (1 + float(np.mean(errors**2)) / variance) ** 2
 
 
 def _noise_points(
     distances_m: ArrayLike, stds_m: ArrayLike, dof: ArrayLike
 ) -> tuple[Floats, Floats, Floats, list[str]]:
     """The distances, stds and dof that a fit can use, and notes on those it cannot."""
-    z = _increasing("distances_m", distances_m)
+    z = _positive("distances_m", distances_m)
     s = array("stds_m", stds_m, z.shape)
     nu = np.broadcast_to(array("dof", dof, z.shape if np.ndim(dof) else ()), z.shape)
     use = s > 0
@@ -245,8 +295,16 @@ def _noise_points(
 
 def _noise_notes(fit: NoiseFit, z: Floats, step: float | None) -> Iterator[str]:
     free, span = "exponent" in fit.names, z[-1] / z[0]
+    if fit.baseline_m is None:
+        yield "without a baseline there is no disparity: this is std over distance"
     if fit.exponent is None:
-        yield "one distance has no exponent; sigma_d takes it to be 2"
+        what = "std elsewhere" if fit.baseline_m is None else "sigma_d"
+        yield f"one distance has no exponent; {what} takes it to be 2"
+    if fit.scatter > 0:
+        yield (
+            f"repeats at one distance differ by {fit.scatter:.0%} more than their own errors say, "
+            "and the intervals hold that"
+        )
     if free and span < 3:
         yield (
             f"the distances span a factor of {span:.1f} only: 10 % more noise at one end moves "
@@ -310,7 +368,7 @@ class BiasFit(LawFit):
     def bias_m(self, distances_m: ArrayLike) -> tuple[Floats, Floats, Floats]:
         """Z_m - Z and its 95 % band at true distances (...): (bias, low, high), each (...), m."""
         z = array("distances_m", distances_m, leading=True)
-        product, offset = self.fx * self.baseline_m, 0.0
+        product, offset = fx_baseline(self.fx, self.baseline_m), 0.0
         slopes = [z]
         if "disparity_offset_px" in self.names:
             offset, slopes = self.value("disparity_offset_px"), [z, z**2 / product]
@@ -347,9 +405,9 @@ def fit_bias(
 ) -> BiasFit:
     """Scale error and disparity offset from depths against the tape, widths against the caliper.
 
-    distances_m (K,): by tape, increasing, m. depths_m, widths_m (K,): as measured by the camera,
-    with standard errors; either or both. width_m: by caliper. tape_m: standard uncertainty of each
-    tape reading. priors: what else is not exact.
+    distances_m (K,): by tape, m, in any order, repeats welcome. depths_m, widths_m (K,): as
+    measured by the camera, with standard errors; either or both. width_m: by caliper. tape_m:
+    standard uncertainty of each tape reading. priors: what else is not exact.
 
     Model: measured depth and width follow the room's formulas, with Gaussian errors of the stated
     sizes; what is common to several distances is a parameter with a Gaussian prior, or, for the
@@ -357,7 +415,7 @@ def fit_bias(
     Generalised least squares (SciPy); intervals as in `fit_noise`. The noise that a depth and a
     width share is neglected: it is small beside the tape.
     One distance reports everything as scale, no offset, and says so.
-    Raises ValueError for distances that do not increase, neither depths nor widths, widths without
+    Raises ValueError for distances that are not positive, neither depths nor widths, widths without
     width_m, errors that are not positive, and a missing baseline.
 
     >>> fit_bias([0.3, 0.45, 0.6], 447.0, 0.05, [0.301, 0.4515, 0.602], depth_errors_m=0.0002)
@@ -366,16 +424,17 @@ def fit_bias(
         Note: these distances hardly tell the two apart (correlation -0.95): use their sum,
         the bias at a distance.
     """
-    z = _increasing("distances_m", distances_m)
+    z = _positive("distances_m", distances_m)
     product = fx_baseline(fx, baseline_m)
     depths = _measured("depths_m", depths_m, depth_errors_m, z)
     widths = _measured("widths_m", widths_m, width_errors_m, z)
     if depths is None and widths is None:
         raise ValueError("depths_m, widths_m: got neither, want at least one of them")
     width = math.nan if widths is None else positive("width_m", width_m)
-    zero = "constant_m" if len(z) >= FREE_CONSTANT_FROM else "tape_zero_m"
+    n_distances = len(np.unique(z))
+    zero = "constant_m" if n_distances >= FREE_CONSTANT_FROM else "tape_zero_m"
     start = {"baseline_error": 0.0}
-    if len(z) > 1:
+    if n_distances > 1:
         start["disparity_offset_px"] = 0.0
     if widths:
         start["fattening_px"] = priors.edge_px[0]
@@ -408,7 +467,7 @@ def fit_bias(
 
     fit = BiasFit(
         **_least_squares(residuals, start),
-        n_distances=len(z),
+        n_distances=n_distances,
         fx=float(fx),
         baseline_m=product / float(fx),
     )

@@ -105,7 +105,7 @@ def fx_baseline(fx: float, baseline_m: float | None) -> float:
     """fx baseline, px m, of a focal length and a baseline that are known and positive."""
     if baseline_m is None:
         raise ValueError(
-            "baseline_m: got None: this recording does not say how far apart its eyes are; give "
-            "the data sheet's baseline if that will do"
+            "baseline_m: got None: no stereo camera, or a recording without its baseline, and so "
+            "no disparity; give 0.050 m, a D435's, if that will do"
         )
     return positive("fx", fx) * positive("baseline_m", baseline_m)

@@ -325,9 +325,8 @@ def work_through(
         running: dict[Future[Graded], Bundle] = {}
         with _pool(limits) as pool, contextlib.suppress(BrokenProcessPool):
             while True:
-                room = (
-                    1 if again else (1 + AHEAD) * limits.workers
-                )  # the last of them is alone, too
+                # One that is tried again is alone, the last of them, too.
+                room = 1 if again else (1 + AHEAD) * limits.workers
                 while len(running) < room:
                     bundle = again.pop() if again else next(left, None)
                     if bundle is None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ import numpy as np
 from coursekit.arrays import Floats
 from coursekit.checks import number, want, whole
 from coursekit.stereo import NoiseFit, WindowStats, fit_noise, window_stats
-from coursekit.stereo.windows import effective_frames, series_std
+from coursekit.stereo.windows import cut, effective_frames, series_std, without_mismatches
 from coursekit.submission.format import Stack, Submission
 
 RULES = Path(__file__).with_name("rubric.toml")
@@ -118,8 +118,13 @@ class AtDistance:
     @cached_property
     def z_mm(self) -> Floats:
         """Raw depths (N, h, w), mm, NaN where invalid."""
-        counts = self.stack.counts
-        return np.where(counts > 0, counts * (1e3 * self.scale_m), np.nan)
+        _, height, width = self.stack.counts.shape
+        return 1e3 * cut(self.stack.counts, (0, 0, width, height), self.scale_m)
+
+    @cached_property
+    def clean_mm(self) -> Floats:
+        """The same with NaN for mismatches, which `window_stats` leaves out of what it says."""
+        return 1e3 * without_mismatches(1e-3 * self.z_mm, self.scale_m)[0]
 
     def noise_of_mean_mm(self, frames: int) -> float | None:
         """Std of one pixel's mean over `frames` frames, as they correlate in this stack.
@@ -131,8 +136,8 @@ class AtDistance:
         n = len(self.stack.counts)
         if frames == 1 or n < 5:
             return self.std.value / math.sqrt(frames)
-        pixels = self.stack.counts.reshape(n, -1).astype(np.float64)
-        pixels = pixels[:, (pixels > 0).all(axis=0)]
+        pixels = self.clean_mm.reshape(n, -1)
+        pixels = pixels[:, np.isfinite(pixels).all(axis=0)]
         independent = float(n)
         if pixels.shape[1]:
             independent, _ = effective_frames(pixels - pixels.mean(axis=0))
@@ -167,6 +172,8 @@ def recompute(submission: Submission) -> Recomputed:
 def _measured(stack: Stack, scale: float, tape: float) -> AtDistance:
     """What one stack says; scale: metres of a count, tape: std of a reading in m."""
     _, height, width = stack.counts.shape
+    ends = np.iinfo(stack.counts.dtype).max  # no depth, as for `window_stats`
+    stack = replace(stack, counts=np.where(stack.counts == ends, 0, stack.counts))
     with np.errstate(all="ignore"):  # depths that no camera gives; what is not finite is dropped
         stats = window_stats(stack.counts, (0, 0, width, height), scale)
     bias = _finite(1e3 * (stats.depth_m - stack.distance_m))
@@ -212,11 +219,10 @@ def _law(
                 camera.depth_scale_m,
                 exponent,
             )
+            fits = math.isfinite(fit.sigma_d_px) and np.isfinite(fit.covariance).all()
     except (ValueError, np.linalg.LinAlgError) as error:
         return None, " ".join(str(error).split())
-    if not (math.isfinite(fit.sigma_d_px) and np.isfinite(fit.covariance).all()):
-        return None, "the stds do not follow any law"
-    return fit, ""
+    return (fit, "") if fits else (None, "the stds do not follow any law")
 
 
 def _finite(value: float) -> float | None:

@@ -296,8 +296,17 @@ def _std(asked: _Question, _: Submission, m: AtDistance, claim: float) -> Item:
     found, n, stats = m.std.value, m.stats.n_frames, m.stats
     tolerance = _tolerance("std", m.std.se)
 
+    left_out = counted(stats.n_mismatches, "mismatch", "mismatches")
+
     def mistakes() -> Iterator[_Mistake]:
         yield from _other_units(found, tolerance, 1e3 * m.scale_m)
+        known = np.isfinite(m.z_mm)
+        often = known.sum(axis=0) > 1
+        if stats.n_mismatches and often.any():
+            variances = np.nanvar(m.z_mm[:, often], axis=0, ddof=1)
+            value = math.sqrt(float(np.average(variances, weights=known.sum(axis=0)[often] - 1)))
+            why = f"it holds {left_out}, samples far from all others of their pixel: leave them out"
+            yield _Mistake("mismatches", value, why, 0.02 * value)
         why = "it is corrected for rounding; the table wants it as measured"
         yield _Mistake("unrounded", 1e3 * stats.pixel_std_unrounded_m, why)
         steady = m.z_mm[:, np.isfinite(m.z_mm).all(axis=0)]
@@ -319,7 +328,10 @@ def _std(asked: _Question, _: Submission, m: AtDistance, claim: float) -> Item:
         yield _Mistake("zeros", over_time, why)
         yield _Mistake("zeros", float(filled.std()), why)
 
-    return _judge(asked, claim, found, tolerance, mistakes)
+    item = _judge(asked, claim, found, tolerance, mistakes)
+    if stats.n_mismatches and item.mistake != "mismatches":
+        item = replace(item, says=f"{item.says[:-1]} ({left_out} left out).")
+    return item
 
 
 def _std_se(asked: _Question, _: Submission, m: AtDistance, claim: float) -> Item:

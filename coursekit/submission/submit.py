@@ -19,7 +19,7 @@ import numpy as np
 from coursekit import results
 from coursekit.cameras import Camera, Frames
 from coursekit.checks import want
-from coursekit.lessons import progress
+from coursekit.lessons import questions
 from coursekit.stereo import NoiseFit
 from coursekit.submission.format import (
     CameraFacts,
@@ -100,7 +100,7 @@ class Handed:
 
     def _repr_html_(self) -> str:
         kind = "not attempted" if self.path is None else "wrong" if self.says else "right"
-        return progress.Verdict("submit", kind, self.headline, self.says)._repr_html_()  # type: ignore[arg-type]
+        return questions.Verdict("submit", kind, self.headline, self.says)._repr_html_()  # type: ignore[arg-type]
 
 
 def stack(frames: Frames, window: tuple[int, int, int, int], distance_m: float) -> Stack:
@@ -142,6 +142,9 @@ def measured(
         f"{len(stacks)}: one number in mm for each distance",
     )
     free = fit.exponent if fit.exponent_interval is not None else None
+    sigma_d = interval = None
+    if fit.baseline_m is not None:  # else there is no disparity
+        sigma_d, interval = fit.sigma_d_px, fit.sigma_d_interval_px
     stds = [row.depth_std_mm for row in rows if row.depth_std_mm is not None]
     predicted = None if predicted_mm is None else tuple(predicted_mm)
     figure = None
@@ -162,7 +165,7 @@ def measured(
         tape_sigma_m=tape_sigma_m,
         caliper_m=caliper_m,
         stacks=stacks,
-        claims=Claims(rows, fit.sigma_d_px, fit.sigma_d_interval_px, free, fit.exponent_interval),
+        claims=Claims(rows, sigma_d, interval, free, fit.exponent_interval),
         plot=figure,
         conclusion=Conclusion(),
         outcomes={},
@@ -249,7 +252,7 @@ def outcomes() -> dict[str, Outcome]:
     """How the checkpoints and exercises of notebook 02 stand that were attempted, by name."""
     return {
         name: Outcome(any(a.get("kind") == "right" for a in attempts), len(attempts))
-        for name, attempts in progress.read_attempts().items()
+        for name, attempts in questions.read_attempts().items()
         if name.startswith(LESSON_PREFIX)
     }
 

@@ -1,22 +1,21 @@
 """Blank, right and wrong answers to every exercise of the notebooks get the verdict they should.
 
 And a notebook runs for somebody who leaves out every section marked deeper or studio.
-COURSEKIT_NIGHTLY=1 runs the whole notebooks with all answers as well.
+COURSEKIT_NIGHTLY=1 runs the notebooks with all answers in them, the core alone and whole.
 """
 
 import ast
-import os
 
 import nbformat
 import numpy as np
 import pytest
+from common import nightly
 from wrong_answers import attempts
 
 import coursekit as ck
 from tools import build_notebooks
 
 PATHS = build_notebooks.find([])
-NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 MARKS = ("deeper", "studio")
 EXERCISES = ck.lessons.EXERCISES
 
@@ -83,7 +82,19 @@ def test_every_mistake_that_a_check_names_has_a_wrong_answer(name):
     assert {mistake.name for mistake in EXERCISES[name].mistakes} <= named
 
 
-@pytest.mark.parametrize("whole", [False, True] if NIGHTLY else [False])
+@pytest.mark.parametrize("path", PATHS, ids=lambda path: path.stem)
+def test_the_core_uses_nothing_that_only_the_rest_defines(path):
+    """So that it runs for somebody who skips the rest; at night it is run."""
+    core, rest = split(nbformat.read(path, as_version=4).cells)
+    used, in_core, in_rest = (
+        set().union(*map(names, cells))
+        for names, cells in ((names_used, core), (names_bound, core), (names_bound, rest))
+    )
+    assert not (used & in_rest) - in_core
+
+
+@nightly
+@pytest.mark.parametrize("whole", [False, True])
 @pytest.mark.parametrize("path", PATHS, ids=lambda path: path.stem)
 def test_a_notebook_with_all_answers_runs_and_finds_them_right(path, whole, tmp_path):
     """The core alone, as for somebody who skips the rest; then the exercises of the rest."""
@@ -132,6 +143,16 @@ def heading(cell):
 
 
 def names_used(cell):
-    if cell.cell_type != "code":
-        return set()
-    return {node.id for node in ast.walk(ast.parse(cell.source)) if isinstance(node, ast.Name)}
+    return {node.id for node in nodes(cell) if isinstance(node, ast.Name)}
+
+
+def names_bound(cell):
+    """What a cell gives a name to, in functions, too."""
+    stored = {n.id for n in nodes(cell) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
+    named = (ast.FunctionDef, ast.ClassDef, ast.ExceptHandler)
+    stored |= {node.name for node in nodes(cell) if isinstance(node, named)}
+    return stored | {node.arg for node in nodes(cell) if isinstance(node, ast.arg)}
+
+
+def nodes(cell):
+    return list(ast.walk(ast.parse(cell.source))) if cell.cell_type == "code" else []
