@@ -430,7 +430,7 @@ class DiagnosisTexts:
     one sentence for each reason why something could not be tested.
 
     >>> texts = DiagnosisTexts.of("intrinsics")
-    >>> texts.finding("focus_drift", drift=1.25, normal=0.2).evidence[:30]
+    >>> texts.finding("focus_drift", drift=1.25, normal=0.2, took="").evidence[:30]
     'focal lengths differ by 1.2 % '
     """
 

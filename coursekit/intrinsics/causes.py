@@ -60,24 +60,26 @@ from coursekit.intrinsics.derivatives import (
 from coursekit.intrinsics.fit import MIN_CORNERS, IntrinsicsResult, evaluate
 from coursekit.words import p_text
 
-BOW, HEIGHTS, PRINT, FLEX = "bowed_board", "heights", "print", "flexing_board"
+BOW, HEIGHTS, FLEX = "bowed_board", "heights", "flexing_board"
+STRETCH, PRINT = "stretch", "print"
 DRIFT, FOCUS = "steady_drift", "focus_drift"
 SHUTTER, LENS = "rolling_shutter", "lens_model"
-SHAPE = (BOW, HEIGHTS, PRINT)  # of the board: three causes, one fault
+SHAPE = (BOW, HEIGHTS, STRETCH, PRINT)  # of the board: four causes, one fault
 PHYSICAL = (*SHAPE, FLEX, DRIFT, FOCUS, SHUTTER, LENS)
 SPOILED_VIEW, BAD_CORNERS = "spoiled_view", "bad_corners"
 OWN = {FLEX: 3, FOCUS: 1, SHUTTER: 3}  # columns of the causes that each view has of its own
 # What a cause's coefficients are when it matters: bow, heights, print and motion during the readout
 # in m, relative focal length, px for the rest.
 TYPICAL = {
-    BOW: 5e-4, HEIGHTS: 3e-4, PRINT: 1e-4, FLEX: 5e-4, DRIFT: 0.5, FOCUS: 0.01, SHUTTER: 1e-3,
-    LENS: 0.5, SPOILED_VIEW: 1.0, BAD_CORNERS: 1.0,
+    BOW: 5e-4, HEIGHTS: 3e-4, STRETCH: 5e-4, PRINT: 1e-4, FLEX: 5e-4, DRIFT: 0.5, FOCUS: 0.01,
+    SHUTTER: 1e-3, LENS: 0.5, SPOILED_VIEW: 1.0, BAD_CORNERS: 1.0,
 }  # fmt: skip
 SHAPE_VIEWS, SHAPE_SIGHTS = 6, 5  # so many, and of each corner on average, tell a shape from noise
 SMOOTH_DEGREE = 3  # of the field over the board that is no corner's noise
-# Residuals whose squares are at most so many of the noise's hold nothing else, and one or two
-# causes explain them together; else a cause must take most of what they hold by itself.
-AS_SMALL, MOST_CAUSES = 1.2, 2
+# One or two causes after which nothing smooth is left explain the residuals together; else a cause
+# must take most of what they hold by itself.
+FAIR = 3  # of the strongest causes are tested with each view's own noise
+NOTHING_LEFT, MOST_CAUSES = 0.05, 2
 MOST, MOST_OF_SHAPE = 0.75, 0.5  # paper is never without a shape, whatever comes on top
 STIFF = 0.1  # nor is it stiff: that much of what its shape does changes from view to view
 # At most 2 % of healthy sessions may get a finding. Six kinds of test at this level make 0.2 %; the
@@ -138,10 +140,11 @@ class Calibration:
     estimated (9, p): d camera parameters / d those that are fitted. poses (n, 4, 4):
     T_camera_board. names: of the n views. board (m, 3): its corners, m; free: what they are free to
     do, see `free_shapes`. values: the coefficients of the causes, 0 where a cause is not in the
-    model: bow (3,) of x^2, xy, y^2 in half diagonals, m; heights (m - 3,) and print (2 m - 4,),
+    model: bow (3,) of x^2, xy, y^2 in half diagonals, m; stretch (2,)
+    as bow; heights (m - 3,) and print (2 m - 4,),
     m; flex (n, 3) as bow; drift (3,) over the session, of the focal length in per cent and of the
-    centre in px; focus (n, 1); motion (n, 3) during the readout of a whole image, m; lens (8 or more,), the terms of
-    `lens_terms`. sizes: the causes that were added, with their coefficients' rms. prior_px: the
+    centre in px; focus (n, 1); motion (n, 3) during the readout of a whole image, m; lens (8 or
+    more,), the terms of `lens_terms`. sizes: the causes that were added, with their coefficients' rms. prior_px: the
     corners' noise against which those are weighed.
     """
 
@@ -168,7 +171,12 @@ class Calibration:
         left_out = int((~estimated[4:].any(axis=1)).sum())
         corners = CornerTable(points[ids], pixels, view, ids)
         names = tuple(d.name or f"view {i}" for i, d in enumerate(detections))
-        values = {BOW: np.zeros(3), DRIFT: np.zeros(3), LENS: np.zeros(8 + left_out)}
+        values = {
+            BOW: np.zeros(3),
+            STRETCH: np.zeros(2),
+            DRIFT: np.zeros(3),
+            LENS: np.zeros(8 + left_out),
+        }
         values |= {c: np.zeros(f.shape[-1]) for c, f in zip((HEIGHTS, PRINT), free, strict=True)}
         values |= {cause: np.zeros((n, width)) for cause, width in OWN.items()}
         camera, poses = result.intrinsics, result.T_camera_board
@@ -215,6 +223,7 @@ class Calibration:
             BOW: on_board[:, :, 2:] * bow[:, None, :],
             FLEX: on_board[:, :, 2:] * bow[:, None, :],
             HEIGHTS: on_board[:, :, 2:] * heights[corners.ids][:, None, :],
+            STRETCH: on_board[:, :, :2] @ stretch_shape(self, corners.points),
             PRINT: on_board[:, :, :2] @ spread[corners.ids],
             DRIFT: drift * number[:, None, None],
             FOCUS: from_axis[..., None],
@@ -236,7 +245,8 @@ class Calibration:
         """What the board's corners (m, 3) are off, m."""
         heights, spread = self.free
         z = bow_shape(self, self.board) @ self.values[BOW] + heights @ self.values[HEIGHTS]
-        return np.column_stack([spread @ self.values[PRINT], z])
+        flat = stretch_shape(self, self.board) @ self.values[STRETCH] + spread @ self.values[PRINT]
+        return np.column_stack([flat, z])
 
     def projection(self, weights: Floats | None = None, smooth: bool = False) -> Projection:
         """The residuals without what the model imitates; weights (N,), one a corner.
@@ -272,9 +282,26 @@ class Calibration:
 
         Of the corners as they are, so that it is true of JPEGs too.
         """
+        squares, dof = self._rough
+        return math.sqrt(squares / max(dof, 1))
+
+    @cached_property
+    def _rough(self) -> tuple[float, int]:
         rest = self.projection(smooth=True)
-        dof = len(rest.residuals) - rest.rank
-        return math.sqrt(float(rest.residuals @ rest.residuals) / max(dof, 1))
+        return float(rest.residuals @ rest.residuals), len(rest.residuals) - rest.rank
+
+    @cached_property
+    def smooth(self) -> tuple[float, float]:
+        """The squares that a shape and smooth fields take beyond what noise gives them, px^2.
+
+        And how often noise alone would give them as much.
+        """
+        from scipy.stats import f
+
+        squares, dof = self._rough
+        fields = len(self.plain.residuals) - self.plain.rank - dof
+        more, each = float(self.plain.residuals @ self.plain.residuals) - squares, squares / dof
+        return more - fields * each, float(f.sf(more / fields / each, fields, dof))
 
     @property
     def shows_shape(self) -> bool:
@@ -327,8 +354,12 @@ class Calibration:
         return Hypothesis(cause, columns, typical=TYPICAL[cause])
 
     def tested(self, hypotheses: Sequence[Hypothesis]) -> list[Tested]:
-        """The test of each hypothesis."""
-        return [self.test(hypothesis) for hypothesis in hypotheses]
+        """The test of each hypothesis; the fair p-value only of those that can be accepted."""
+        tests = [self.plain.explains(hypothesis).tested() for hypothesis in hypotheses]
+        physical = sorted(t.strength for t in tests if t.cause in PHYSICAL)
+        least = max(physical[-FAIR:][0] if physical else math.inf, 0.0)
+        fair = [t.cause in PHYSICAL and t.strength >= least for t in tests]
+        return [self.test(t.hypothesis) if f else t for t, f in zip(tests, fair, strict=True)]
 
     def test(self, hypothesis: Hypothesis) -> Tested:
         """One hypothesis; a physical cause has its p-value from weights after each view's noise.
@@ -429,14 +460,14 @@ def named(found: CauseSearch[Calibration]) -> list[Accepted[Calibration]]:
     def taken(steps: Sequence[Accepted[Calibration]]) -> float:
         return sum(step.before.left_px**2 - step.after.left_px**2 for step in steps)
 
-    def takes(steps: Sequence[Accepted[Calibration]], share: float) -> bool:
-        return taken(steps) >= share * max(steps[0].before.left_px ** 2 - noise, 0.0)
-
-    closed = found.model.left_px**2 <= AS_SMALL * noise and len(others) <= MOST_CAUSES
-    good = shape if shape and (closed or takes(shape, MOST_OF_SHAPE)) else []
+    closed = found.model.smooth[1] > NOTHING_LEFT and len(others) <= MOST_CAUSES
+    held = max(shape[0].before.left_px ** 2 - noise, 0.0) if shape else 0.0
+    good = shape if closed or taken(shape) >= MOST_OF_SHAPE * held else []
     crumbs = STIFF**2 * taken(good)
     large = [step for step in others if taken([step]) > crumbs]
-    good = good + [step for step in large if closed or takes([step], MOST)]
+    good = good + [
+        s for s in large if closed or s.after.smooth[0] < (1 - MOST) * s.before.smooth[0]
+    ]
     kept = _sound(found, good)
     return [step for step in kept if step.test.cause not in PHYSICAL] + good
 
@@ -519,6 +550,12 @@ def bow_shape(model: Calibration, points: Floats) -> Floats:
     """The three shapes (N, 3) of a bow: x^2, xy, y^2 from the board's centre in half diagonals."""
     x, y = ((points - model.board.mean(axis=0))[:, :2] / model.half_diagonal).T
     return np.stack([x * x, x * y, y * y], axis=1)
+
+
+def stretch_shape(model: Calibration, points: Floats) -> Floats:
+    """A print too wide and as much too low, and one askew: (N, 2, 2) in half diagonals."""
+    x, y = ((points - model.board.mean(axis=0))[:, :2] / model.half_diagonal).T
+    return np.stack([np.stack([x, y], axis=1), np.stack([-y, x], axis=1)], axis=1)
 
 
 def free_shapes(points: Floats) -> tuple[Floats, Floats]:
@@ -737,10 +774,15 @@ def fit_shape(result: IntrinsicsResult) -> IntrinsicsResult:
     sights = len(model.corners.view) / len(model.board)
     wanted = f"at least {SHAPE_VIEWS} views and {SHAPE_SIGHTS} sights of each corner"
     want(model.shows_shape, "result", f"{len(model.views)} views and {sights:.1f} sights", wanted)
-    for cause in (HEIGHTS, PRINT, HEIGHTS):  # the heights again, once the print is known
+    for cause in (STRETCH, HEIGHTS, PRINT, HEIGHTS):  # the heights again, with the print known
         less = without(model, (cause,))
         model = less.with_cause(less.plain.explains(less.hypothesis(cause)).tested())
     return shaped(model, result)
+
+
+def _flat(moves: Floats) -> Floats:
+    """Moves (m, 2, k) in the board's plane as moves (m, 3, k)."""
+    return np.concatenate([moves, np.zeros((len(moves), 1, moves.shape[2]))], axis=1)
 
 
 def shaped(model: Calibration, result: IntrinsicsResult) -> IntrinsicsResult:
@@ -749,11 +791,12 @@ def shaped(model: Calibration, result: IntrinsicsResult) -> IntrinsicsResult:
     moves = {
         BOW: bow_shape(model, model.board)[:, None] * up,
         HEIGHTS: heights[:, None] * up,
-        PRINT: np.concatenate([spread, np.zeros((len(spread), 1, spread.shape[2]))], axis=1),
+        STRETCH: _flat(stretch_shape(model, model.board)),
+        PRINT: _flat(spread),
     }
     causes = [cause for cause in model.sizes if cause in SHAPE]
     extra = {f"{c} {k}": moves[c][:, :, k] for c in causes for k in range(moves[c].shape[2])}
-    weights = [model.prior_px / model.sizes[c] if c != BOW else 0.0 for c in causes]
+    weights = [model.prior_px / model.sizes[c] * (c in (HEIGHTS, PRINT)) for c in causes]
     held = np.repeat(weights, [moves[c].shape[2] for c in causes])
     values = np.concatenate([np.zeros(0), *(model.values[c] for c in causes)])
     return evaluate(

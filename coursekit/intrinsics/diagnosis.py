@@ -351,7 +351,11 @@ _FIGURES: tuple[tuple[tuple[str, ...], Callable[[_Search, _Steps, Calibration], 
     ((causes.SHUTTER,), _shutter),
     ((causes.LENS,), _lens),
 )
-_ENTRY = {causes.HEIGHTS: "bowed_board", causes.PRINT: "uneven_print"}
+_ENTRY = {
+    causes.HEIGHTS: "bowed_board",
+    causes.PRINT: "uneven_print",
+    causes.STRETCH: "uneven_print",
+}
 
 
 def _unexplained(model: Calibration, result: IntrinsicsResult, some: bool) -> Iterator[Finding]:
