@@ -356,9 +356,12 @@ class Explained:
 
 def _basis(columns: Floats) -> Floats:
     """An orthonormal basis of the columns, without those that the others imitate."""
+    from scipy.linalg import qr
+
     size = np.linalg.norm(columns, axis=0)
-    u, s, _ = np.linalg.svd(columns / np.where(size > 0, size, 1.0), full_matrices=False)
-    return u[:, s > IMITATED * s[0]]
+    q, r, _ = qr(columns / np.where(size > 0, size, 1.0), mode="economic", pivoting=True)
+    left = np.abs(np.diag(r))
+    return np.asarray(q[:, left > IMITATED * left.max(initial=0.0)])
 
 
 # --- the test where the covariance of the noise is a model ---
@@ -427,7 +430,7 @@ class DiagnosisTexts:
     one sentence for each reason why something could not be tested.
 
     >>> texts = DiagnosisTexts.of("intrinsics")
-    >>> texts.finding("focus_drift", drift=1.25, normal=0.2).evidence[:30]
+    >>> texts.finding("focus_drift", drift=1.25, normal=0.2, took="").evidence[:30]
     'focal lengths differ by 1.2 % '
     """
 

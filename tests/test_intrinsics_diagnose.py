@@ -14,15 +14,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
 from scipy.stats import binom, kstest
 
 from coursekit.boards import Board, Detection, Detections, Skipped
+from coursekit.causes import CauseSearch
 from coursekit.geometry import Intrinsics
 from coursekit.intrinsics import causes
 from coursekit.intrinsics.causes import Calibration, CornerTable, Linear
 from coursekit.intrinsics.diagnosis import blur_lengths_px, depth_scale, diagnose, stored_power
 from coursekit.intrinsics.fit import calibrate
-from coursekit.simulation.corner_sessions import Effects, Truth, corner_session
+from coursekit.simulation.corner_sessions import Effects, Truth, corner_session, ordinary
 from tools import make_data
 
 NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
@@ -109,6 +111,11 @@ def test_the_stored_power_is_what_is_measured(cause: str) -> None:
     assert low - 3 <= found <= high + 3 if NIGHTLY else low <= found <= high
 
 
+def searched(detections: Detections) -> CauseSearch[Calibration]:
+    start = causes.refit(Calibration.of(calibrate(detections, CHECKERBOARD)))
+    return causes.search_residuals(start)
+
+
 def test_two_causes_are_both_named_and_measured() -> None:
     effects = Effects(bow_m=1e-3, spoiled_px=3.0)
     detections, truth = corner_session(CHECKERBOARD, LENS, FIRST_SEED, effects=effects)
@@ -116,7 +123,7 @@ def test_two_causes_are_both_named_and_measured() -> None:
     assert set(findings.names) == {"bowed_board", "spoiled_view"}
     spoiled, bowed = findings
     assert f"view {truth.spoiled_view:02d}:" in spoiled.evidence
-    found = causes.search_residuals(calibrate(detections, CHECKERBOARD))
+    found = searched(detections)
     assert {step.test.cause for step in found.accepted} == {"bowed_board", "spoiled_view"}
     sag, sigma = causes.sag(found.model)
     assert abs(sag - 1e-3) < 4 * sigma < 2e-4
@@ -128,13 +135,13 @@ def test_the_sizes_of_focus_drift_and_shutter_motion_come_out() -> None:
     drifting, truth = corner_session(
         CHECKERBOARD, LENS, FIRST_SEED + 1, effects=Effects(focus_drift=0.02)
     )
-    model = causes.search_residuals(calibrate(drifting, CHECKERBOARD)).model
+    model = searched(drifting).model
     assert tuple(model.sizes) == (causes.FOCUS,)
     assert model.sizes[causes.FOCUS] == pytest.approx(truth.focal_scale.std(), rel=0.25)
     moving, truth = corner_session(
         CHECKERBOARD, LENS, FIRST_SEED + 1, effects=Effects(readout_s=0.02, speed_m_s=0.1)
     )
-    model = causes.search_residuals(calibrate(moving, CHECKERBOARD)).model
+    model = searched(moving).model
     assert tuple(model.sizes) == (causes.SHUTTER,)
     assert np.sqrt(3) * model.sizes[causes.SHUTTER] == pytest.approx(0.002, rel=0.25)
     estimated, true = model.values[causes.SHUTTER][:, :2], 0.02 * truth.velocity_m_s[:, :2]
@@ -160,16 +167,15 @@ def test_the_derivatives_are_those_of_the_model() -> None:
     """Against central differences, for a model in which every cause is present."""
     model = small(FIRST_SEED + 5)
     rng = np.random.default_rng(0)
-    values = {
-        causes.BOW: np.array([3e-4, -2e-4, 5e-4]),
-        causes.FOCUS: 0.01 * rng.normal(size=(6, 1)),
-        causes.SHUTTER: 1e-3 * rng.normal(size=(6, 3)),
-        causes.LENS: np.zeros(5),
-    }
+    sizes = {**dict.fromkeys(causes.PHYSICAL, 3e-4), causes.FOCUS: 0.01, causes.DRIFT: 1.0}
+    sizes |= {causes.SHUTTER: 1e-3, causes.LENS: 0.0}
+    values = {c: sizes[c] * rng.normal(size=v.shape) for c, v in model.values.items()}
     columns = replace(model, values=values).linear.columns
 
-    for cause, tolerance in zip(causes.PHYSICAL, (1e-4, 1e-5, 1e-4, 1e-5), strict=True):
-        for k, direction in enumerate(np.eye(values[cause].shape[-1])):
+    for cause in causes.PHYSICAL:
+        tolerance = 1e-5 if cause in (causes.FOCUS, causes.LENS, causes.DRIFT) else 1e-4
+        for direction in np.eye(values[cause].shape[-1])[:8]:
+            k = int(direction.argmax())
             ahead, back = (
                 replace(model, values=values | {cause: values[cause] + step * direction})
                 for step in (1e-6, -1e-6)
@@ -202,7 +208,7 @@ def test_the_size_of_a_cause_is_the_restricted_maximum_likelihood() -> None:
 
 
 def test_p_values_of_healthy_sessions_are_uniform() -> None:
-    """Kolmogorov-Smirnov at 1 %, over 4 causes; views that differ in noise make no difference."""
+    """Kolmogorov-Smirnov at 1 %, over all causes; views that differ in noise make no difference."""
     count = 200 if NIGHTLY else 40
     p_values: dict[str, list[float]] = {cause: [] for cause in causes.PHYSICAL}
     for seed in range(FIRST_SEED + 3000, FIRST_SEED + 3000 + count):
@@ -211,7 +217,7 @@ def test_p_values_of_healthy_sessions_are_uniform() -> None:
         for cause in causes.PHYSICAL:
             p_values[cause].append(model.test(model.hypothesis(cause)).p_value)
     for cause, values in p_values.items():
-        assert kstest(values, "uniform").pvalue > 0.01 / 4, cause
+        assert kstest(values, "uniform").pvalue > 0.01 / len(p_values), cause
 
 
 def test_the_refit_without_causes_is_opencvs_minimum() -> None:
@@ -221,6 +227,65 @@ def test_the_refit_without_causes_is_opencvs_minimum() -> None:
     refitted = causes.refit(replace(Calibration.of(result), camera=away)).camera
     for name in ("fx", "fy", "cx", "cy"):
         assert abs(getattr(refitted, name) - result.value(name)) < 0.05 * result.sigma(name)
+
+
+# --- sessions that nobody here made, and lenses beyond the model ---
+
+
+def test_ordinary_sessions_get_no_wrong_cause() -> None:
+    """At most 8 of 400 (nightly); of 6 at most 1. That paper is no plane is true, and is named."""
+    wrong = {
+        "spoiled_view", "bad_corners", "steady_drift", "focus_drift", "rolling_shutter",
+        "lens_model", "flexing_board",
+    }  # fmt: skip
+    count, most = (400, 8) if NIGHTLY else (6, 1)
+    found: Counter[tuple[str, ...]] = Counter()
+    for seed in range(FIRST_SEED + 5000, FIRST_SEED + 5000 + count):
+        detections, _, board = session(seed, ordinary(seed))
+        found[diagnose(detections, board).names] += 1
+    print("ordinary", dict(found))
+    assert sum(n for names, n in found.items() if wrong & set(names)) <= most
+
+
+def fisheye_views(focal: float, seed: int) -> Detections:
+    """25 views of a board out to 80 deg from the axis of a lens that grows with the angle."""
+    rng, views = np.random.default_rng(seed), []
+    P = CHECKERBOARD.points - CHECKERBOARD.points.mean(axis=0)
+    while len(views) < 25:
+        turn, out = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(0, 65))
+        ahead = np.array([np.sin(out) * np.cos(turn), np.sin(out) * np.sin(turn), np.cos(out)])
+        facing, _ = Rotation.align_vectors(ahead[None], [[0.0, 0.0, 1.0]])
+        tilt = Rotation.from_euler("xyz", rng.uniform(-35, 35, 3), degrees=True)
+        X = (facing * tilt).apply(P) + rng.uniform(0.2, 0.4) * ahead
+        radius = np.hypot(X[:, 0], X[:, 1])
+        angle = np.arctan2(radius, X[:, 2])
+        seen = X[:, :2] / radius[:, None] * focal * angle[:, None] + [639.5, 479.5]
+        inside = (seen > 5).all() and (seen < [1274, 954]).all()
+        if inside and (X[:, 2] > 0.03).all():
+            noisy = seen + rng.normal(0, 0.08, seen.shape)
+            views.append(Detection(np.arange(54), noisy, (1280, 960), f"view {len(views)}"))
+    return Detections(views)
+
+
+@pytest.mark.parametrize(("focal", "seed"), [(310.0, 3), (340.0, 4), (280.0, 5)])
+def test_a_fisheye_is_a_wrong_lens_and_nothing_else(focal: float, seed: int) -> None:
+    findings = diagnose(fisheye_views(focal, seed), CHECKERBOARD)
+    assert findings.names == ("lens_model",)
+    assert "cv2.fisheye" in findings[0].remedy
+    assert any("passes for bow" in line for line in findings.not_tested)
+
+
+def test_a_steady_drift_is_told_from_an_autofocus() -> None:
+    """The lens grows by 1 % from the first view to the last."""
+    views = []
+    for number in range(28):
+        longer = 1 + 0.01 * number / 27
+        lens = replace(LENS, fx=LENS.fx * longer, fy=LENS.fy * longer)
+        views.append(corner_session(CHECKERBOARD, lens, FIRST_SEED, views=28)[0][number])
+    findings = diagnose(Detections(views), CHECKERBOARD)
+    assert findings.names == ("steady_drift",)
+    [longer] = re.findall(r"grows by ([+-][0-9.]+) %", findings[0].evidence)
+    assert float(longer) == pytest.approx(1.0, abs=0.3)
 
 
 # --- what needs no fit ---
@@ -247,7 +312,7 @@ def test_mixed_sizes_are_named_and_the_majority_is_used() -> None:
     assert findings.names == ("mixed_sizes",)
     assert "large.png" in findings[0].evidence
     assert "640x480" in findings[0].evidence
-    skipped = Detections(detections, [Skipped("big.png", SIZE_REASON)])
+    skipped = Detections(detections, [Skipped("big.png", SIZE_REASON, "other_size")])
     assert diagnose(skipped, CHARUCO).names == ("mixed_sizes",)
 
 
@@ -266,7 +331,7 @@ def test_a_board_with_another_number_of_squares_is_recognised_by_its_lattice() -
 
 def test_a_board_that_the_detector_saw_with_other_squares_is_named() -> None:
     reason = "a checkerboard of 10x7 squares: you gave inner corners, squares are one more"
-    skipped = [Skipped(f"view {i}", reason) for i in range(12)]
+    skipped = [Skipped(f"view {i}", reason, "other_board") for i in range(12)]
     findings = diagnose(Detections([], skipped), Board("checkerboard", (9, 6), 0.025))
     assert findings.names == ("wrong_board_size",)
     assert reason in findings[0].evidence

@@ -74,7 +74,7 @@ def test_uncertainty_is_the_spread_over_repeated_sessions() -> None:
     """The same views again and again with fresh noise: parameters and projection scatter so."""
     rng = np.random.default_rng(17)
     clean, truth = corner_session(CHARUCO, LENS, 4, noise_px=0.0)
-    values, world, camera = [], [], []
+    values, world, camera, stated = [], [], [], []
     for _ in range(2 * SESSIONS):
         views = [replace(d, pixels=d.pixels + rng.normal(0, 0.08, d.pixels.shape)) for d in clean]
         result = intrinsics.calibrate(views, CHARUCO, guess=LENS)
@@ -82,18 +82,21 @@ def test_uncertainty_is_the_spread_over_repeated_sessions() -> None:
         seen = seen_again(result, truth.T_camera_board, 0.45)
         world.append(seen[0])
         camera.append(seen[1])
+        projected = [result.projection_covariance(PIXELS, 0.45, to) for to in ("world", "camera")]
+        stated.append((result.covariance, *projected))
     given = (CHARUCO, CHARUCO.points, result.names, "brown_conrady")
     model = evaluate(LENS, truth.T_camera_board, clean, *given)
     expected = 0.08 * np.sqrt(np.diag(model.equations.shared_covariance))
     tolerance = 4 / math.sqrt(4 * SESSIONS)  # four sigmas of an empirical deviation
     np.testing.assert_allclose(np.std(values, axis=0) / expected, 1.0, atol=tolerance)
     correlation = np.corrcoef(np.transpose(values))
-    scale = np.sqrt(np.diag(result.covariance))
-    expected = result.covariance / np.outer(scale, scale)
+    covariance, *projections = (np.mean(each, axis=0) for each in zip(*stated, strict=True))
+    scale = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(np.std(values, axis=0) / scale, 1.0, atol=tolerance)
+    expected = covariance / np.outer(scale, scale)
     np.testing.assert_allclose(correlation, expected, atol=0.15 if NIGHTLY else 0.5)
-    for spread, fixed in ((world, "world"), (camera, "camera")):
-        covariance = result.projection_covariance(PIXELS, 0.45, fixed)
-        sigma = np.sqrt(np.einsum("nii->ni", covariance)) * 0.08 / result.sigma_px
+    for spread, covariance in zip((world, camera), projections, strict=True):
+        sigma = np.sqrt(np.einsum("nii->ni", covariance))
         np.testing.assert_allclose(np.std(spread, axis=0) / sigma, 1.0, atol=1.3 * tolerance)
 
 

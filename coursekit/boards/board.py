@@ -271,6 +271,10 @@ class BoardNotFound(ValueError):
     """The board is not in the image; the message says what is there instead, or what to mend."""
 
 
+class OtherBoard(BoardNotFound):
+    """Another board than was asked for is in the image."""
+
+
 @dataclass(frozen=True, eq=False)
 class Detection:
     """The corners of a board that one image shows.
@@ -323,10 +327,15 @@ class Detection:
 
 @dataclass(frozen=True)
 class Skipped:
-    """An image that was not used, and why."""
+    """An image that was not used, and why.
+
+    kind: "other_size" for a size that is not the others', "other_board" for another board
+    than was asked for, else empty.
+    """
 
     name: str
     reason: str
+    kind: str = ""
 
     def __repr__(self) -> str:
         return f"{self.name}: {self.reason}"

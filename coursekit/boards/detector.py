@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from coursekit.arrays import AnyArray, Grey, NDArray
-from coursekit.boards.board import Board, BoardNotFound, Detection, Detections, Skipped
+from coursekit.boards.board import Board, BoardNotFound, Detection, Detections, OtherBoard, Skipped
 from coursekit.boards.corners import blur_covariance, refine_corners, steps
 from coursekit.boards.explain import BLANK_GREY, blank, explain
 from coursekit.boards.find import OFF_PLANE, find_corners, on_plane
@@ -182,7 +182,8 @@ def detect_all(
             try:
                 views.append(detect(_read(source), board, name))
             except BoardNotFound as reason:
-                skipped.append(Skipped(name, str(reason)))
+                kind = "other_board" if isinstance(reason, OtherBoard) else ""
+                skipped.append(Skipped(name, str(reason), kind))
     except KeyboardInterrupt:
         done = len(views) + len(skipped)
         print(f"Stopped after {done} of {len(sources)} images; they are kept.")
@@ -304,6 +305,6 @@ def _of_one_size(views: list[Detection], skipped: list[Skipped], names: list[str
             reason = "{}x{} px, where most are {}x{}: one calibration is for one size"
             if view.size == common[::-1]:
                 reason += "; give the pixels as the sensor has them, not turned"
-            skipped.append(Skipped(view.name, reason.format(*view.size, *common)))
+            skipped.append(Skipped(view.name, reason.format(*view.size, *common), "other_size"))
     skipped.sort(key=lambda skip: names.index(skip.name))
     return Detections([view for view in views if view.size == common], skipped)

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from coursekit.arrays import Floats, Grey, NDArray
-from coursekit.boards.board import DICTIONARIES, FEWEST_SQUARES, Board
+from coursekit.boards.board import DICTIONARIES, FEWEST_SQUARES, Board, OtherBoard
 from coursekit.boards.find import (
     ANY_SIZE_PX,
     checkerboard_seen,
@@ -72,7 +72,8 @@ class _Markers(NamedTuple):
 def explain(grey: Grey, board: Board, corners: int) -> str:
     """Why `board` was not found in a grey image (H, W), uint8, in one sentence.
 
-    corners: how many of the board's corners were found, too few for use.
+    corners: how many of the board's corners were found, too few for use. Raises OtherBoard with the
+    sentence where another board is seen.
     """
     small = shrunk(grey, LONGEST_PX)
     low, high = np.quantile(small, [0.01, 0.99])
@@ -80,7 +81,7 @@ def explain(grey: Grey, board: Board, corners: int) -> str:
         return blank(low, high)
     asked = f"the {board.text} asked for"
     if reason := _what_else(small, board):
-        return f"not {asked}, but {reason}"
+        raise OtherBoard(f"not {asked}, but {reason}")
     if corners:
         return (
             f"only {corners} usable corners of {asked}: at least 6 are needed that do not lie on "

@@ -10,7 +10,7 @@ Intervals are 95 %. Pixels, metres and radians; a pose is T_camera_board, (4, 4)
 
 from __future__ import annotations
 
-from coursekit.intrinsics.causes import Bow, fit_bow
+from coursekit.intrinsics.causes import Bow, fit_bow, fit_shape
 from coursekit.intrinsics.comparison import Comparison, HalvesDifference, compare, halves
 from coursekit.intrinsics.diagnosis import diagnose, stored_power
 from coursekit.intrinsics.fit import (
@@ -39,6 +39,7 @@ __all__ = [
     "coverage",
     "diagnose",
     "fit_bow",
+    "fit_shape",
     "halves",
     "image_grid",
     "stored_power",

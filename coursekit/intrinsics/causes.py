@@ -1,19 +1,30 @@
-"""What the residuals of a calibration speak for: a bowed board, drifting focus, and four more.
+"""What the residuals of a calibration speak for: the board's shape, drifting focus, and more.
 
-The model is the camera and the board's pose in each view, to which causes are added. A corner at P
-on the board (m, z into it) is seen at
+The model is the camera and the board's pose in each view, to which causes are added. Corner j, at
+P_j on the board (m, z into it), is seen at
 
-    p = R_i (P + bow(P) n) + t_i + time motion_i,      time = -1/2 ... 1/2 from first row to last,
-    pixel = c + (1 + focus_i) (K distort(p) + lens terms - c),
+    p = R_i (P_j + (bow(P_j) + height_j + flex_i(P_j)) n + print_j) + t_i + time motion_i,
+    pixel = c + drift_c number_i + (1 + focus_i + drift_f number_i) (K distort(p) + lens terms - c),
 
-where bow is a quadratic form (constant and linear terms are poses), n the board's normal, motion_i
-what the board moves while view i is read out, and focus_i the view's relative change of the focal
-length. What is not in the model is 0 there and is tested by `coursekit.causes`: each has its
-columns whether it is in the model or not. Two more hypotheses set data aside: a view, and single
-corners, that do not fit the others.
+where bow is a quadratic form (constant and linear terms are poses), as flex_i is, that of a board
+which bends from view to view, n the board's normal, height_j
+and print_j what the corner is off out of the plane and in it, motion_i what the board moves while
+view i is read out (time = -1/2 ... 1/2 from first row to last), focus_i the view's relative change
+of the focal length, and number_i = -1/2 ... 1/2 over the session. Heights, prints, motions and
+focus are drawn from normal distributions, one width each. Lens terms are smooth functions of the
+place in the image. What is not in the model is 0 there and is tested by `coursekit.causes`: each
+has its columns whether it is in the model or not. Two more hypotheses set data aside: a view, and
+single corners, that do not fit the others.
+
+What explains most is taken in first, and that is not yet a reason to name it: residuals of real
+images hang together within a view, and something always explains a little of that. `named` asks
+whether a cause explains what there is: with it the residuals are as small as the corners' noise, or
+it takes most of what they hold beyond it. The noise is what is left when the board's shape and a
+smooth field in each view are free (`Calibration.noise_px`), whatever the detector believes.
 
 `fit_bow` fits the bow alone. It puts corners a millimetre off the plane, and a fit without it pays
-with the focal length and k1 rather than with the residuals.
+with the focal length and k1 rather than with the residuals. `fit_shape` lets every corner be where
+the views say.
 """
 
 from __future__ import annotations
@@ -27,7 +38,16 @@ import numpy as np
 
 from coursekit.arrays import Floats, Interval, Mask, NDArray
 from coursekit.boards import Detection, Detections
-from coursekit.causes import CauseSearch, Explained, Hypothesis, Projection, Tested, search
+from coursekit.causes import (
+    Accepted,
+    CauseSearch,
+    Explained,
+    Hypothesis,
+    Projection,
+    Tested,
+    search,
+)
+from coursekit.checks import want
 from coursekit.geometry import Intrinsics, moved
 from coursekit.intrinsics.derivatives import (
     NormalEquations,
@@ -40,18 +60,36 @@ from coursekit.intrinsics.derivatives import (
 from coursekit.intrinsics.fit import MIN_CORNERS, IntrinsicsResult, evaluate
 from coursekit.words import p_text
 
-BOW, FOCUS, SHUTTER, LENS = "bowed_board", "focus_drift", "rolling_shutter", "lens_model"
-PHYSICAL = (BOW, FOCUS, SHUTTER, LENS)
+BOW, HEIGHTS, FLEX = "bowed_board", "heights", "flexing_board"
+STRETCH, PRINT = "stretch", "print"
+DRIFT, FOCUS = "steady_drift", "focus_drift"
+SHUTTER, LENS = "rolling_shutter", "lens_model"
+SHAPE = (BOW, HEIGHTS, STRETCH, PRINT)  # of the board: four causes, one fault
+PHYSICAL = (*SHAPE, FLEX, DRIFT, FOCUS, SHUTTER, LENS)
 SPOILED_VIEW, BAD_CORNERS = "spoiled_view", "bad_corners"
-OWN = {FOCUS: 1, SHUTTER: 3}  # columns of the causes that each view has of its own
-# What a cause's coefficients are when it matters: bow, motion during the readout in m, relative
-# focal length, px for the rest.
-TYPICAL = {BOW: 5e-4, FOCUS: 0.01, SHUTTER: 1e-3, LENS: 0.5, SPOILED_VIEW: 1.0, BAD_CORNERS: 1.0}
+OWN = {FLEX: 3, FOCUS: 1, SHUTTER: 3}  # columns of the causes that each view has of its own
+# What a cause's coefficients are when it matters: bow, heights, print and motion during the readout
+# in m, relative focal length, px for the rest.
+TYPICAL = {
+    BOW: 5e-4, HEIGHTS: 3e-4, STRETCH: 5e-4, PRINT: 1e-4, FLEX: 5e-4, DRIFT: 0.5, FOCUS: 0.01,
+    SHUTTER: 1e-3, LENS: 0.5, SPOILED_VIEW: 1.0, BAD_CORNERS: 1.0,
+}  # fmt: skip
+SHAPE_VIEWS, SHAPE_SIGHTS = 6, 5  # so many, and of each corner on average, tell a shape from noise
+SMOOTH_DEGREE = 3  # of the field over the board that is no corner's noise
+# One or two causes after which nothing smooth is left explain the residuals together; else a cause
+# must take most of what they hold by itself.
+FAIR = 3  # of the strongest causes are tested with each view's own noise
+NOTHING_LEFT, MOST_CAUSES = 0.05, 2
+MOST, MOST_OF_SHAPE = 0.75, 0.5  # paper is never without a shape, whatever comes on top
+STIFF = 0.1  # nor is it stiff: that much of what its shape does changes from view to view
 # At most 2 % of healthy sessions may get a finding. Six kinds of test at this level make 0.2 %; the
 # rest is for noise that is not quite Gaussian and for the checks that are no F-tests.
 CHANCE_LEVEL = 3e-4
 BOW_LEVEL = 0.01  # a bow less likely than this by chance is one
-PRIOR_PX = 0.1  # corner noise against which a cause's size is weighed in a refit
+PRIOR_PX = 0.1  # corner noise until residuals were looked at
+LEAST_SHAPE_M = 1e-6
+DENT_SIGMAS, DENT_M = 3.5, 2e-4  # of a corner that stands out from its board
+LEAST_PX = 1e-6  # of noise, where exact corners have none
 REFIT_STEPS, SMALL_DECREASE = 40, 1e-7  # a step that saves less of the squares is the last
 LEAST_DAMPING, MOST_DAMPING = 1e-12, 1.0  # of the columns' own squares
 SPOILED_RATIO = 3.0  # a view's rms over the others' median; blurred or far views reach 2
@@ -100,11 +138,14 @@ class Calibration:
     """A camera, the board's pose in each view, the causes that were added, and the corners.
 
     estimated (9, p): d camera parameters / d those that are fitted. poses (n, 4, 4):
-    T_camera_board. names: of the n views. centre, half_diagonal: of the board, m. values: the
-    coefficients of the causes, 0 where a cause is not in the model: bow (3,) of x^2, xy, y^2 in
-    half diagonals, m; focus (n, 1); motion (n, 3) during the readout of a whole image, m; lens
-    (5 or more,), the terms of `lens_terms`. sizes: the causes that were added, with their
-    coefficients' rms.
+    T_camera_board. names: of the n views. board (m, 3): its corners, m; free: what they are free to
+    do, see `free_shapes`. values: the coefficients of the causes, 0 where a cause is not in the
+    model: bow (3,) of x^2, xy, y^2 in half diagonals, m; stretch (2,)
+    as bow; heights (m - 3,) and print (2 m - 4,),
+    m; flex (n, 3) as bow; drift (3,) over the session, of the focal length in per cent and of the
+    centre in px; focus (n, 1); motion (n, 3) during the readout of a whole image, m; lens (8 or
+    more,), the terms of `lens_terms`. sizes: the causes that were added, with their coefficients' rms. prior_px: the
+    corners' noise against which those are weighed.
     """
 
     camera: Intrinsics
@@ -112,16 +153,17 @@ class Calibration:
     poses: Floats
     corners: CornerTable
     names: tuple[str, ...]
-    centre: Floats
-    half_diagonal: float
+    board: Floats
+    free: tuple[Floats, Floats]
     values: dict[str, Floats]
     sizes: dict[str, float]
+    prior_px: float = PRIOR_PX
 
     @classmethod
     def of(cls, result: IntrinsicsResult) -> Calibration:
         """A fit as a model without causes."""
         detections, points = result.detections, result.points
-        n, centre = len(detections), points.mean(axis=0)
+        n, free = len(detections), free_shapes(points)
         ids = np.concatenate([d.ids for d in detections])
         pixels = np.concatenate([d.pixels for d in detections])
         view = np.repeat(np.arange(n), [len(d.ids) for d in detections])
@@ -129,11 +171,16 @@ class Calibration:
         left_out = int((~estimated[4:].any(axis=1)).sum())
         corners = CornerTable(points[ids], pixels, view, ids)
         names = tuple(d.name or f"view {i}" for i, d in enumerate(detections))
-        half_diagonal = float(np.linalg.norm(points - centre, axis=1).max())
-        values = {BOW: np.zeros(3), LENS: np.zeros(5 + left_out)}
+        values = {
+            BOW: np.zeros(3),
+            STRETCH: np.zeros(2),
+            DRIFT: np.zeros(3),
+            LENS: np.zeros(8 + left_out),
+        }
+        values |= {c: np.zeros(f.shape[-1]) for c, f in zip((HEIGHTS, PRINT), free, strict=True)}
         values |= {cause: np.zeros((n, width)) for cause, width in OWN.items()}
         camera, poses = result.intrinsics, result.T_camera_board
-        return cls(camera, estimated, poses, corners, names, centre, half_diagonal, values, {})
+        return cls(camera, estimated, poses, corners, names, points, free, values, {})
 
     @cached_property
     def views(self) -> NDArray[np.intp]:
@@ -150,57 +197,139 @@ class Calibration:
         """Residuals and derivatives at the corners."""
         corners, camera, values = self.corners, self.camera, self.values
         R, t = self.poses[corners.view, :3, :3], self.poses[corners.view, :3, 3]
-        shape = bow_shape(self, corners.points)
-        on_board = corners.points + (shape @ values[BOW])[:, None] * NORMAL
-        still = np.einsum("nij,nj->ni", R, on_board) + t
+        bow = bow_shape(self, corners.points)
+        off = self.shape[corners.ids]
+        off[:, 2] += np.einsum("nk,nk->n", bow, values[FLEX][corners.view])
+        still = np.einsum("nij,nj->ni", R, corners.points + off) + t
         # The row at which a corner was seen is measured: nothing has to be solved for it.
         time = (corners.pixels[:, 1] + 0.5) / camera.height - 0.5
         points = still + time[:, None] * values[SHUTTER][corners.view]
         pixels, by_camera, by_point = project_with_derivatives(points, camera)
         left_out = by_camera[:, :, 4:][:, :, ~self.estimated[4:].any(axis=1)]
-        terms = lens_terms(points[:, :2] / points[:, 2:]) * np.array([[camera.fx], [camera.fy]])
-        terms = np.concatenate([terms, left_out], axis=2)
+        terms = np.concatenate([lens_terms(pixels, camera.size), left_out], axis=2)
         principal = np.array([camera.cx, camera.cy])
         from_axis = pixels - principal + terms @ values[LENS]
-        scale = 1.0 + values[FOCUS][corners.view][:, :, None]
+        number = corners.view / max(len(self.names) - 1, 1) - 0.5
+        longer = values[FOCUS][corners.view, 0] + 0.01 * number * values[DRIFT][0]
+        scale = 1.0 + longer[:, None, None]
         by_point = by_point * scale
         by_camera = by_camera * scale
         by_camera[:, [0, 1], [2, 3]] = 1.0
+        on_board = np.einsum("nij,njk->nik", by_point, R)
+        centre = np.broadcast_to(np.eye(2), (len(number), 2, 2))
+        drift = np.concatenate([0.01 * from_axis[..., None], centre], axis=2)
+        heights, spread = self.free
         columns = {
-            BOW: np.einsum("nij,nj->ni", by_point, R[:, :, 2])[..., None] * shape[:, None, :],
+            BOW: on_board[:, :, 2:] * bow[:, None, :],
+            FLEX: on_board[:, :, 2:] * bow[:, None, :],
+            HEIGHTS: on_board[:, :, 2:] * heights[corners.ids][:, None, :],
+            STRETCH: on_board[:, :, :2] @ stretch_shape(self, corners.points),
+            PRINT: on_board[:, :, :2] @ spread[corners.ids],
+            DRIFT: drift * number[:, None, None],
             FOCUS: from_axis[..., None],
             SHUTTER: by_point * time[:, None, None],
             LENS: terms * scale,
         }
         shared = [by_camera @ self.estimated, *(columns[c] for c in self.sizes if c not in OWN)]
         own = [twist_columns(points, by_point), *(columns[c] for c in self.sizes if c in OWN)]
+        moved_centre = principal + number[:, None] * values[DRIFT][1:]
         return Linear(
-            corners.pixels - principal - from_axis * scale[:, 0],
+            corners.pixels - moved_centre - from_axis * scale[:, 0],
             np.concatenate(shared, axis=2),
             np.concatenate(own, axis=2),
             columns,
         )
 
-    def projection(self, weights: Floats | None = None) -> Projection:
-        """The residuals without what the model imitates; weights (N,), one a corner."""
+    @property
+    def shape(self) -> Floats:
+        """What the board's corners (m, 3) are off, m."""
+        heights, spread = self.free
+        z = bow_shape(self, self.board) @ self.values[BOW] + heights @ self.values[HEIGHTS]
+        flat = stretch_shape(self, self.board) @ self.values[STRETCH] + spread @ self.values[PRINT]
+        return np.column_stack([flat, z])
+
+    def projection(self, weights: Floats | None = None, smooth: bool = False) -> Projection:
+        """The residuals without what the model imitates; weights (N,), one a corner.
+
+        smooth: nor what a shape of the board and a smooth field over each view imitate.
+        """
         linear, view = self.linear, np.repeat(self.corners.view, 2)
-        own = linear.own.reshape(len(view), -1)
-        blocks = [(rows, own[rows]) for rows in (np.flatnonzero(view == v) for v in self.views)]
-        residuals, shared = linear.residuals.ravel(), linear.shared.reshape(len(view), -1)
+        rows_of = [np.flatnonzero(view == v) for v in self.views]
+        own, shared = linear.own, [linear.shared]
+        if smooth:  # in place of the views' own causes: a row that was measured has noise in it
+            own = np.concatenate([own[..., :6], self._fields], axis=2)
+            shared += [linear.columns[c] for c in (HEIGHTS, PRINT) if self.shows_shape]
+        own = own.reshape(len(view), -1)
+        blocks = [(rows, own[rows]) for rows in rows_of]
+        columns = np.concatenate(shared, axis=2).reshape(len(view), -1)
         by_row = None if weights is None else np.repeat(weights, 2)
-        return Projection(residuals, shared, blocks, by_row)
+        return Projection(linear.residuals.ravel(), columns, blocks, by_row)
 
     @cached_property
     def plain(self) -> Projection:
         """`projection` with all corners alike."""
         return self.projection()
 
+    @property
+    def left_px(self) -> float:
+        """The residuals' standard deviation in one coordinate, px."""
+        dof = len(self.plain.residuals) - self.plain.rank
+        return math.sqrt(float(self.plain.residuals @ self.plain.residuals) / max(dof, 1))
+
+    @cached_property
+    def noise_px(self) -> float:
+        """The corners' own noise in one coordinate, px: what no shape and no smooth field explains.
+
+        Of the corners as they are, so that it is true of JPEGs too.
+        """
+        squares, dof = self._rough
+        return math.sqrt(squares / max(dof, 1))
+
+    @cached_property
+    def _rough(self) -> tuple[float, int]:
+        rest = self.projection(smooth=True)
+        return float(rest.residuals @ rest.residuals), len(rest.residuals) - rest.rank
+
+    @cached_property
+    def smooth(self) -> tuple[float, float]:
+        """The squares that a shape and smooth fields take beyond what noise gives them, px^2.
+
+        And how often noise alone would give them as much.
+        """
+        from scipy.stats import f
+
+        squares, dof = self._rough
+        fields = len(self.plain.residuals) - self.plain.rank - dof
+        more, each = float(self.plain.residuals @ self.plain.residuals) - squares, squares / dof
+        return more - fields * each, float(f.sf(more / fields / each, fields, dof))
+
+    @property
+    def shows_shape(self) -> bool:
+        """Whether the views are enough to tell where each corner of the board is."""
+        enough = len(self.corners.view) >= SHAPE_SIGHTS * len(self.board)
+        return enough and len(self.views) >= SHAPE_VIEWS
+
+    @cached_property
+    def _fields(self) -> Floats:
+        """Columns (N, 2, k) of a polynomial over the board in u and in v, in each view its own."""
+        x, y = ((self.corners.points - self.board.mean(axis=0))[:, :2] / self.half_diagonal).T
+        powers = [(i, j) for i in range(SMOOTH_DEGREE + 1) for j in range(SMOOTH_DEGREE + 1 - i)]
+        terms = np.stack([x**i * y**j for i, j in powers], axis=1)
+        few = np.bincount(self.index)[self.index] < 2 * len(powers)  # a cubic takes those whole
+        terms[np.ix_(few, np.array([i + j > 2 for i, j in powers]))] = 0.0
+        return np.einsum("nk,ij->nijk", terms, np.eye(2)).reshape(len(x), 2, -1)
+
+    @cached_property
+    def half_diagonal(self) -> float:
+        """From the board's centre to its outermost corner, m."""
+        return float(np.linalg.norm(self.board - self.board.mean(axis=0), axis=1).max())
+
     # --- the search ---
 
     def hypotheses(self) -> Iterator[Hypothesis]:
         """The physical causes that were not added, the worst view, and corners far out."""
         for cause in PHYSICAL:
-            if cause not in self.sizes:
+            if cause not in self.sizes and (self.shows_shape or cause not in (HEIGHTS, PRINT)):
                 yield self.hypothesis(cause)
         rms = self._rms_by_view()
         if len(rms) >= 4 and len(self.names) - len(rms) < len(rms) // 4:
@@ -225,8 +354,12 @@ class Calibration:
         return Hypothesis(cause, columns, typical=TYPICAL[cause])
 
     def tested(self, hypotheses: Sequence[Hypothesis]) -> list[Tested]:
-        """The test of each hypothesis."""
-        return [self.test(hypothesis) for hypothesis in hypotheses]
+        """The test of each hypothesis; the fair p-value only of those that can be accepted."""
+        tests = [self.plain.explains(hypothesis).tested() for hypothesis in hypotheses]
+        physical = sorted(t.strength for t in tests if t.cause in PHYSICAL)
+        least = max(physical[-FAIR:][0] if physical else math.inf, 0.0)
+        fair = [t.cause in PHYSICAL and t.strength >= least for t in tests]
+        return [self.test(t.hypothesis) if f else t for t, f in zip(tests, fair, strict=True)]
 
     def test(self, hypothesis: Hypothesis) -> Tested:
         """One hypothesis; a physical cause has its p-value from weights after each view's noise.
@@ -253,8 +386,15 @@ class Calibration:
     def accept(self, test: Tested) -> Calibration:
         """The calibration with a cause added, or corners set aside, fitted again."""
         if test.cause in PHYSICAL:
-            return refit(replace(self, sizes={**self.sizes, test.cause: max(test.size, 1e-12)}))
+            return self.with_cause(test)
         return refit(replace(self, corners=self.corners.keep(~self.corners_of(test))))
+
+    def with_cause(self, test: Tested) -> Calibration:
+        """The calibration with a physical cause added, fitted again."""
+        least = LEAST_SHAPE_M if test.cause in (HEIGHTS, PRINT) else 1e-12
+        sizes = {**self.sizes, test.cause: max(test.size, least)}
+        noise = math.sqrt(self.plain.explains(test.hypothesis).rest)
+        return refit(replace(self, sizes=sizes, prior_px=max(noise, LEAST_PX)))
 
     def corners_of(self, test: Tested) -> Mask:
         """The corners (N,) that a spoiled view or bad corners concern."""
@@ -291,9 +431,72 @@ def _free(cause: str, rows: NDArray[np.intp], at: int = 0, tried: int = 1) -> Hy
     return Hypothesis(cause, np.eye(len(rows)), at, rows, TYPICAL[cause], tried)
 
 
-def search_residuals(result: IntrinsicsResult) -> CauseSearch[Calibration]:
-    """The causes that the residuals of a calibration speak for, the strongest first."""
-    return search(refit(Calibration.of(result)), CHANCE_LEVEL)
+def search_residuals(start: Calibration) -> CauseSearch[Calibration]:
+    """The causes that the residuals of a fit speak for, the strongest first."""
+    return search(start, CHANCE_LEVEL)
+
+
+def search_lens(start: Calibration) -> Accepted[Calibration] | None:
+    """The step to a lens that the model cannot follow, where that explains most of the residuals.
+
+    Then nothing else is asked: a wrong lens passes for every other cause. None where another
+    physical cause explains more, or where no more is gained than a calibration is exact to.
+    """
+    tests = [start.test(h) for h in start.hypotheses() if h.cause in PHYSICAL]
+    best = max(tests, key=lambda test: test.strength)
+    if best.cause != LENS or best.log_p > math.log(CHANCE_LEVEL):
+        return None
+    step = Accepted(best, start, start.with_cause(best), ())
+    excess = start.left_px**2 - start.noise_px**2
+    return step if start.left_px**2 - step.after.left_px**2 > MOST * max(excess, 0.0) else None
+
+
+def named(found: CauseSearch[Calibration]) -> list[Accepted[Calibration]]:
+    """The accepted steps that explain what there is; the three of a board's shape are one cause."""
+    noise = found.model.noise_px**2
+    shape = [step for step in found.accepted if step.test.cause in SHAPE]
+    others = [s for s in found.accepted if s.test.cause in PHYSICAL and s not in shape]
+
+    def taken(steps: Sequence[Accepted[Calibration]]) -> float:
+        return sum(step.before.left_px**2 - step.after.left_px**2 for step in steps)
+
+    closed = found.model.smooth[1] > NOTHING_LEFT and len(others) <= MOST_CAUSES
+    held = max(shape[0].before.left_px ** 2 - noise, 0.0) if shape else 0.0
+    good = shape if closed or taken(shape) >= MOST_OF_SHAPE * held else []
+    crumbs = STIFF**2 * taken(good)
+    large = [step for step in others if taken([step]) > crumbs]
+    good = good + [
+        s for s in large if closed or s.after.smooth[0] < (1 - MOST) * s.before.smooth[0]
+    ]
+    kept = _sound(found, good)
+    return [step for step in kept if step.test.cause not in PHYSICAL] + good
+
+
+def _sound(
+    found: CauseSearch[Calibration], good: Sequence[Accepted[Calibration]]
+) -> list[Accepted[Calibration]]:
+    """The steps up to the first physical one that is not good: what comes later rests on it."""
+    physical = [step.test.cause in PHYSICAL and step not in good for step in found.accepted]
+    return found.accepted[: physical.index(True)] if any(physical) else found.accepted
+
+
+def explained(found: CauseSearch[Calibration]) -> Calibration:
+    """The end of a search with nothing in it but what is `named`."""
+    good = named(found)
+    causes = {step.test.cause for step in good}
+    if len(good) == len(found.accepted):
+        return found.model
+    sound = _sound(found, good)
+    corners = sound[-1].after.corners if sound else found.start.corners
+    sizes = {cause: size for cause, size in found.model.sizes.items() if cause in causes}
+    return refit(replace(found.start, corners=corners, sizes=sizes, prior_px=found.model.prior_px))
+
+
+def without(model: Calibration, causes: Sequence[str]) -> Calibration:
+    """The calibration with these causes taken out, fitted again."""
+    sizes = {cause: size for cause, size in model.sizes.items() if cause not in causes}
+    values = {c: v * (c in sizes) for c, v in model.values.items()}
+    return refit(replace(model, sizes=sizes, values=values))
 
 
 def kept(model: Calibration, detections: Sequence[Detection]) -> Detections:
@@ -308,14 +511,36 @@ def kept(model: Calibration, detections: Sequence[Detection]) -> Detections:
 
 
 def sag(model: Calibration) -> tuple[float, float]:
-    """How far the bowed board's corners lie out of a plane, top to bottom, and its sigma, m."""
-    shape = bow_shape(model, np.unique(model.corners.points, axis=0))
-    z = shape @ model.values[BOW]
-    between = shape[z.argmax()] - shape[z.argmin()]
-    sizes = {cause: size for cause, size in model.sizes.items() if cause != BOW}
-    without = replace(model, sizes=sizes)
-    covariance = without.plain.explains(without.hypothesis(BOW)).covariance
-    return float(between @ model.values[BOW]), math.sqrt(float(between @ covariance @ between))
+    """How far the board's corners lie out of a plane, top to bottom, and its sigma, m."""
+    seen = np.unique(model.corners.ids)
+    z = model.shape[seen, 2]
+    plane = np.column_stack([model.board[seen, :2], np.ones(len(seen))])
+    z = z - plane @ np.linalg.lstsq(plane, z, rcond=None)[0]
+    covariance = np.zeros((len(seen), len(seen)))
+    bases = {BOW: bow_shape(model, model.board), HEIGHTS: model.free[0]}
+    for cause, basis in bases.items():
+        if cause in model.sizes:
+            sizes = {c: size for c, size in model.sizes.items() if c != cause}
+            less = replace(model, sizes=sizes)
+            own = less.plain.explains(less.hypothesis(cause)).covariance
+            covariance += basis[seen] @ own @ basis[seen].T
+    between = np.zeros(len(seen))
+    between[[z.argmax(), z.argmin()]] = 1.0, -1.0
+    return float(np.ptp(z)), math.sqrt(float(between @ covariance @ between))
+
+
+def dents(model: Calibration) -> list[tuple[int, float]]:
+    """Single corners that stand out of the others' surface, and how far out of the plane, m.
+
+    z points into the board.
+    """
+    seen = np.unique(model.corners.ids)
+    plane = np.column_stack([model.board[seen, :2], np.ones(len(seen))])
+    smooth = np.column_stack([bow_shape(model, model.board)[seen], plane])
+    z = model.shape[seen, 2]
+    from_plane, off = (z - A @ np.linalg.lstsq(A, z, rcond=None)[0] for A in (plane, smooth))
+    limit = max(DENT_SIGMAS * 1.4826 * float(np.median(np.abs(off))), DENT_M)
+    return [(int(seen[k]), float(from_plane[k])) for k in np.flatnonzero(np.abs(off) > limit)]
 
 
 # --- the model ---
@@ -323,20 +548,43 @@ def sag(model: Calibration) -> tuple[float, float]:
 
 def bow_shape(model: Calibration, points: Floats) -> Floats:
     """The three shapes (N, 3) of a bow: x^2, xy, y^2 from the board's centre in half diagonals."""
-    x, y = ((points - model.centre)[:, :2] / model.half_diagonal).T
+    x, y = ((points - model.board.mean(axis=0))[:, :2] / model.half_diagonal).T
     return np.stack([x * x, x * y, y * y], axis=1)
 
 
-def lens_terms(xy: Floats) -> Floats:
-    """Distortions that Brown-Conrady lacks, (N, 2, 5): r^8, and thin prisms in r^2 and r^4.
+def stretch_shape(model: Calibration, points: Floats) -> Floats:
+    """A print too wide and as much too low, and one askew: (N, 2, 2) in half diagonals."""
+    x, y = ((points - model.board.mean(axis=0))[:, :2] / model.half_diagonal).T
+    return np.stack([np.stack([x, y], axis=1), np.stack([-y, x], axis=1)], axis=1)
 
-    xy (N, 2): normalised coordinates. Source: OpenCV's s1..s4; its rational model differs from
-    Brown-Conrady first of all in r^8.
+
+def free_shapes(points: Floats) -> tuple[Floats, Floats]:
+    """What the corners (m, 3) of a board may do: heights (m, m - 3) and print (m, 2, 2 m - 4).
+
+    Orthonormal columns, without what is no shape: a motion of the board, and its size.
     """
-    r2 = (xy**2).sum(axis=1)
-    terms = np.zeros((len(xy), 2, 5))
-    terms[:, :, 0] = xy * r2[:, None] ** 4
-    for axis, column, power in ((0, 1, r2), (1, 2, r2), (0, 3, r2**2), (1, 4, r2**2)):
+    (x, y), one, zero = points[:, :2].T, np.ones(len(points)), np.zeros(len(points))
+    moved_plane = np.linalg.qr(np.stack([one, x, y], axis=1), mode="complete")[0]
+    motions = [[one, zero], [zero, one], [-y, x], [x, y]]
+    flat = np.stack([np.stack(m, axis=1).ravel() for m in motions], axis=1)
+    spread = np.linalg.qr(flat, mode="complete")[0][:, 4:]
+    return moved_plane[:, 3:], spread.reshape(len(points), 2, -1)
+
+
+def lens_terms(pixels: Floats, size: tuple[int, int]) -> Floats:
+    """What a lens may do that the model lacks, (N, 2, 8), px: smooth fields over the image.
+
+    Radial ones with the 5th, 7th, 9th and 11th power of the distance from the image's centre, and
+    thin prisms with the 2nd and 4th. In the image, where they stay bounded: the normalised
+    coordinates of a wide lens do not. pixels (N, 2): where the model sees the corners (where they
+    were seen has their noise in it, and would explain itself); size: (width, height), px.
+    """
+    at = (pixels - (np.array(size) - 1) / 2) / (np.hypot(*size) / 2)
+    r2 = (at**2).sum(axis=1)
+    terms = np.zeros((len(at), 2, 8))
+    for column in range(4):
+        terms[:, :, column] = at * r2[:, None] ** (column + 2)
+    for axis, column, power in ((0, 4, r2), (1, 5, r2), (0, 6, r2**2), (1, 7, r2**2)):
         terms[:, axis, column] = power
     return terms
 
@@ -364,16 +612,30 @@ def refit(model: Calibration) -> Calibration:
 
 def _squares(model: Calibration) -> float:
     with np.errstate(all="ignore"):
-        return float((model.linear.residuals**2).sum()) + float((_prior(model)[1] ** 2).sum())
+        held = sum(float((prior(model)[1] ** 2).sum()) for prior in (_prior, _shape_prior))
+        return float((model.linear.residuals**2).sum()) + held
+
+
+def _shape_prior(model: Calibration) -> tuple[Floats, Floats]:
+    """As `_prior`, of what is shared (g,): corners are held to where the board has them."""
+    causes = [cause for cause in model.sizes if cause not in OWN]
+    weights, values = [np.zeros(model.estimated.shape[1])], [np.zeros(model.estimated.shape[1])]
+    for cause in causes:
+        value = model.values[cause]
+        held = model.prior_px / model.sizes[cause] if cause in (HEIGHTS, PRINT) else 0.0
+        weights.append(np.full(len(value), held))
+        values.append(value)
+    weight = np.concatenate(weights)
+    return weight, np.concatenate(values) * weight
 
 
 def _prior(model: Calibration) -> tuple[Floats, Floats]:
     """Of the views' own causes: px a coefficient (k,), and what they amount to (views, k), px.
 
-    Coefficients are held towards 0 as by one corner coordinate of noise PRIOR_PX each.
+    Coefficients are held towards 0 as by one corner coordinate of noise `prior_px` each.
     """
     own = [cause for cause in model.sizes if cause in OWN]
-    weights = [np.full(OWN[cause], PRIOR_PX / model.sizes[cause]) for cause in own]
+    weights = [np.full(OWN[cause], model.prior_px / model.sizes[cause]) for cause in own]
     values = [np.zeros((len(model.views), 0)), *(model.values[cause][model.views] for cause in own)]
     weight = np.concatenate([np.zeros(0), *weights])
     return weight, np.concatenate(values, axis=1) * weight
@@ -395,6 +657,9 @@ def _step(model: Calibration, damping: float) -> tuple[Floats, Floats]:
         s += [linear.shared[rows].reshape(-1, g), np.zeros((len(weak) + width, g)), damp]
         b.append(np.concatenate([mine, weak, damp_own, np.zeros((g, width))]))
         r += [linear.residuals[rows].ravel(), -prior[index], np.zeros(width + g)]
+    held, values = _shape_prior(model)
+    s.append(np.diag(held)[held > 0])
+    r.append(-values[held > 0])
     return NormalEquations(np.concatenate(s), b, np.concatenate(r)).step()
 
 
@@ -477,7 +742,7 @@ def fit_bow(result: IntrinsicsResult) -> Bow:
         result.model,
         {name: z[:, None] * NORMAL for name, z in zip(BOW_NAMES, shape.T, strict=True)},
     )
-    covariance = bowed.sigma_px**2 * bowed.equations.shared_covariance[-3:, -3:]
+    covariance = bowed.equations.scatter(len(result.names)).covariance[-3:, -3:]
     columns, rows = result.board.corners
     outermost = shape[[0, columns - 1, (rows - 1) * columns, rows * columns - 1]].mean(axis=0)
     flat, bent = (float(np.sum(r.equations.residuals**2)) for r in (result, bowed))
@@ -487,6 +752,61 @@ def fit_bow(result: IntrinsicsResult) -> Bow:
         sigma_m=math.sqrt(float(outermost @ covariance @ outermost)),
         coefficients=coefficients,
         covariance=covariance,
-        p_value=float(f.sf(max(0.0, flat - bent) / 3 / (bent / bowed.dof), 3, bowed.dof)),
+        p_value=float(
+            f.sf(max(0.0, flat - bent) / 3 / (bent / bowed.equations.dof), 3, bowed.equations.dof)
+        ),
         result=bowed,
+    )
+
+
+# --- the shape, corner by corner ---
+
+
+def fit_shape(result: IntrinsicsResult) -> IntrinsicsResult:
+    """The camera where every corner of the board may be off, in its plane and out of it.
+
+    How far corners are off is drawn from two normal distributions whose widths the residuals tell
+    (restricted maximum likelihood). The board's `points` are then where the views put them, and
+    every covariance includes what their being unknown costs. Raises ValueError for fewer than 6
+    views or fewer than 5 sights of each corner on average: they cannot tell a shape from noise.
+    """
+    model = refit(Calibration.of(result))
+    sights = len(model.corners.view) / len(model.board)
+    wanted = f"at least {SHAPE_VIEWS} views and {SHAPE_SIGHTS} sights of each corner"
+    want(model.shows_shape, "result", f"{len(model.views)} views and {sights:.1f} sights", wanted)
+    for cause in (STRETCH, HEIGHTS, PRINT, HEIGHTS):  # the heights again, with the print known
+        less = without(model, (cause,))
+        model = less.with_cause(less.plain.explains(less.hypothesis(cause)).tested())
+    return shaped(model, result)
+
+
+def _flat(moves: Floats) -> Floats:
+    """Moves (m, 2, k) in the board's plane as moves (m, 3, k)."""
+    return np.concatenate([moves, np.zeros((len(moves), 1, moves.shape[2]))], axis=1)
+
+
+def shaped(model: Calibration, result: IntrinsicsResult) -> IntrinsicsResult:
+    """The fit `result` with the camera of a model and the shape that it gives the board."""
+    (heights, spread), up = model.free, np.array([[0.0], [0.0], [1.0]])
+    moves = {
+        BOW: bow_shape(model, model.board)[:, None] * up,
+        HEIGHTS: heights[:, None] * up,
+        STRETCH: _flat(stretch_shape(model, model.board)),
+        PRINT: _flat(spread),
+    }
+    causes = [cause for cause in model.sizes if cause in SHAPE]
+    extra = {f"{c} {k}": moves[c][:, :, k] for c in causes for k in range(moves[c].shape[2])}
+    weights = [model.prior_px / model.sizes[c] * (c in (HEIGHTS, PRINT)) for c in causes]
+    held = np.repeat(weights, [moves[c].shape[2] for c in causes])
+    values = np.concatenate([np.zeros(0), *(model.values[c] for c in causes)])
+    return evaluate(
+        model.camera,
+        model.poses,
+        result.detections,
+        result.board,
+        model.board + model.shape,
+        result.names,
+        result.model,
+        extra,
+        (held, held * values),
     )

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from coursekit.arrays import Floats
+from coursekit.arrays import ArrayLike, Floats
 from coursekit.boards import Board, Detection
 from coursekit.checks import want
 from coursekit.geometry import Intrinsics, deproject, moved, project
@@ -29,6 +29,7 @@ from coursekit.intrinsics.fit import (
     MAP_SHAPE,
     IntrinsicsResult,
     calibrate,
+    folded_text,
     image_grid,
     points_at,
     projection_columns,
@@ -74,8 +75,11 @@ class HalvesDifference:
             f"differ by {np.nanmedian(length):.2f} px in the median\nof the image and "
             f"{np.nanmax(length):.2f} px at worst, at {self.range_m:.2f} m; noise alone: sigma "
             f"{np.nanmedian(wide):.2f} and {np.nanmax(wide):.2f} px\n"
-            f"{agree} ({p_text(self.p_value)})"
-        )
+            + "\n".join([
+                f"{agree} ({p_text(self.p_value)})",
+                *folded_text(float(np.isnan(length).mean())),
+            ])
+        )  # fmt: skip
 
 
 def halves(
@@ -85,11 +89,13 @@ def halves(
     same_focal: bool = False,
     range_m: float | None = None,
     shape: tuple[int, int] = MAP_SHAPE,
+    points: ArrayLike | None = None,
 ) -> HalvesDifference:
     """Calibrate the even and the odd views apart and compare.
 
     range_m: where to compare, m; None takes the boards' median distance. shape: (rows, columns)
-    of the map. Raises ValueError where a half is too small to fit, and as `calibrate`.
+    of the map. points (N, 3): where the board's corners really are, m, as in `calibrate`.
+    Raises ValueError where a half is too small to fit, and as `calibrate`.
 
     >>> halves([], Board("checkerboard", (10, 7), 0.025))
     Traceback (most recent call last):
@@ -98,7 +104,7 @@ def halves(
     if len(detections) < 6:
         raise ValueError(f"detections: got {len(detections)} views, halves need at least 6")
     first, second = (
-        calibrate([detections[i] for i in part], board, model, same_focal)
+        calibrate([detections[i] for i in part], board, model, same_focal, points=points)
         for part in (range(0, len(detections), 2), range(1, len(detections), 2))
     )
     range_m = first.board_range_m if range_m is None else float(range_m)
@@ -106,6 +112,7 @@ def halves(
     weights = 1.0 / np.hypot(*(r.uncertainty_map(range_m, shape).ravel() for r in (first, second)))
     weights[~np.isfinite(weights)] = 0.0  # where a half's distortion has no inverse
     difference = difference_px(first.intrinsics, second.intrinsics, grid, range_m, weights)
+    difference[weights == 0] = np.nan
     columns = projection_columns(first.intrinsics, grid, range_m, first.names)
     spread = _without_motion(columns, weights)
     total = first.covariance + second.covariance
@@ -168,12 +175,17 @@ def _without_motion(columns: Floats, weights: Floats) -> Floats:
     return parameters - motion @ (scaled_inverse(A.T @ A) @ (A.T @ b))
 
 
-def _wald(difference: Floats, covariance: Floats, dof: int) -> float:
-    """The p-value of a difference (p,) whose covariance (p, p) was estimated with `dof`."""
+def _wald(difference: Floats, covariance: Floats, dof: float) -> float:
+    """The p-value of a difference (p,) whose covariance (p, p) was estimated with `dof`.
+
+    Hotelling's: of so few degrees of freedom, p - 1 go into the covariance's directions.
+    """
     from scipy.stats import f
 
+    p = len(difference)
+    left = max(dof - p + 1, 1.0)
     squares = float(difference @ scaled_inverse(covariance) @ difference)
-    return float(f.sf(squares / len(difference), len(difference), dof))
+    return float(f.sf(squares * left / (p * dof), p, left))
 
 
 # --- the factory's K ---
@@ -220,6 +232,7 @@ class Comparison:
             f"{1e3 * np.nanmax(self.shift_m):.2f} mm at worst "
             f"(sigma {1e3 * np.nanmedian(self.expected_shift_m):.2f} mm)"
         )
+        lines += folded_text(float(np.isnan(self.shift_m).mean()))
         return "\n".join(lines)
 
 

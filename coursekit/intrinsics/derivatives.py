@@ -96,12 +96,25 @@ def twist_columns(points: Floats, by_point: Floats) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
+class Scatter:
+    """How much the shared parameters scatter, as the views bear it out.
+
+    covariance (g, g), of the parameters. variance: of one coordinate of a corner, as it would have
+    to be for independent corners to give as much. dof: degrees of freedom of either.
+    """
+
+    covariance: Floats
+    variance: float
+    dof: float
+
+
+@dataclass(frozen=True, eq=False)
 class NormalEquations:
     """J'J of parameters that all views share and six of a pose a view, poses eliminated.
 
     shared (2N, g): rows u, v of each corner, view after view. poses: one (2 N_i, 6) a view.
-    residuals (2N,): observed - predicted, px. Everything is in units where the residuals have
-    variance 1; the caller multiplies covariances by sigma^2.
+    residuals (2N,): observed - predicted, px. Rows beyond those of the views say what is known of
+    the shared parameters besides. Covariances are for residuals of variance 1 unless it is given.
     """
 
     shared: Floats
@@ -157,26 +170,66 @@ class NormalEquations:
             change[rows] += block @ twist
         return float(change @ change)
 
+    @cached_property
+    def parts(self) -> tuple[Floats, Floats]:
+        """What each view says of the shared parameters, its pose unknown.
+
+        Its part (n, g, g) of `information`, and the gradient (n, g) that its residuals leave.
+        """
+        information, gradients = [], []
+        for block, rows, responses in zip(self.poses, self.slices, self.responses, strict=True):
+            left = self.shared[rows] - block @ responses
+            information.append(left.T @ left)
+            gradients.append(left.T @ self.residuals[rows])
+        return np.stack(information), np.stack(gradients)
+
+    def scatter(self, p: int) -> Scatter:
+        """How the first p shared parameters scatter from view to view; all g get a covariance.
+
+        The views' gradients say it, whatever the residuals of one view have in common: half of
+        each variance is the parameter's own, by a jackknife in which each view in turn keeps an
+        n-th of its weight; half is the `shared_covariance` times what all p agree on. That is right
+        for independent corners and for views that differ, however few they are. Source: Bell and
+        McCaffrey, "Bias reduction in standard errors for linear regression with multi-stage
+        samples" (2002).
+        """
+        V, (information, gradients) = self.shared_covariance, self.parts
+        moves = gradients @ V  # what each view adds to the parameters, (n, g)
+        least = np.eye(len(V)) - (1.0 - 1.0 / len(moves)) * information @ V
+        without = np.linalg.solve(least, gradients[..., None])[..., 0] @ V
+        free = information - information @ V @ information
+        expected = np.einsum("ag,ngh,hb->nab", V[:p], free, V[:, :p])  # of moves, at noise 1
+        by_view = np.einsum("ag,ngh,ha->na", V, free, V)
+        inverse = scaled_inverse(V[:p, :p])
+        squares = np.einsum("na,ab,nb->", moves[:, :p], inverse, moves[:, :p])
+        variance = float(squares / np.einsum("nab,ab->", expected, inverse))
+        covariance = (without.T @ without + variance * V) / 2.0
+        own = by_view[:, :p].sum(axis=0) ** 2 / (by_view[:, :p] ** 2).sum(axis=0)
+        return Scatter(covariance, variance, float(4.0 * np.mean(own) / (1.0 + 3.0 / p)))
+
     def _by_pose(self, values: Floats) -> Floats:
         """B_i' values_i of each view, (n, 6, ...)."""
         views = zip(self.poses, self.slices, strict=True)
         return np.stack([block.T @ values[rows] for block, rows in views])
 
-    def covariance(self) -> Floats:
-        """The covariance (g + 6n, g + 6n) of the shared parameters, then the poses in order."""
+    def covariance(self, shared: Floats, variance: float) -> Floats:
+        """The covariance (g + 6n, g + 6n) of the shared parameters, then the poses in order.
+
+        shared (g, g): that of the shared. variance: of one coordinate of a corner.
+        """
         g, n = self.shared.shape[1], len(self.poses)
         spread = np.concatenate([np.eye(g), -self.responses.reshape(6 * n, g)])
-        joint = spread @ self.shared_covariance @ spread.T
+        joint = spread @ shared @ spread.T
         for i, own in enumerate(self.pose_covariances):
             at = slice(g + 6 * i, g + 6 * i + 6)
-            joint[at, at] += own
+            joint[at, at] += variance * own
         return joint
 
-    def mean_motion_covariance(self) -> Floats:
+    def mean_motion_covariance(self, shared: Floats, variance: float) -> Floats:
         """The covariance (g + 6, g + 6) of the shared parameters and of the poses' mean twist."""
         spread = np.concatenate([np.eye(self.shared.shape[1]), -self.responses.mean(axis=0)])
-        joint = spread @ self.shared_covariance @ spread.T
-        joint[-6:, -6:] += self.pose_covariances.sum(axis=0) / len(self.poses) ** 2
+        joint = spread @ shared @ spread.T
+        joint[-6:, -6:] += variance * self.pose_covariances.sum(axis=0) / len(self.poses) ** 2
         return joint
 
 

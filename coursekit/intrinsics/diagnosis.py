@@ -9,7 +9,7 @@ board twice as large at twice the distance gives the same images. How small a ca
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,6 +19,7 @@ from coursekit.arrays import ArrayLike, Floats
 from coursekit.boards import Board, Detection, Detections, Skipped
 from coursekit.causes import Accepted, CauseSearch, DiagnosisTexts
 from coursekit.checks import array, want
+from coursekit.geometry import fold_radius
 from coursekit.intrinsics import causes
 from coursekit.intrinsics.causes import Calibration
 from coursekit.intrinsics.comparison import halves
@@ -36,7 +37,9 @@ from coursekit.specifications import DATA
 from coursekit.words import Finding, Findings
 
 _Steps = list[Accepted[Calibration]]
+_Search = CauseSearch[Calibration]
 _Figures = dict[str, Any]
+_Told = tuple[str, _Figures] | None
 
 POWER_FILE = DATA / "diagnosis_power.json"
 FEW_VIEWS = 10  # 9 camera parameters, and one odd view must not be able to decide them
@@ -49,6 +52,8 @@ BARE_MARGIN, BARE_SIDES, ONE_BARE_MARGIN = 0.125, 2, 0.25
 # and a board held "still" moves 5 mm/s for the 20 ms that an image takes.
 NORMAL_BOW_M, NORMAL_DRIFT, NORMAL_MOTION_M = 1e-4, 2e-3, 1e-4
 NORMAL_LENS_PX = 0.05  # no measurement with the camera notices less
+NORMAL_SHIFT_PX = 1.0  # of the centre over a session
+UNEXPLAINED = 0.8  # of the corners' noise: what neighbours share in any JPEG stays below
 BLUR_LENGTH_PX = 2.0  # shorter motions cost a corner a fifth of its precision and no more
 MANY_BLURRED = 2
 GRAVE_PX = 1.0  # between the halves: less than that is for the intervals to say
@@ -106,7 +111,10 @@ def diagnose(
     if flat:
         unseen.append(_TEXTS.not_tested["residuals"])
     else:
-        found += _residuals(result, unseen)
+        start = causes.refit(Calibration.of(result))
+        if lens := _wrong_lens(start):  # passes for everything else
+            return Findings([*found, lens], _TEXTS.looked_for, [_TEXTS.not_tested["lens_first"]])
+        found += _residuals(start, result, unseen)
     scale = depth_scale(result, [depths[i] for i in used]) if depths else None
     design = [_blur(views), flat, _no_edge_corners(views), _wrong_squares(result, scale)]
     found += [finding for finding in design if finding]
@@ -133,14 +141,14 @@ def _images(detections: Sequence[Detection], board: Board) -> tuple[list[Finding
     common = max(set(sizes), key=sizes.count) if sizes else (0, 0)
     others = [d.name or f"view {i}" for i, d in enumerate(detections) if d.size != common]
     skipped: Sequence[Skipped] = getattr(detections, "skipped", ())
-    others += [s.name for s in skipped if "one size" in s.reason]
+    others += [s.name for s in skipped if s.kind == "other_size"]
     if others and sizes:
         width, height = common
         listed = _listed(others)
         found.append(_TEXTS.finding("mixed_sizes", width=width, height=height, others=listed))
     used = [i for i, d in enumerate(detections) if d.size == common and len(d.ids) >= MIN_CORNERS]
     layout = _layout([detections[i] for i in used], board)
-    refused = [s.reason for s in skipped if "squares" in s.reason]
+    refused = [s.reason for s in skipped if s.kind == "other_board"]
     if not layout and len(refused) > len(used):  # the detector saw other squares in most images
         figures = {"images": len(refused), "reason": refused[0], "board": board.text}
         layout = _TEXTS.finding("other_squares_seen", **figures)
@@ -198,36 +206,78 @@ def _lattice_misfit(detections: list[Detection], columns: int) -> float:
 # --- after a fit ---
 
 
-def _residuals(result: IntrinsicsResult, unseen: list[str]) -> list[Finding]:
+def _residuals(start: Calibration, result: IntrinsicsResult, unseen: list[str]) -> list[Finding]:
     """What the residuals of a fit speak for; what could not be tested is added to `unseen`."""
-    search = causes.search_residuals(result)
+    search = causes.search_residuals(start)
+    model, steps = causes.explained(search), causes.named(search)
     found = []
-    for cause, figures_of in _FIGURES.items():
-        steps = search.of(cause)
-        figures = figures_of(search, steps) if steps else None
-        if figures:
-            found.append(_TEXTS.finding(cause, steps[0].test.p_value, **figures))
+    for alike, figures_of in _FIGURES:
+        mine = [step for step in steps if step.test.cause in alike]
+        told = figures_of(search, mine, model) if mine else None
+        if told:
+            key, figures = told
+            if alike[0] in causes.PHYSICAL:
+                figures |= _took(mine, causes.without(model, alike), model)
+            found.append(_TEXTS.finding(key, mine[0].test.p_value, **figures))
+    found += _unexplained(model, result, bool(found))
     if not result.converged:
         why = "another step of the solver would still move the parameters"
         found.insert(0, _TEXTS.finding("not_converged", why=why))
     try:
-        apart = _halves(search.model, result, explained=bool(found))
+        apart = _halves(model, result, explained=bool(found))
     except (CalibrationFailed, np.linalg.LinAlgError) as error:
         unseen.append(_TEXTS.not_tested["halves"].format(error=error))
         return found
     return [*found, apart] if apart else found
 
 
-def _spoiled_views(search: CauseSearch[Calibration], steps: _Steps) -> _Figures | None:
+def _took(steps: _Steps, before: Calibration, after: Calibration) -> _Figures:
+    """What the residuals lose to a cause, and what explains them as well."""
+    took = f"it takes the RMS from {_flat(before.left_px)} to {_flat(after.left_px)} px "
+    took += f"(corner noise {_flat(after.noise_px)})"
+    mine = {step.test.cause for step in steps}
+    rivals = {r.cause for step in steps for r in step.rivals if r.cause in causes.PHYSICAL}
+    names = sorted({_TEXTS.findings[_ENTRY.get(r, r)]["name"] for r in rivals - mine})
+    if names and not (mine | rivals) <= set(causes.SHAPE):
+        took += f"; {' or '.join(n.replace('_', ' ') for n in names)} explains it as well"
+    return {"took": took}
+
+
+def _flat(sigma_px: float) -> str:
+    """A standard deviation of one coordinate as an RMS in two dimensions."""
+    return f"{math.sqrt(2.0) * sigma_px:.2f}"
+
+
+def _wrong_lens(start: Calibration) -> Finding | None:
+    """A lens that the model cannot follow, or folds under corners that were seen."""
+    fold = fold_radius(np.array(start.camera.coeffs))
+    R, t = start.poses[start.corners.view, :3, :3], start.poses[start.corners.view, :3, 3]
+    points = np.einsum("nij,nj->ni", R, start.corners.points) + t
+    out = float((np.hypot(points[:, 0], points[:, 1]) / points[:, 2]).max())
+    if out > fold:
+        beyond = {"out": math.degrees(math.atan(out)), "fold": math.degrees(math.atan(fold))}
+        return _TEXTS.finding("lens_folds", rms=_flat(start.left_px), **beyond)
+    step = causes.search_lens(start)
+    if step is None or _gain_px([step]) < NORMAL_LENS_PX:
+        return None
+    return _TEXTS.finding("lens_model", step.test.p_value, **_took([step], start, step.after))
+
+
+def _gain_px(steps: _Steps) -> float:
+    """The size of what causes explain in one coordinate, px."""
+    return math.sqrt(max(steps[0].before.left_px ** 2 - steps[-1].after.left_px ** 2, 0.0))
+
+
+def _spoiled_views(search: _Search, steps: _Steps, model: Calibration) -> _Told:
     residuals = steps[-1].after.linear.residuals
-    return {
+    return "spoiled_view", {
         "names": _listed([search.model.names[step.test.at] for step in steps]),
         "rms": ", ".join(f"{step.test.size:.2f}" for step in steps),
         "others": math.sqrt(float(np.mean(residuals**2))),
     }
 
 
-def _bad_corners(search: CauseSearch[Calibration], steps: _Steps) -> _Figures | None:
+def _bad_corners(search: _Search, steps: _Steps, model: Calibration) -> _Told:
     found = []
     for step in steps:
         gone = step.before.corners.keep(step.before.corners_of(step.test))
@@ -237,43 +287,90 @@ def _bad_corners(search: CauseSearch[Calibration], steps: _Steps) -> _Figures | 
     names = search.model.names
     listed = [f"{names[view]} corner {k} ({off:.1f} px)" for off, view, k in found]
     given = len(search.model.corners.view) + len(found)
-    return {"wrong": len(found), "given": given, "listed": _listed(listed)}
+    return "bad_corners", {"wrong": len(found), "given": given, "listed": _listed(listed)}
 
 
-def _bow(search: CauseSearch[Calibration], steps: _Steps) -> _Figures | None:
-    sag, sigma = causes.sag(search.model)
-    if sag < NORMAL_BOW_M:
+def _shape(search: _Search, steps: _Steps, model: Calibration) -> _Told:
+    sag, sigma = causes.sag(model)
+    print_m = float(np.linalg.norm(model.shape[:, :2], axis=1).max())
+    if max(sag, print_m) < NORMAL_BOW_M:
         return None
-    before, after = search.start.camera.fx, search.model.camera.fx
-    fx = {"before": before, "after": after, "change": 100 * (before / after - 1)}
-    return {"sag": 1e3 * sag, "half": 1.96e3 * sigma, **fx}
+    before, camera = search.start.camera.fx, model.camera
+    figures: _Figures = {"before": before, "change": 100 * (before / camera.fx - 1)}
+    figures |= {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    figures |= {"sag": 1e3 * sag, "half": 1.96e3 * sigma, "print": 1e3 * print_m, "more": ""}
+    if sag < NORMAL_BOW_M:
+        return "uneven_print", figures
+    if print_m >= NORMAL_BOW_M:
+        figures["more"] += f", and up to {1e3 * print_m:.2f} mm off their places in it"
+    figures["more"] += "".join(
+        f"; corner {k} is {1e3 * abs(off):.2f} mm {'into' if off > 0 else 'out of'} the board"
+        for k, off in causes.dents(model)
+    )
+    return "bowed_board", figures
 
 
-def _focus(search: CauseSearch[Calibration], steps: _Steps) -> _Figures | None:
-    drift = search.model.sizes[causes.FOCUS]
-    return {"drift": 100 * drift, "normal": 100 * NORMAL_DRIFT} if drift >= NORMAL_DRIFT else None
+def _flex(search: _Search, steps: _Steps, model: Calibration) -> _Told:
+    size = model.sizes[causes.FLEX]
+    return ("flexing_board", {"size": 1e3 * size}) if size >= NORMAL_BOW_M else None
 
 
-def _shutter(search: CauseSearch[Calibration], steps: _Steps) -> _Figures | None:
+def _drift(search: _Search, steps: _Steps, model: Calibration) -> _Told:
+    longer, right, down = model.values[causes.DRIFT].tolist()
+    if abs(longer) < 100 * NORMAL_DRIFT and math.hypot(right, down) < NORMAL_SHIFT_PX:
+        return None
+    return "steady_drift", {"longer": longer, "right": right, "down": down}
+
+
+def _focus(search: _Search, steps: _Steps, model: Calibration) -> _Told:
+    drift = model.sizes[causes.FOCUS]
+    figures = {"drift": 100 * drift, "normal": 100 * NORMAL_DRIFT}
+    return ("focus_drift", figures) if drift >= NORMAL_DRIFT else None
+
+
+def _shutter(search: _Search, steps: _Steps, model: Calibration) -> _Told:
     # The size is that of one of three components of the motion.
-    motion = math.sqrt(3.0) * search.model.sizes[causes.SHUTTER]
-    return {"motion": 1e3 * motion, "speed": motion / 0.02} if motion >= NORMAL_MOTION_M else None
+    motion = math.sqrt(3.0) * model.sizes[causes.SHUTTER]
+    figures = {"motion": 1e3 * motion, "speed": motion / 0.02}
+    return ("rolling_shutter", figures) if motion >= NORMAL_MOTION_M else None
 
 
-def _lens(search: CauseSearch[Calibration], steps: _Steps) -> _Figures | None:
-    size = search.model.sizes[causes.LENS]
-    return {"size": size} if size >= NORMAL_LENS_PX else None
+def _lens(search: _Search, steps: _Steps, model: Calibration) -> _Told:
+    return ("lens_model", {}) if _gain_px(steps) >= NORMAL_LENS_PX else None
 
 
-# The figures of an accepted cause, or None where it is no larger than normal; in order of gravity.
-_FIGURES: dict[str, Callable[[CauseSearch[Calibration], _Steps], _Figures | None]] = {
-    causes.SPOILED_VIEW: _spoiled_views,
-    causes.BAD_CORNERS: _bad_corners,
-    causes.BOW: _bow,
-    causes.FOCUS: _focus,
-    causes.SHUTTER: _shutter,
-    causes.LENS: _lens,
+# The entry and figures of what was found, or None where it is no larger than normal; in order of
+# gravity.
+_FIGURES: tuple[tuple[tuple[str, ...], Callable[[_Search, _Steps, Calibration], _Told]], ...] = (
+    ((causes.SPOILED_VIEW,), _spoiled_views),
+    ((causes.BAD_CORNERS,), _bad_corners),
+    (causes.SHAPE, _shape),
+    ((causes.FLEX,), _flex),
+    ((causes.DRIFT,), _drift),
+    ((causes.FOCUS,), _focus),
+    ((causes.SHUTTER,), _shutter),
+    ((causes.LENS,), _lens),
+)
+_ENTRY = {
+    causes.HEIGHTS: "bowed_board",
+    causes.PRINT: "uneven_print",
+    causes.STRETCH: "uneven_print",
 }
+
+
+def _unexplained(model: Calibration, result: IntrinsicsResult, some: bool) -> Iterator[Finding]:
+    """What the residuals hold beyond the corners' noise although every cause was tried."""
+    excess = math.sqrt(max(model.left_px**2 - model.noise_px**2, 0.0))
+    if excess < max(UNEXPLAINED * model.noise_px, NORMAL_LENS_PX):
+        return
+    fit = causes.shaped(model, result)
+    alone = fit.sigma_px**2 * np.diag(fit.equations.shared_covariance)
+    centre = [fit.names.index(name) for name in fit.names if name[0] in "fc"]
+    more = np.sqrt(np.maximum(np.diag(fit.covariance) - alone[: len(fit.names)], 0.0))
+    moved = fit.quantile() * float(more[centre].max())
+    besides = " beside what was found" if some else ""
+    figures = {"excess": _flat(excess), "noise": _flat(model.noise_px), "moved": moved}
+    yield _TEXTS.finding("unexplained", besides=besides, **figures)
 
 
 def _halves(model: Calibration, result: IntrinsicsResult, explained: bool) -> Finding | None:
@@ -284,7 +381,8 @@ def _halves(model: Calibration, result: IntrinsicsResult, explained: bool) -> Fi
     kept = causes.kept(model, result.detections)
     if len(kept) < FEW_VIEWS or _no_edge_corners(result.detections):
         return None
-    both = halves(kept, result.board, model=result.model)
+    points = model.board + model.shape
+    both = halves(kept, result.board, model=result.model, points=points)
     worst, sigma = float(np.nanmax(both.length_px)), float(np.nanmax(both.expected_px))
     unexplained = both.p_value < causes.CHANCE_LEVEL and worst > GRAVE_PX and not explained
     if not unexplained and min(worst, sigma) < LOST_PX:

@@ -14,9 +14,10 @@ p + omega_i x p + v_i, and the mean over the boards is projected with the refitt
 `fixed="camera"` the point stays where it is in the camera's frame and only the intrinsics change:
 what a depth camera's user gets who trusts that frame, and the larger of the two.
 
-What both leave out: errors of the model (a bowed board, a distortion that the coefficients cannot
-follow, rolling shutter), corner errors that are correlated or larger in some views, and everything
-of second order. It is the least that the uncertainty can be.
+The unit is the view: what the residuals of one view have in common counts once, and views that
+scatter more than corner noise explains widen every figure. What both leave out: errors of the model
+that all views share (a bowed board, a distortion that the coefficients cannot follow), and
+everything of second order.
 
 Whether a calibration is good is said by `IntrinsicsResult.verdict`, from that uncertainty, from
 what the corners cover (`coverage`) and from how the boards were tilted (`tilts`).
@@ -25,7 +26,7 @@ what the corners cover (`coverage`) and from how the boards were tilted (`tilts`
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -37,10 +38,11 @@ from coursekit.arrays import ArrayLike, Floats, NDArray
 from coursekit.boards import Board, Detection
 from coursekit.boards.board import check_detections
 from coursekit.checks import array, choice, is_number, want
-from coursekit.geometry import Intrinsics, deproject, make_transform
+from coursekit.geometry import Intrinsics, deproject, make_transform, project
 from coursekit.intrinsics.derivatives import (
     PARAMETERS,
     NormalEquations,
+    Scatter,
     parameter_vector,
     project_with_derivatives,
     selection,
@@ -73,6 +75,7 @@ GOOD_SPREAD_DEG = 10.0
 GOOD_VIEWS = 10
 GOOD_PX, USABLE_PX = 0.5, 2.0  # 95 %, in all but the worst 5 % of the image, at the boards' range
 GOOD_FAR_PX, USABLE_FAR_PX = 2.0, 4.0  # the same for a direction (a point infinitely far away)
+MOST_FOLDED = 0.05  # of the image; beyond, no figure is one of "95 % of the image"
 DETERMINED_SHARE = 0.01  # 95 % of the focal length and of the centre, as shares of the focal length
 
 
@@ -116,9 +119,9 @@ class IntrinsicsResult(Estimate):
         flat = self.equations.residuals
         return tuple(flat[rows].reshape(-1, 2) for rows in self.equations.slices)
 
-    @property
+    @cached_property
     def _all_residuals(self) -> Floats:
-        return self.equations.residuals.reshape(-1, 2)
+        return np.concatenate(self.residuals)
 
     @property
     def corners(self) -> int:
@@ -146,14 +149,14 @@ class IntrinsicsResult(Estimate):
         return np.array([_rms(r) for r in self.residuals])
 
     @property
-    def dof(self) -> int:
-        """Degrees of freedom: two a corner, less all parameters, those of the poses included."""
-        return self.equations.dof
+    def dof(self) -> float:
+        """Degrees of freedom of the covariances, which the scatter from view to view decides."""
+        return self._scatter.dof
 
     @property
     def sigma_px(self) -> float:
-        """Standard deviation of one corner coordinate, px, from the residuals and `dof`."""
-        return math.sqrt(float(np.sum(self._all_residuals**2)) / self.dof)
+        """Standard deviation of one corner coordinate, px: squares over degrees of freedom."""
+        return math.sqrt(float(np.sum(self.equations.residuals**2)) / self.equations.dof)
 
     @cached_property
     def converged(self) -> bool:
@@ -163,7 +166,7 @@ class IntrinsicsResult(Estimate):
         deviation, or no corner by more than ARRIVED_PX.
         """
         decrease, variance = self.equations.decrease(), float(np.mean(self._all_residuals**2))
-        of_sigma = variance * 2 * self.corners / max(1, self.dof)
+        of_sigma = variance * 2 * self.corners / max(1, self.equations.dof)
         return decrease < max(ARRIVED_SIGMAS**2 * of_sigma, 2 * self.corners * ARRIVED_PX**2)
 
     # --- what the parameters are known to ---
@@ -178,21 +181,29 @@ class IntrinsicsResult(Estimate):
         return self.equations.shared[:, : len(self.names)], tuple(self.equations.poses)
 
     @cached_property
+    def _scatter(self) -> Scatter:
+        return self.equations.scatter(len(self.names))
+
+    @cached_property
     def covariance(self) -> Floats:
-        """The covariance (p, p) of the parameters `names`, poses unknown; px^2 for K."""
-        p = len(self.names)
-        return self.sigma_px**2 * self.equations.shared_covariance[:p, :p]
+        """The covariance (p, p) of the parameters `names`, poses unknown; px^2 for K.
+
+        The residuals of one view hang together (its image, its light, what the model lacks of its
+        pose), so the view is the unit that it counts, not the corner: `NormalEquations.scatter`.
+        """
+        return self._scatter.covariance[: len(self.names), : len(self.names)]
 
     @cached_property
     def joint_covariance(self) -> Floats:
         """The covariance (p + 6n, p + 6n) of the parameters, then (omega, v) of each pose."""
-        return self._scaled(self.equations.covariance())
+        return self._without_extra(self.equations.covariance)
 
-    def _scaled(self, covariance: Floats) -> Floats:
-        """A covariance of shared parameters and motions at the corners' noise, without `extra`."""
+    def _without_extra(self, covariance_of: Callable[[Floats, float], Floats]) -> Floats:
+        """A covariance of shared parameters and motions as the views scatter, without `extra`."""
+        covariance = covariance_of(self._scatter.covariance, self._scatter.variance)
         extra = np.s_[len(self.names) : len(self.names) + len(self.extra)]
         kept = np.delete(np.arange(len(covariance)), extra)
-        return self.sigma_px**2 * covariance[np.ix_(kept, kept)]
+        return covariance[np.ix_(kept, kept)]
 
     def value(self, name: str) -> float:
         """The estimate of one of `names`."""
@@ -223,7 +234,7 @@ class IntrinsicsResult(Estimate):
         choice("fixed", fixed, ("world", "camera"))
         uv = array("pixels", pixels, (2,), leading=True)
         columns = projection_columns(self.intrinsics, uv.reshape(-1, 2), range_m, self.names)
-        covariance = self._scaled(self.equations.mean_motion_covariance())
+        covariance = self._without_extra(self.equations.mean_motion_covariance)
         known = len(self.names) if fixed == "camera" else len(covariance)
         columns, covariance = columns[..., :known], covariance[:known, :known]
         return (columns @ covariance @ np.swapaxes(columns, -1, -2)).reshape(*uv.shape, 2)
@@ -248,6 +259,45 @@ class IntrinsicsResult(Estimate):
         ]
         return float(np.median(seen))
 
+    # --- where it says nothing ---
+
+    @cached_property
+    def folded_share(self) -> float:
+        """The share of the image in which the fitted distortion has no inverse, hence no figure."""
+        grid = image_grid(self.intrinsics, MAP_SHAPE).reshape(-1, 2)
+        return float(np.isnan(points_at(grid, math.inf, self.intrinsics)[:, 0]).mean())
+
+    @cached_property
+    def simpler(self) -> IntrinsicsResult | None:
+        """The fit with the most coefficients below these whose lens does not fold in the image.
+
+        None where there is none. Raises ValueError as `calibrate`.
+        """
+        smaller = list(MODELS)[: list(MODELS).index(self.model)]
+        for model in reversed(smaller):
+            fit = calibrate(
+                self.detections, self.board, model, "f" in self.names, None, self.points
+            )
+            if not fit.folded_share:
+                return fit
+        return None
+
+    def held_out_px(self) -> float:
+        """The RMS in px of each half of the views under the camera of the other half.
+
+        With the poses that suit it best: what a model is worth, where coefficients too many show.
+        Raises ValueError where a half has fewer than 3 views, and as `calibrate`.
+        """
+        squares = np.zeros(2)
+        for part in (0, 1):
+            views, others = self.detections[part::2], self.detections[1 - part :: 2]
+            same = "f" in self.names
+            lens = calibrate(views, self.board, self.model, same, None, self.points).intrinsics
+            for d in others:
+                off = _off_px(lens, self.points[d.ids], d.pixels)
+                squares += float(np.sum(off**2)), len(off)
+        return math.sqrt(squares[0] / squares[1])
+
     # --- in words ---
 
     def verdict(self) -> str:
@@ -259,14 +309,15 @@ class IntrinsicsResult(Estimate):
         """
         range_m, wide, views = self.board_range_m, self.quantile(), len(self.residuals)
         near, far = (
-            wide * float(np.quantile(self.uncertainty_map(r), 0.95)) for r in (range_m, math.inf)
+            wide * float(np.nanquantile(self.uncertainty_map(r), 0.95)) for r in (range_m, math.inf)
         )
         focal = wide * max(self.sigma(f) / self.value(f) for f in ("fx", "fy"))
         centre = wide * max(self.sigma(c) for c in ("cx", "cy"))
         determined = max(focal, centre / self.value("fx")) < DETERMINED_SHARE
         near_mm = 1e3 * near * range_m / self.value("fx")
+        where = "the pixels that have a ray" if self.folded_share else "the image"
         says = (
-            f"in 95 % of the image a point {range_m:.2f} m away is seen where this camera says to "
+            f"in 95 % of {where} a point {range_m:.2f} m away is seen where this camera says to "
             f"± {near:.2f} px ({near_mm:.2f} mm), and a direction to ± {far:.2f} px (95 %)."
             if determined
             else f"these {views} views do not determine K (f ± {100 * focal:.1f} %, "
@@ -279,7 +330,8 @@ class IntrinsicsResult(Estimate):
                 f"views, or sharper ones (the corners scatter by {self.sigma_px:.2f} px)."
             ]
         grade = "Usable with care" if weak else "Good"
-        if not (self.converged and determined and near < USABLE_PX and far < USABLE_FAR_PX):
+        small = near < USABLE_PX and far < USABLE_FAR_PX and self.folded_share <= MOST_FOLDED
+        if not (self.converged and determined and small):
             grade = "Not good enough"
         lines = [f"{grade}: {says}", *(f"- {reason}" for reason in weak)]
         lines.append(
@@ -293,7 +345,7 @@ class IntrinsicsResult(Estimate):
         lines = [
             f"{width}x{height} px, model {self.model}, {len(self.residuals)} views, "
             f"{self.corners} corners"
-            + (", the board's bow fitted too" if self.extra else "")
+            + (", the board's shape fitted too" if self.extra else "")
             + ("" if self.converged else "; NOT CONVERGED")
         ]
         for name in self.names:
@@ -307,10 +359,29 @@ class IntrinsicsResult(Estimate):
         )
         sigmas = self.quantile() * self.uncertainty_map(self.board_range_m)
         lines.append(
-            f"at {self.board_range_m:.2f} m a point is seen within ± {np.median(sigmas):.2f} px "
-            f"(median of the image), ± {sigmas.max():.2f} px (worst)"
+            f"at {self.board_range_m:.2f} m a point is seen within ± {np.nanmedian(sigmas):.2f} px "
+            f"(median of the image), ± {np.nanmax(sigmas):.2f} px (worst)"
         )
+        lines += folded_text(self.folded_share)
         return "\n".join(lines)
+
+
+def folded_text(share: float) -> list[str]:
+    """The line about the share of the image in which a lens has no answer; none where it has."""
+    if not share:
+        return []
+    where = "in its corners" if share < MOST_FOLDED else "from some distance to its centre on"
+    folds = "the fitted lens folds back: it has no figures"
+    return [f"in {100 * share:.1f} % of the image ({where}) {folds}"]
+
+
+def _off_px(lens: Intrinsics, points: Floats, pixels: Floats) -> Floats:
+    """How far (N, 2) the board's corners are from where the camera sees them at the best pose."""
+    import cv2
+
+    _, r, t = cv2.solvePnP(points, pixels, lens.K, lens.dist)
+    at = points @ cv2.Rodrigues(r)[0].T + t.ravel()
+    return np.asarray(pixels - project(at, lens.K, lens.dist))
 
 
 def _rms(residuals: Floats) -> float:
@@ -384,11 +455,13 @@ def evaluate(
     names: tuple[str, ...],
     model: str,
     extra: dict[str, Floats] | None = None,
+    held: tuple[Floats, Floats] | None = None,
 ) -> IntrinsicsResult:
     """Residuals and Jacobian of a camera and poses, as a result.
 
     T_camera_board (n, 4, 4). points (N, 3): the board's corners, m. names: what counts as
-    estimated. extra: d points / d a further estimated quantity, (N, 3) by name.
+    estimated. extra: d points / d a further estimated quantity, (N, 3) by name. held: what is known
+    of each of those besides, in px: weights (k,) and what they amount to (k,); 0 for nothing.
     """
     extra = extra or {}
     ids = np.concatenate([d.ids for d in detections])
@@ -403,10 +476,13 @@ def evaluate(
         moves = np.einsum("nij,nj->ni", R, by_extra[ids])
         shared.append(np.einsum("nij,nj->ni", by_point, moves)[..., None])
     poses = np.split(twist_columns(at, by_point), np.cumsum(counts)[:-1])
+    weights, off = held or (np.zeros(len(extra)), np.zeros(len(extra)))
+    known = np.concatenate([np.zeros((len(extra), len(names))), np.diag(weights)], axis=1)
+    seen = np.concatenate(shared, axis=-1).reshape(2 * len(ids), -1)
     equations = NormalEquations(
-        shared=np.concatenate(shared, axis=-1).reshape(2 * len(ids), -1),
+        shared=np.concatenate([seen, known[weights > 0]]),
         poses=tuple(block.reshape(-1, 6) for block in poses),
-        residuals=residuals.ravel(),
+        residuals=np.concatenate([residuals.ravel(), -off[weights > 0]]),
     )
     return IntrinsicsResult(
         intrinsics=intrinsics,
@@ -626,6 +702,8 @@ def _weaknesses(result: IntrinsicsResult) -> Iterator[str]:
     """What could be better about the views of a calibration, with what to do."""
     views, seen = len(result.residuals), coverage(result.detections)
     about_x, about_y = tilts(result).spread_deg
+    if result.folded_share:
+        yield f"{folded_text(result.folded_share)[0]}; {_fewer_coefficients(result)}"
     if not result.converged:
         yield "the solver did not converge: remove views that are spoiled, or give a guess."
     if views < GOOD_VIEWS:
@@ -645,3 +723,16 @@ def _weaknesses(result: IntrinsicsResult) -> Iterator[str]:
         )
     if seen.fraction < GOOD_COVERAGE:
         yield f"only {100 * seen.fraction:.0f} % of the image saw a corner: fill the rest."
+
+
+def _fewer_coefficients(result: IntrinsicsResult) -> str:
+    """What to fit in place of a lens that folds inside the image, and what it costs."""
+    fit = result.simpler
+    if fit is None:
+        return "no smaller model here does better: push the board into the image's corners."
+    says = f"fit fewer coefficients, calibrate(..., model='{fit.model}'): "
+    if len(result.detections) >= 2 * MIN_VIEWS:
+        says += f"held-out views RMS {fit.held_out_px():.2f} px, with these coefficients "
+        says += f"{result.held_out_px():.2f} px; "
+    fx = "f" if "f" in result.names else "fx"
+    return f"{says}sigma of fx {fit.sigma(fx):.2f} px, with these {result.sigma(fx):.2f} px."

@@ -188,7 +188,7 @@ def _arrows(
 def uncertainty(results: Mapping[str, IntrinsicsResult], range_m: float) -> LessonFigure:
     """Maps of the standard deviation of a projected pixel, with one scale for all of them."""
     maps = {name: r.uncertainty_map(range_m, (30, 40)) for name, r in results.items()}
-    top = max(float(m.max()) for m in maps.values())
+    top = max(float(np.nanmax(m)) for m in maps.values())  # NaN where a lens folds back
     fig = figure(4.7 * len(maps) + 0.6, 3.9)
     axes = fig.subplots(1, len(maps), squeeze=False, sharey=True)[0]
     levels = np.array([0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100])
@@ -205,7 +205,7 @@ def uncertainty(results: Mapping[str, IntrinsicsResult], range_m: float) -> Less
     return fig.saying(
         f"Standard deviation of a projected pixel over the image, for points {range_m:g} m away: "
         + "; ".join(
-            f"{name or 'this calibration'} from {m.min():.3f} to {m.max():.3f} px"
+            f"{name or 'this calibration'} from {np.nanmin(m):.3f} to {np.nanmax(m):.3f} px"
             for name, m in maps.items()
         )
         + "."
@@ -250,7 +250,7 @@ def rules(rows: Mapping[str, IntrinsicsResult], range_m: float) -> LessonFigure:
     """
     names = [f"{name} ({r.rms_px:.2f} px)" for name, r in rows.items()]
     fx = [100 * r.sigma("fx") / r.intrinsics.fx for r in rows.values()]
-    worst = [float(r.uncertainty_map(range_m, (12, 16)).max()) for r in rows.values()]
+    worst = [float(np.nanmax(r.uncertainty_map(range_m, (12, 16)))) for r in rows.values()]
     fig = figure(9.0, 0.55 * len(names) + 1.4)
     axes = fig.subplots(1, 2, sharey=True)
     for ax, values, label in (
