@@ -64,13 +64,10 @@ def board_in_gripper(board: Board) -> Floats:
     return make_transform(R, np.array([FINGERS_M + half, 0.0, 0.0]) - R @ board.middle)
 
 
-def over_the_shoulder(
-    at_m: tuple[float, float, float] = (-0.12, 0.18, 0.75),
-    looks_at_m: tuple[float, float, float] = (0.28, 0.0, 0.25),
-) -> Floats:
+def over_the_shoulder() -> Floats:
     """T_base_camera (4, 4) of a camera beside and above the arm's shoulder, its image upright."""
-    at = np.array(at_m)
-    forward = np.array(looks_at_m) - at
+    at = np.array([-0.12, 0.18, 0.75])
+    forward = np.array([0.28, 0.0, 0.25]) - at
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
