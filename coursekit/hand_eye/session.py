@@ -363,8 +363,8 @@ def _check_columns(columns: set[str]) -> None:
         raise ValueError(
             f"folder: {POSES} has no column {missing[0]!r}, and not all of {', '.join(JOINTS)} "
             "either: want a pose (m and a quaternion), or the joint angles (rad) of a WidowX AI. "
-            "Those of another arm tell nothing here: give its poses (a UR's x, y, z, rx, ry, rz are one: "
-            "Rotation.from_rotvec([rx, ry, rz]).as_quat())"
+            "Those of another arm tell nothing here: give its poses (a UR's x, y, z, rx, ry, rz "
+            "are one: Rotation.from_rotvec([rx, ry, rz]).as_quat())"
         )
 
 
