@@ -154,8 +154,8 @@ def test_intrinsics_of_another_image_size(factor: float) -> None:
     given = session(SEEDS[0], 15, detections=True)
     lens = given.intrinsics
     assert lens is not None
-    wrong = replace(lens, fx=factor * lens.fx, fy=factor * lens.fy,
-                    cx=factor * (lens.cx + 0.5) - 0.5, cy=factor * (lens.cy + 0.5) - 0.5)  # fmt: skip
+    cx, cy = factor * (lens.cx + 0.5) - 0.5, factor * (lens.cy + 0.5) - 0.5
+    wrong = replace(lens, fx=factor * lens.fx, fy=factor * lens.fy, cx=cx, cy=cy)
     [finding] = diagnose(replace(given, intrinsics=wrong))
     assert finding.name == "lens_of_another_size"
     times = float(finding.evidence.split("times ")[1].split()[0])
