@@ -237,7 +237,7 @@ def _in_order(
     couples = [f"{names[i]} and {names[j]}" for i, j in enumerate(rows) if i < j and rows[j] == i]
     if 2 * len(couples) == len(moved):
         return Pairing(pairs, rows, "exchanged_rows", ", ".join(couples))
-    listed = ", ".join(f"{names[i]} to that of {names[int(rows[i])]}" for i in moved)
+    listed = ", ".join(f"{names[int(i)]} to that of {names[int(rows[i])]}" for i in moved)
     words = f"images belong to arm poses of others ({listed})"
     taken = np.isin(own, rows[moved]) & (rows == own)
     return Pairing(pairs, np.where(taken, -1, rows), "off_by_one", words)
