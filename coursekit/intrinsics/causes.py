@@ -465,8 +465,8 @@ def named(found: CauseSearch[Calibration]) -> list[Accepted[Calibration]]:
     held = max(shape[0].before.left_px ** 2 - noise, 0.0) if shape else 0.0
     good = shape if closed or taken(shape) >= MOST_OF_SHAPE * held else []
     crumbs = STIFF**2 * taken(good)
-    # Paper that bends from view to view is taken in, lest others pass for it, and is not named: what
-    # neighbouring corners of any image have in common looks like it.
+    # Paper that bends from view to view is taken in, lest others pass for it, and is not named:
+    # what neighbouring corners of any image have in common looks like it.
     large = [s for s in others if taken([s]) > crumbs and s.test.cause != FLEX]
     good = good + [
         s for s in large if closed or s.after.smooth[0] < (1 - MOST) * s.before.smooth[0]
