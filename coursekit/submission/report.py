@@ -111,7 +111,6 @@ class ReportLine:
 
 def graded(file: str, grade: Grade, submission: Submission, page: str = "") -> ReportLine:
     """The line of a graded bundle; of its items what the class page and the table say."""
-    brief: dict[str, Any] = {"says": "", "claimed": None, "found": None, "tolerance": None}
     return ReportLine(
         file=file,
         student=grade.student,
@@ -119,7 +118,7 @@ def graded(file: str, grade: Grade, submission: Submission, page: str = "") -> R
         paragraph=submission.conclusion.paragraph,
         points=grade.points,
         of=grade.of,
-        items=tuple(replace(item, **brief) for item in grade.items),
+        items=tuple(replace(item, says="", tolerance=None) for item in grade.items),
         flags=grade.flags,
         page=page,
         fingerprint=grade.fingerprint,
