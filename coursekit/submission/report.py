@@ -235,17 +235,10 @@ def _comparison(grade: Grade, submission: Submission) -> Iterator[tuple[str, ...
         yield "", "std (mm)", claim, found
         percent = None if row.invalid_fraction is None else 100 * row.invalid_fraction
         yield "", "invalid (%)", _pair(percent), _pair(100 * m.invalid.value)
-    claim, found = (
-        _pair(claims.sigma_d_px, None, ".3f"),
-        _pair(getattr(law, "sigma_d_px", None), None, ".3f"),
-    )
+    sigma_d, ends = (law.sigma_d_px, law.sigma_d_interval_px) if law else (None, None)
+    claim, found = (_pair(value, None, ".3f") for value in (claims.sigma_d_px, sigma_d))
     yield "all", "σ_d (px)", claim, found
-    yield (
-        "",
-        "95 % (px)",
-        _ends(claims.sigma_d_interval_px),
-        _ends(getattr(law, "sigma_d_interval_px", None)),
-    )
+    yield "", "95 % (px)", _ends(claims.sigma_d_interval_px), _ends(ends)
 
 
 def _pair(
@@ -334,12 +327,7 @@ def _noise_figure(submission: Submission, found: Recomputed) -> dict[str, Any] |
         "x_ticks": [(axes.x(v), f"{v:.2g}") for v in _ticks(axes.low, axes.high, 6)],
         "y_ticks": [(axes.y(v), f"{v:.3g}") for v in _ticks(0, axes.top, 5)],
         "measured": [
-            (
-                axes.x(z),
-                axes.y(std),
-                axes.y(max(std - 2 * se, 0)),
-                axes.y(min(std + 2 * se, axes.top)),
-            )
+            (axes.x(z), *map(axes.y, (std, max(std - 2 * se, 0), min(std + 2 * se, axes.top))))
             for z, std, se in measured
             if std < LARGEST_MM
         ],

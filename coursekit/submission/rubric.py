@@ -259,9 +259,9 @@ def _bias_se(asked: _Question, submission: Submission, m: AtDistance, claim: flo
 
     With the tape's error or without it is right; it is itself known to a part only.
     """
-    if m.bias is None or m.bias_se_mm is None or m.bias_se_apart_mm is None:
+    if m.bias is None or m.bias_se_mm is None:
         return _unknown(asked, claim)
-    both, apart, tape = m.bias_se_mm, m.bias_se_apart_mm, 1e3 * submission.tape_sigma_m
+    both, apart, tape = m.bias_se_mm, m.bias.se, 1e3 * submission.tape_sigma_m
     n, pixels = m.stats.n_frames, m.stats.n_pixels
     std = m.std.value if m.std else math.nan
 
@@ -666,7 +666,7 @@ def _at_mounting(
     """
     at = np.array([m.distance_m for m in known])
     each = [m.bias.value for m in known if m.bias is not None]
-    errors = [m.bias_se_apart_mm or 0.0 for m in known]
+    errors = [m.bias.se for m in known if m.bias is not None]
     inside = float(np.clip(z, at[0], at[-1]))
     beyond = z / inside
     bias, se = float(np.interp(inside, at, each)) * beyond, float(np.interp(inside, at, errors))
