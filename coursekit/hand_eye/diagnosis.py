@@ -381,7 +381,7 @@ def _figures(
     if test.cause == causes.ARM_ERROR:
         size = np.degrees(model.offsets[test.at])
         return {"joint": test.at, "size": size, "half": np.degrees(half)}
-    if test.cause == causes.DRIFT:
+    if test.cause == causes.STEADY:
         turn, shift = step.before.over_session(test)
         what = ("the camera on its mount", "the board on its stand")[test.at]
         return {"what": what, "turn": np.degrees(turn), "shift": 1e3 * shift}
