@@ -240,7 +240,7 @@ def mistaken(seed: int = 0) -> dict[str, tuple[str, Submission]]:
         "not_divided": ("bias_se", std),
         "independent": ("bias_se", std / z.size**0.5),
         "tape_only": ("bias_se", 0.1),
-        "no_tape": ("bias_se", m.bias_se_apart_mm),
+        "no_tape": ("bias_se", m.bias.se),
         "of_the_mean": ("std", float(np.nanmean(z, axis=(1, 2)).std(ddof=1))),
         "standard_error": ("std", std / 10),
         "variance": ("std", std**2),

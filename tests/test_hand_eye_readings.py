@@ -18,6 +18,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from simulated_hand_eye import free_session
 
+from coursekit.arm import widowx
 from coursekit.geometry import turned
 from coursekit.hand_eye import HandEyeSession
 from coursekit.hand_eye.diagnosis import diagnose
@@ -136,3 +137,65 @@ def test_arms_that_err_at_each_pose_are_not_accused() -> None:
     print(dict(found))
     accused = sum(n for names, n in found.items() if set(names) - {"unexplained"})
     assert accused <= (2 if NIGHTLY else 0)
+
+
+def test_random_rotations_get_no_name() -> None:
+    """Many candidates fit a few poses by chance; "nothing fits" is the honest word."""
+    for seed, n in ((1, 8), (3, 15), (4, 25)):
+        given = session(seed, n)
+        T = given.T_base_gripper.copy()
+        T[:, :3, :3] = Rotation.random(n, rng=np.random.default_rng(seed)).as_matrix()
+        [finding] = diagnose(replace(given, T_base_gripper=T))
+        assert "no reading that was tried" in finding.says
+
+
+@pytest.mark.parametrize("factor", [1.25, 1.5, 2.0])
+def test_intrinsics_of_another_image_size(factor: float) -> None:
+    given = session(SEEDS[0], 15, detections=True)
+    lens = given.intrinsics
+    assert lens is not None
+    cx, cy = factor * (lens.cx + 0.5) - 0.5, factor * (lens.cy + 0.5) - 0.5
+    wrong = replace(lens, fx=factor * lens.fx, fy=factor * lens.fy, cx=cx, cy=cy)
+    [finding] = diagnose(replace(given, intrinsics=wrong))
+    assert finding.name == "lens_of_another_size"
+    times = float(finding.evidence.split("times ")[1].split()[0])
+    assert times == pytest.approx(1 / factor, rel=0.03)
+    smaller = replace(lens, width=320, height=240)
+    with pytest.raises(ValueError, match="320"):
+        diagnose(replace(given, intrinsics=smaller))
+
+
+@pytest.mark.parametrize("scatter_m", [0.0, 1e-5])
+def test_pairs_that_only_repeat_accuse_nobody(scatter_m: float) -> None:
+    """Each pose three times, as a logger writes while the arm stands: no slip, no drift."""
+    for seed in (5, 6):
+        given = session(seed, 12)
+        arm, seen = (np.repeat(T, 3, axis=0) for T in (given.T_base_gripper, given.seen))
+        seen[:, :3, 3] += scatter_m * np.random.default_rng(seed).normal(size=(36, 3))
+        findings = diagnose(HandEyeSession(given.mount, arm, seen))
+        assert findings.names == ()
+        assert any("24 of 36 pairs repeat" in reason for reason in findings.not_tested)
+
+
+def test_what_is_large_is_never_nothing() -> None:
+    """An arm in free drive, off by 0.8 deg and 6 mm at each pose: no cause, but not "nothing"."""
+    for seed in (7, 8):
+        given = free_session(seed, "eye_in_hand", 24).session
+        error = np.random.default_rng(seed).normal(size=(24, 6))
+        arm = turned(given.T_base_gripper, error * np.repeat([np.radians(0.8), 6e-3], 3))
+        [finding] = diagnose(replace(given, T_base_gripper=arm))
+        assert finding.name == "unexplained"
+        assert "none of the causes known here" in finding.says
+
+
+def test_whose_joint_angles_are_meant_is_said(tmp_path) -> None:
+    (tmp_path / "poses.csv").write_text("file,x,y,z,rx,ry,rz\n0.png,0,0,0,0,0,0\n", "utf-8")
+    lens = session(SEEDS[0], 15, detections=True)
+    with pytest.raises(ValueError, match=r"joint angles \(rad\) of a WidowX AI"):
+        HandEyeSession.from_folder(tmp_path, "eye_in_hand", lens.board, lens.intrinsics)
+    q = widowx().random(np.random.default_rng(0), 12)
+    other = replace(session(9, 12), T_base_gripper=widowx().forward(q), q=q)
+    assert "poses computed with the WidowX AI (follower)'s kinematics" in repr(other)
+    [finding] = diagnose(other)
+    assert finding.name == "joints_of_another_arm"
+    assert "WidowX AI" in finding.evidence

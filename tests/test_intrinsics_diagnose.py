@@ -236,7 +236,7 @@ def test_ordinary_sessions_get_no_wrong_cause() -> None:
     """At most 8 of 400 (nightly); of 6 at most 1. That paper is no plane is true, and is named."""
     wrong = {
         "spoiled_view", "bad_corners", "steady_drift", "focus_drift", "rolling_shutter",
-        "lens_model", "flexing_board",
+        "lens_model",
     }  # fmt: skip
     count, most = (400, 8) if NIGHTLY else (6, 1)
     found: Counter[tuple[str, ...]] = Counter()

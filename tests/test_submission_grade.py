@@ -137,7 +137,7 @@ def test_every_number_of_the_plot_counts(field, i):
 
 def test_a_standard_error_counts_with_the_tapes_or_apart_from_it():
     measured = recompute(GOOD).at[1]
-    both, apart = measured.bias_se_mm, measured.bias_se_apart_mm
+    both, apart = measured.bias_se_mm, measured.bias.se
     assert item(with_row(GOOD, 1, depth_bias_se_mm=apart), "bias_se", 1).verdict == "right"
     between = with_row(GOOD, 1, depth_bias_se_mm=(both + apart) / 2)
     assert item(between, "bias_se", 1).points < 2

@@ -9,6 +9,7 @@ of a session; whoever calibrates with them asks `check_detections` first.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -352,6 +353,17 @@ class Detections(Sequence[Detection]):
         self.skipped = tuple(skipped)
         for view in self._views:
             instance("views", view, Detection)
+
+    @classmethod
+    def from_file(cls, path: str | os.PathLike[str]) -> Detections:
+        """Corners that are kept in an .npz, as data/ordinary/SOURCE.md describes it."""
+        with np.load(path) as kept:
+            width, height = kept["size"].tolist()
+            of_view = [kept["view"] == number for number in range(len(kept["names"]))]
+            return cls(
+                Detection(kept["ids"][here], kept["pixels"][here], (width, height), str(name))
+                for here, name in zip(of_view, kept["names"], strict=True)
+            )
 
     @property
     def size(self) -> tuple[int, int]:

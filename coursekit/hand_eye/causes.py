@@ -46,7 +46,7 @@ LEAST_RAD, LEAST_M = np.radians(0.005), 2e-5
 MEDIAN_1D = 1.4826  # of the size of a standard normal number, one over
 MEDIAN_3D = 1.5382  # the median length of three independent standard normal numbers
 SCALE, LATE, ARM_ERROR = "wrong_square_size", "late_time_stamps", "arm_error"
-SLIP, OUTLIER, DRIFT = "slipping_board", "outlier_pose", "slow_drift"
+SLIP, OUTLIER, STEADY = "slipping_board", "outlier_pose", "slow_drift"
 SMOOTH = (SCALE, LATE, ARM_ERROR)  # one number that acts on all pairs
 # At most 2 % of healthy sessions may get a finding, and five kinds of test at this level make
 # 0.05 %; the rest is for arms whose errors are not quite normal.
@@ -54,15 +54,15 @@ _CHANCE_LEVEL = 1e-4
 # What careful people have, and no finding: squares measured with a ruler, a driver's own delay, a
 # board that settles, a pose in which the arm still swings, a zero that a jig sets.
 NORMAL_SIZE = {
-    SCALE: 0.01, LATE: 5e-3, SLIP: 2e-3, OUTLIER: 5e-3, DRIFT: 2e-3, ARM_ERROR: np.radians(0.6)
+    SCALE: 0.01, LATE: 5e-3, SLIP: 2e-3, OUTLIER: 5e-3, STEADY: 2e-3, ARM_ERROR: np.radians(0.6)
 }  # fmt: skip
-NORMAL_TURN_RAD = {SLIP: np.radians(0.5), OUTLIER: np.radians(1.0), DRIFT: np.radians(0.25)}
+NORMAL_TURN_RAD = {SLIP: np.radians(0.5), OUTLIER: np.radians(1.0), STEADY: np.radians(0.25)}
 # Times as much, where no image says how well it knows its board pose, or no joint angles what the
 # arm may be wrong by: some pose of a healthy one is off by four times the typical error.
 ROUGH_DATA = 3.0
 # Times the typical residual, where no joint angles say which errors poses share: those of the arm
 # then look like a slip of their own size.
-OVER_USUAL = {SLIP: 2.5, OUTLIER: 4.0, DRIFT: 1.0}
+OVER_USUAL = {SLIP: 2.5, OUTLIER: 4.0, STEADY: 1.0}
 SCALE_WITHOUT_JOINTS = 0.02  # the arm's own shared errors can imitate that much of a scale
 CAMERA_RAD, CAMERA_M = np.radians(0.02), 1e-4  # what imperfect intrinsics do to a board's pose
 # Of the arm's stated errors, which poses share; one that is worse than the last is itself a
@@ -308,7 +308,7 @@ class MendedPairs:
         usual = OVER_USUAL[test.cause] if self.arms.q is None else 0.0
         least_turn = max(rough * NORMAL_TURN_RAD[test.cause], usual * self.fit.turn_rad)
         least_shift = max(rough * normal, usual * self.fit.shift_m)
-        turn, shift = self.over_session(test) if test.cause == DRIFT else turn_and_shift(test)
+        turn, shift = self.over_session(test) if test.cause == STEADY else turn_and_shift(test)
         return shift > least_shift or turn > least_turn
 
     def accept(self, test: Tested) -> MendedPairs | None:
@@ -317,10 +317,10 @@ class MendedPairs:
         if test.cause == OUTLIER:
             left = pairs.keep(np.arange(len(pairs)) != at)
             return replace(self, fit=left.fit, odd=self.odd + 1)
-        if test.cause == DRIFT:
+        if test.cause == STEADY:
             effect = (test.hypothesis.columns @ test.coefficients).reshape(-1, 6)
             straight = replace(pairs, T_camera_board=turned(pairs.T_camera_board, -effect))
-            after = replace(self, smooth=(*self.smooth, (DRIFT, at)), fit=straight.fit)
+            after = replace(self, smooth=(*self.smooth, (STEADY, at)), fit=straight.fit)
             return after if after.fit.better_than(self.fit) > 1.0 else None
         if test.cause == SLIP:
             segment, Y = pairs.segment.copy(), self.fit.Y
@@ -365,7 +365,7 @@ class MendedPairs:
         time = (pairs.view - pairs.view.mean()) / np.ptp(pairs.view)  # 1 over the whole session
         for place, columns in enumerate((fit.columns[:, :, :6], by_Y)):
             steady = (time[:, None, None] * columns).reshape(-1, 6)
-            found.append(Hypothesis(DRIFT, steady, place, tried=2))
+            found.append(Hypothesis(STEADY, steady, place, tried=2))
         later = {}
         for at in range(1, n):
             mine = np.flatnonzero(pairs.segment == pairs.segment[at])

@@ -103,8 +103,8 @@ class _Case:
         if np.abs(middle - 0.5).max() < FAR_FROM_MIDDLE:
             return
         given, factor = self.pairs.fit, float(0.5 / middle.mean())
-        centre = {"cx": (lens.cx + 0.5) * factor - 0.5, "cy": (lens.cy + 0.5) * factor - 0.5}
-        scaled = replace(lens, fx=factor * lens.fx, fy=factor * lens.fy, **centre)
+        fx, fy, (cx, cy) = factor * lens.fx, factor * lens.fy, factor * middle * lens.size - 0.5
+        scaled = replace(lens, fx=fx, fy=fy, cx=float(cx), cy=float(cy))
         mended = PosePairs.of(replace(self.session, intrinsics=scaled))
         if mended.fit.better_than(given) > 1.0:
             self.pairs = mended
@@ -381,7 +381,7 @@ def _figures(
     if test.cause == causes.ARM_ERROR:
         size = np.degrees(model.offsets[test.at])
         return {"joint": test.at, "size": size, "half": np.degrees(half)}
-    if test.cause == causes.DRIFT:
+    if test.cause == causes.STEADY:
         turn, shift = step.before.over_session(test)
         what = ("the camera on its mount", "the board on its stand")[test.at]
         return {"what": what, "turn": np.degrees(turn), "shift": 1e3 * shift}

@@ -33,7 +33,7 @@ PLACES_AGREE = 0.15  # of the positions' spread; in degrees taken as radians pos
 # Of a whole turn of the numbers as read that a decoding may miss in a typical pose; random ones do
 # by 130 deg. With few whole turns in reach much less is chance too.
 CHANCE_RAD, CLOSE_RAD = np.radians(80.0), np.radians(15.0)
-CHANCE_LEVEL, HYPOTHESES = 1e-4, 150
+NOTATION_LEVEL, HYPOTHESES = 1e-4, 150
 SOURCE_POSES = 3  # that candidates are taken from
 FEW_CANDIDATES = 2000  # that all poses are asked about
 ROUNDED = 1.001  # times pi: how far numbers reach
@@ -237,7 +237,7 @@ def _in_order(
     couples = [f"{names[i]} and {names[j]}" for i, j in enumerate(rows) if i < j and rows[j] == i]
     if 2 * len(couples) == len(moved):
         return Pairing(pairs, rows, "exchanged_rows", ", ".join(couples))
-    listed = ", ".join(f"{names[i]} to that of {names[int(rows[i])]}" for i in moved)
+    listed = ", ".join(f"{names[int(i)]} to that of {names[int(rows[i])]}" for i in moved)
     words = f"images belong to arm poses of others ({listed})"
     taken = np.isin(own, rows[moved]) & (rows == own)
     return Pairing(pairs, np.where(taken, -1, rows), "off_by_one", words)
@@ -526,7 +526,7 @@ def undo_notation(given: Fit, expected: Floats) -> Reading | None:
         arm = M if fit.pairs.mount == "eye_to_hand" else invert_transform(M)
         numbers, _ = misreading.nearest(misreading.read.numbers(G), arm[:, :3, :3])
         fit = with_rotations(given.pairs, misreading.written.rotations(numbers)).fit
-        if misreading.log_p(G, fit) < np.log(CHANCE_LEVEL):
+        if misreading.log_p(G, fit) < np.log(NOTATION_LEVEL):
             found.append(Reading(misreading.name, misreading.says(), fit))
     return best(found)
 

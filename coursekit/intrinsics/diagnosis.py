@@ -237,6 +237,7 @@ def _took(steps: _Steps, before: Calibration, after: Calibration) -> _Figures:
     took += f"(corner noise {_flat(after.noise_px)})"
     mine = {step.test.cause for step in steps}
     rivals = {r.cause for step in steps for r in step.rivals if r.cause in causes.PHYSICAL}
+    rivals -= {causes.FLEX}
     names = sorted({_TEXTS.findings[_ENTRY.get(r, r)]["name"] for r in rivals - mine})
     if names and not (mine | rivals) <= set(causes.SHAPE):
         took += f"; {' or '.join(n.replace('_', ' ') for n in names)} explains it as well"
@@ -310,11 +311,6 @@ def _shape(search: _Search, steps: _Steps, model: Calibration) -> _Told:
     return "bowed_board", figures
 
 
-def _flex(search: _Search, steps: _Steps, model: Calibration) -> _Told:
-    size = model.sizes[causes.FLEX]
-    return ("flexing_board", {"size": 1e3 * size}) if size >= NORMAL_BOW_M else None
-
-
 def _drift(search: _Search, steps: _Steps, model: Calibration) -> _Told:
     longer, right, down = model.values[causes.DRIFT].tolist()
     if abs(longer) < 100 * NORMAL_DRIFT and math.hypot(right, down) < NORMAL_SHIFT_PX:
@@ -345,7 +341,6 @@ _FIGURES: tuple[tuple[tuple[str, ...], Callable[[_Search, _Steps, Calibration], 
     ((causes.SPOILED_VIEW,), _spoiled_views),
     ((causes.BAD_CORNERS,), _bad_corners),
     (causes.SHAPE, _shape),
-    ((causes.FLEX,), _flex),
     ((causes.DRIFT,), _drift),
     ((causes.FOCUS,), _focus),
     ((causes.SHUTTER,), _shutter),

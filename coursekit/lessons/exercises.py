@@ -156,45 +156,30 @@ class Exercise:
         for run, args in zip(runs, self.cases, strict=True):
             if isinstance(run.error, NotImplementedError):
                 return self._say("not attempted", "not attempted yet.")
+            kind, text = "wrong", "it returns None here; is a `return` missing?"
             if run.error is not None:
-                return self._say("raised", f"your function raised {run.said}", self._given(args))
-            if run.value is None:
-                return self._say(
-                    "wrong", "it returns None here; is a `return` missing?", self._given(args)
-                )
-            if _as_numbers(run.value) is None:
-                kind = type(run.value).__name__
-                return self._say(
-                    "wrong",
-                    f"it returns a {kind} that is not an array of numbers.",
-                    self._given(args),
-                )
+                kind, text = "raised", f"your function raised {run.said}"
+            elif run.value is not None:
+                if _as_numbers(run.value) is not None:
+                    continue
+                text = f"it returns a {type(run.value).__name__} that is not an array of numbers."
+            return self._say(kind, text, self._given(args))
         return None
 
     def _compare(self, runs: list[Run], expected: list[Floats]) -> Verdict:
         values = [v for r in runs if (v := _as_numbers(r.value)) is not None]
-        changed = any(r.changed_input for r in runs)
-        turned = [
-            v.shape == e.T.shape
-            for v, e in zip(values, expected, strict=True)
-            if e.shape != e.T.shape
-        ]
-        transposed = bool(turned) and all(turned)
-        if transposed:
-            values = [
-                v.T if v.shape == e.T.shape else v for v, e in zip(values, expected, strict=True)
-            ]
+        both = list(zip(values, expected, strict=True))
+        formal = [IN_PLACE] if any(r.changed_input for r in runs) else []
+        turned = [v.shape == e.T.shape for v, e in both if e.shape != e.T.shape]
+        if turned and all(turned):
+            formal.append(TRANSPOSED)
+            values = [v.T if v.shape == e.T.shape else v for v, e in both]
         for value, want, args in zip(values, expected, self.cases, strict=True):
             if value.shape != want.shape:
                 got, wanted = _shape(value), _shape(want)
                 text = f"wrong shape: it returns {got}, and {wanted} is wanted."
                 return self._say("wrong", text, self._given(args))
         agree = [self._agrees(v, e) for v, e in zip(values, expected, strict=True)]
-        formal = []
-        if changed:
-            formal.append(IN_PLACE)
-        if transposed:
-            formal.append(TRANSPOSED)
         if all(agree):
             return self._formal(formal) if formal else self._right()
         return self._wrong(values, expected, agree, formal)

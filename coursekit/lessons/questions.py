@@ -14,7 +14,7 @@ import tomllib
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from coursekit import results
 
@@ -50,10 +50,14 @@ class Objective:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A question; `answer` commits one answer and says why it is right or wrong."""
+    """A question; `answer` commits one answer and says why it is right or wrong.
+
+    example: what a plain call would pass, as source.
+    """
 
     name: str
     question: str
+    example: ClassVar[str]
 
     def answer(self, given: Any) -> Verdict:
         """The verdict on an answer; the first one given is what `progress` keeps as first try."""
@@ -61,11 +65,6 @@ class Checkpoint:
 
     def judge(self, given: Any) -> Verdict:
         """The verdict on an answer, without noting it."""
-        raise NotImplementedError
-
-    @property
-    def example(self) -> str:
-        """What a plain call would pass, as source."""
         raise NotImplementedError
 
     def input_widget(self) -> Any:
@@ -105,6 +104,7 @@ class Choice(Checkpoint):
     """
 
     options: tuple[Option, ...]
+    example = '"A"'
 
     def lettered(self) -> dict[str, Option]:
         """The options by letter."""
@@ -129,10 +129,6 @@ class Choice(Checkpoint):
     def explanation(self) -> Verdict:
         return self.judge(next(k for k, o in self.lettered().items() if o.right))
 
-    @property
-    def example(self) -> str:
-        return '"A"'
-
     def input_widget(self) -> Any:
         import ipywidgets
 
@@ -156,6 +152,7 @@ class Number(Checkpoint):
     hint: str
     classics: tuple[Classic, ...]
     tolerance: float = 0.02
+    example = "1.0"
 
     def judge(self, given: Any) -> Verdict:
         """The verdict on a number, or on text such as "2.4" or "2,4 mm"."""
@@ -192,10 +189,6 @@ class Number(Checkpoint):
 
     def explanation(self) -> Verdict:
         return self.judge(self.value)
-
-    @property
-    def example(self) -> str:
-        return "1.0"
 
     def input_widget(self) -> Any:
         import ipywidgets
@@ -278,15 +271,12 @@ def load_questions(lesson: str) -> tuple[tuple[Checkpoint, ...], tuple[Objective
         why, hint = _single_spaced(asked["why"]), _single_spaced(asked["hint"])
         return Number(name, question, asked["value"], asked["unit"], why, hint, slips)
 
-    return (
-        tuple(
-            checkpoint(f"{lesson}.{key}", asked) for key, asked in content["checkpoints"].items()
-        ),
-        tuple(
-            Objective(_single_spaced(o["text"]), tuple(f"{lesson}.{n}" for n in o["shown_by"]))
-            for o in content["objectives"]
-        ),
+    asked = (checkpoint(f"{lesson}.{key}", told) for key, told in content["checkpoints"].items())
+    objectives = (
+        Objective(_single_spaced(o["text"]), tuple(f"{lesson}.{n}" for n in o["shown_by"]))
+        for o in content["objectives"]
     )
+    return tuple(asked), tuple(objectives)
 
 
 def _single_spaced(text: str) -> str:

@@ -384,9 +384,8 @@ def _unit(values: NDArray[np.int8]) -> NDArray[np.float32]:
 
 def _queries(frames: NDArray[np.int8]) -> NDArray[np.int8]:
     """Up to FRAMES_ASKED frames, evenly spread."""
-    if len(frames) <= FRAMES_ASKED:
-        return frames
-    return frames[np.linspace(0, len(frames) - 1, FRAMES_ASKED).round().astype(int)]
+    n = len(frames)
+    return frames[np.linspace(0, n - 1, min(n, FRAMES_ASKED)).round().astype(int)]
 
 
 def _shared(one: StackPrint, two: StackPrint) -> tuple[int, bool]:
@@ -444,25 +443,15 @@ def _nearly(groups: Mapping[str, tuple[str, ...]], prints: Mapping[str, Fingerpr
     found: dict[tuple[str, str], dict[float, tuple[int, bool]]] = {}
     rank = {key: i for i, key in enumerate(groups)}
     for i, (key, stack) in enumerate(stacks):
-        alike = np.flatnonzero(patterns @ patterns[i] > PATTERN_LIKENESS)
-        others = [
-            j for j in alike if stacks[j][0] != key and len(stacks[j][1].frames) >= FRAMES_FOUND
-        ]
-        ask = _queries(stack.frames)
-        if not others or len(ask) < FRAMES_FOUND:
-            continue
-        frames = [_unit(stacks[j][1].frames) for j in others]
-        likeness = _unit(ask) @ np.concatenate(frames).T
-        starts = np.cumsum([0, *(len(some) for some in frames[:-1])])
-        hits = (np.maximum.reduceat(likeness, starts, axis=1) >= FRAME_LIKENESS).sum(axis=0)
-        for j, number in zip(others, hits.tolist(), strict=True):
+        for j in np.flatnonzero(patterns @ patterns[i] > PATTERN_LIKENESS):
+            other, its_stack = stacks[j]
+            number, exact = (0, False) if other == key else _shared(stack, its_stack)
             if number >= FRAMES_FOUND:
-                other = stacks[j][0]
                 pair = (key, other) if rank[key] < rank[other] else (other, key)
-                exact = stack.digest == stacks[j][1].digest or _shared(stack, stacks[j][1])[1]
                 part = found.setdefault(pair, {})
                 before = part.get(stack.distance_m, (0, False))
-                part[stack.distance_m] = max(before, (number, exact))
+                now = (number, exact or stack.digest == its_stack.digest)
+                part[stack.distance_m] = max(before, now)
     copies_found = []
     for (one, two), part in found.items():
         keys, exact = groups[one] + groups[two], all(same for _, same in part.values())

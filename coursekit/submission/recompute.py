@@ -26,6 +26,7 @@ RULES = Path(__file__).with_name("rubric.toml")
 WORDS = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding="utf-8"))
 LABELS: dict[str, str] = WORDS["labels"]  # of what is asked for, by topic
 MISTAKES: dict[str, str] = WORDS["mistakes"]
+WHY: dict[str, str] = WORDS["why"]  # a number that a mistake explains is wrong, by its code
 EXERCISE = ("distances_m", "slack_m", "frames", "window_px", "words", "tape_at_most_m")
 TOLERANCES = ("standard_errors", "error_of_an_error", "prediction", "prediction_factor", "near")
 FLAGS = ("least_sigma_d_px", "flat_exponent", "white", "pattern", "fastest_hz")
@@ -97,7 +98,7 @@ class WithError:
 class AtDistance:
     """One distance; None is what its raw depths do not say.
 
-    bias, std in mm. bias_se_mm holds the tape's error, bias_se_apart_mm does not. invalid: as a
+    bias, std in mm. bias_se_mm holds the tape's error, the error in bias does not. invalid: as a
     fraction; its standard error is that of a mean over frames.
     """
 
@@ -106,7 +107,6 @@ class AtDistance:
     stats: WindowStats
     bias: WithError | None
     bias_se_mm: float | None
-    bias_se_apart_mm: float | None
     std: WithError | None
     invalid: WithError
 
@@ -176,17 +176,14 @@ def _measured(stack: Stack, scale: float, tape: float) -> AtDistance:
     stack = replace(stack, counts=np.where(stack.counts == ends, 0, stack.counts))
     with np.errstate(all="ignore"):  # depths that no camera gives; what is not finite is dropped
         stats = window_stats(stack.counts, (0, 0, width, height), scale)
-    bias = _finite(1e3 * (stats.depth_m - stack.distance_m))
-    bias_se = _finite(1e3 * stats.depth_error_m)
-    std, std_se = _finite(1e3 * stats.pixel_std_m), _finite(1e3 * stats.pixel_std_error_m)
+    bias = _in_mm(stats.depth_m - stack.distance_m, stats.depth_error_m)
     return AtDistance(
         stack=stack,
         scale_m=scale,
         stats=stats,
-        bias=None if bias is None or bias_se is None else WithError(bias, bias_se),
-        bias_se_mm=None if bias_se is None else math.hypot(bias_se, 1e3 * tape),
-        bias_se_apart_mm=bias_se,
-        std=None if std is None or std_se is None else WithError(std, std_se),
+        bias=bias,
+        bias_se_mm=None if bias is None else math.hypot(bias.se, 1e3 * tape),
+        std=_in_mm(stats.pixel_std_m, stats.pixel_std_error_m),
         invalid=_invalid(stack),
     )
 
@@ -225,6 +222,7 @@ def _law(
     return (fit, "") if fits else (None, "the stds do not follow any law")
 
 
-def _finite(value: float) -> float | None:
-    """A number, or None in place of NaN and infinity."""
-    return float(value) if math.isfinite(value) else None
+def _in_mm(value_m: float, error_m: float) -> WithError | None:
+    """A length and its standard error in mm; None where one of them is NaN or infinite."""
+    found = WithError(1e3 * float(value_m), 1e3 * float(error_m))
+    return found if math.isfinite(found.value) and math.isfinite(found.se) else None

@@ -111,7 +111,6 @@ class ReportLine:
 
 def graded(file: str, grade: Grade, submission: Submission, page: str = "") -> ReportLine:
     """The line of a graded bundle; of its items what the class page and the table say."""
-    brief: dict[str, Any] = {"says": "", "claimed": None, "found": None, "tolerance": None}
     return ReportLine(
         file=file,
         student=grade.student,
@@ -119,7 +118,7 @@ def graded(file: str, grade: Grade, submission: Submission, page: str = "") -> R
         paragraph=submission.conclusion.paragraph,
         points=grade.points,
         of=grade.of,
-        items=tuple(replace(item, **brief) for item in grade.items),
+        items=tuple(replace(item, says="", tolerance=None) for item in grade.items),
         flags=grade.flags,
         page=page,
         fingerprint=grade.fingerprint,
@@ -236,17 +235,10 @@ def _comparison(grade: Grade, submission: Submission) -> Iterator[tuple[str, ...
         yield "", "std (mm)", claim, found
         percent = None if row.invalid_fraction is None else 100 * row.invalid_fraction
         yield "", "invalid (%)", _pair(percent), _pair(100 * m.invalid.value)
-    claim, found = (
-        _pair(claims.sigma_d_px, None, ".3f"),
-        _pair(getattr(law, "sigma_d_px", None), None, ".3f"),
-    )
+    sigma_d, ends = (law.sigma_d_px, law.sigma_d_interval_px) if law else (None, None)
+    claim, found = (_pair(value, None, ".3f") for value in (claims.sigma_d_px, sigma_d))
     yield "all", "σ_d (px)", claim, found
-    yield (
-        "",
-        "95 % (px)",
-        _ends(claims.sigma_d_interval_px),
-        _ends(getattr(law, "sigma_d_interval_px", None)),
-    )
+    yield "", "95 % (px)", _ends(claims.sigma_d_interval_px), _ends(ends)
 
 
 def _pair(
@@ -335,12 +327,7 @@ def _noise_figure(submission: Submission, found: Recomputed) -> dict[str, Any] |
         "x_ticks": [(axes.x(v), f"{v:.2g}") for v in _ticks(axes.low, axes.high, 6)],
         "y_ticks": [(axes.y(v), f"{v:.3g}") for v in _ticks(0, axes.top, 5)],
         "measured": [
-            (
-                axes.x(z),
-                axes.y(std),
-                axes.y(max(std - 2 * se, 0)),
-                axes.y(min(std + 2 * se, axes.top)),
-            )
+            (axes.x(z), *map(axes.y, (std, max(std - 2 * se, 0), min(std + 2 * se, axes.top))))
             for z, std, se in measured
             if std < LARGEST_MM
         ],

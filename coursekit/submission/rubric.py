@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from functools import partial
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from coursekit.submission.flags import Fingerprint, Flag, data_flags, fingerprin
 from coursekit.submission.format import Plot, Submission, TableRow
 from coursekit.submission.recompute import (
     LABELS,
+    WHY,
     AtDistance,
     Recomputed,
     grading_rules,
@@ -32,12 +34,7 @@ Judgement = Literal["right", "partial", "wrong", "missing"]
 SAME_DISTANCE_M = 0.005  # a row or a point of the plot belongs to the stack this near
 EXPLAINED_WITHIN = 0.03  # a wrong number is explained by a mistake that gives it to this part
 
-UNIT_OF = {
-    "sigma_d": " px",
-    "sigma_d_interval": " px",
-    "exponent": "",
-    "invalid": " %",
-}  # else mm
+UNIT_OF = {"sigma_d": " px", "sigma_d_interval": " px", "exponent": "", "invalid": " %"}  # else mm
 
 
 @dataclass(frozen=True)
@@ -45,7 +42,7 @@ class Item:
     """One thing that is asked for.
 
     name: "bias at 0.45 m"; topic: "bias". says: one sentence. mistake: a key of MISTAKES, or "".
-    claimed, found, tolerance: what was compared, in the claim's unit, where it is one number.
+    tolerance: by how much what was compared may be off, in the claim's unit.
     """
 
     name: str
@@ -55,8 +52,6 @@ class Item:
     verdict: Judgement
     says: str
     mistake: str = ""
-    claimed: float | None = None
-    found: float | None = None
     tolerance: float | None = None
 
 
@@ -82,12 +77,20 @@ class Grade:
 
 
 class _Mistake(NamedTuple):
-    """A value that a typical mistake gives, and how near a claim must be to be explained by it."""
+    """A value that a typical mistake gives, and how near a claim must be to be explained by it.
 
-    code: str
+    key: the mistake's code, and after a dot the way in which it was made, where there are several;
+    words.toml says why it is wrong. fact: what has to be filled in there.
+    """
+
+    key: str
     value: float
-    why: str
     within: float = 0.0
+    fact: str = ""
+
+    def why(self, topic: str) -> str:
+        """Why a claim about the topic is wrong."""
+        return (WHY.get(f"{topic}.{self.key}") or WHY[self.key]).format(self.fact)
 
 
 class _Question(NamedTuple):
@@ -109,7 +112,7 @@ class _Question(NamedTuple):
         says: str,
         mistake: str = "",
         part: float | None = None,
-        **compared: Any,
+        tolerance: float | None = None,
     ) -> Item:
         """The answer to it.
 
@@ -121,11 +124,11 @@ class _Question(NamedTuple):
             part = credit[mistake] if verdict == "partial" else float(verdict == "right")
         points = round(self.of * part, 2)
         name = LABELS[self.topic] + self.at
-        return Item(name, self.topic, points, self.of, verdict, says, mistake, **compared)
+        return Item(name, self.topic, points, self.of, verdict, says, mistake, tolerance)
 
-    def missing(self, why: str, **compared: Any) -> Item:
+    def missing(self, why: str) -> Item:
         """Nothing was answered."""
-        return self.item("missing", f"{self.name}: missing; {why}.", **compared)
+        return self.item("missing", f"{self.name}: missing; {why}.")
 
 
 def grade(submission: Submission) -> Grade:
@@ -241,14 +244,12 @@ def _bias(asked: _Question, _: Submission, m: AtDistance, claim: float) -> Item:
     tolerance = _tolerance("bias", m.bias.se)
 
     def mistakes() -> Iterator[_Mistake]:
-        yield _Mistake("sign", -found, "its sign is turned: bias is measured minus true", tolerance)
+        yield _Mistake("sign", -found, tolerance)
         yield from _other_units(found, tolerance, step)
-        percent = "it is in percent of the distance"
-        yield _Mistake("percent", 100 * found / z, percent, 100 * tolerance / z)
-        yield _Mistake("level", z + found, "it is the depth, not its error", 0.01 * z)
-        yield _Mistake("level", (z + found) / 1e3, "it is the depth, not its error", 1e-5 * z)
-        filled = float(m.stack.counts.mean()) * step - z
-        yield _Mistake("zeros", filled, "invalid pixels were averaged in as depths of 0", tolerance)
+        yield _Mistake("percent", 100 * found / z, 100 * tolerance / z)
+        yield _Mistake("level", z + found, 0.01 * z)
+        yield _Mistake("level", (z + found) / 1e3, 1e-5 * z)
+        yield _Mistake("zeros", float(m.stack.counts.mean()) * step - z, tolerance)
 
     return _judge(asked, claim, found, tolerance, mistakes)
 
@@ -258,22 +259,19 @@ def _bias_se(asked: _Question, submission: Submission, m: AtDistance, claim: flo
 
     With the tape's error or without it is right; it is itself known to a part only.
     """
-    if m.bias is None or m.bias_se_mm is None or m.bias_se_apart_mm is None:
+    if m.bias is None or m.bias_se_mm is None:
         return _unknown(asked, claim)
-    both, apart, tape = m.bias_se_mm, m.bias_se_apart_mm, 1e3 * submission.tape_sigma_m
+    both, apart, tape = m.bias_se_mm, m.bias.se, 1e3 * submission.tape_sigma_m
     n, pixels = m.stats.n_frames, m.stats.n_pixels
     std = m.std.value if m.std else math.nan
 
     def mistakes() -> Iterator[_Mistake]:
         if tape:
-            yield _Mistake("tape_only", tape, "it is the tape's error alone, without the camera's")
-        yield _Mistake("not_divided", std, "it is the std of a pixel, not the error of a mean")
-        why = "it takes all samples as independent, but neighbours share their noise and a pattern"
+            yield _Mistake("tape_only", tape)
+        yield _Mistake("not_divided", std)
         for samples in (n, n * pixels):
-            one = std / math.sqrt(samples)
-            yield _Mistake("independent", one, f"{why} stays in every frame")
-        mean = 1e3 * m.stats.mean_std_m
-        yield _Mistake("not_divided", mean, "it is the std of the window's mean, not its error")
+            yield _Mistake("independent", std / math.sqrt(samples))
+        yield _Mistake("not_divided.window", 1e3 * m.stats.mean_std_m)
         for se in (both, apart):
             yield from _other_units(se, 0.1 * se, 1e3 * m.scale_m)
 
@@ -305,28 +303,21 @@ def _std(asked: _Question, _: Submission, m: AtDistance, claim: float) -> Item:
         if stats.n_mismatches and often.any():
             variances = np.nanvar(m.z_mm[:, often], axis=0, ddof=1)
             value = math.sqrt(float(np.average(variances, weights=known.sum(axis=0)[often] - 1)))
-            why = f"it holds {left_out}, samples far from all others of their pixel: leave them out"
-            yield _Mistake("mismatches", value, why, 0.02 * value)
-        why = "it is corrected for rounding; the table wants it as measured"
-        yield _Mistake("unrounded", 1e3 * stats.pixel_std_unrounded_m, why)
+            yield _Mistake("mismatches", value, 0.02 * value, left_out)
+        yield _Mistake("unrounded", 1e3 * stats.pixel_std_unrounded_m)
         steady = m.z_mm[:, np.isfinite(m.z_mm).all(axis=0)]
         each = steady.std(axis=0, ddof=1) if n > 1 and steady.size else np.array([math.nan])
         for kind, value in (("mean", each.mean()), ("median", np.median(each))):
-            why = f"it is the {kind} of the pixels' stds; over pixels, variances are averaged"
-            yield _Mistake("unpooled", float(value), why, 0.005 * found)
-        why = "it is the std of the window's mean; the noise of one pixel is asked for"
-        yield _Mistake("of_the_mean", 1e3 * stats.mean_std_m, why)
-        why = "it was divided by the root of the number of frames: a standard error, not a std"
-        yield _Mistake("standard_error", found / math.sqrt(n), why)
-        yield _Mistake("variance", found**2, "it is a variance, the square of the std")
-        why = "it is the spread over the pixels of a frame; noise is the spread over time"
-        yield _Mistake("spatial", 1e3 * stats.spatial_std_m, why)
-        why = "it is the std of all samples at once, so it holds the pattern that stays"
-        yield _Mistake("mixed", float(m.z_mm[np.isfinite(m.z_mm)].std()), why)
-        filled, why = np.nan_to_num(m.z_mm), "invalid pixels were taken as depths of 0"
-        over_time = math.sqrt(filled.var(axis=0, ddof=1).mean()) if n > 1 else math.nan
-        yield _Mistake("zeros", over_time, why)
-        yield _Mistake("zeros", float(filled.std()), why)
+            yield _Mistake("unpooled", float(value), 0.005 * found, kind)
+        yield _Mistake("of_the_mean", 1e3 * stats.mean_std_m)
+        yield _Mistake("standard_error", found / math.sqrt(n))
+        yield _Mistake("variance", found**2)
+        yield _Mistake("spatial", 1e3 * stats.spatial_std_m)
+        yield _Mistake("mixed", float(m.z_mm[np.isfinite(m.z_mm)].std()))
+        filled = np.nan_to_num(m.z_mm)
+        if n > 1:
+            yield _Mistake("zeros", math.sqrt(filled.var(axis=0, ddof=1).mean()))
+        yield _Mistake("zeros", float(filled.std()))
 
     item = _judge(asked, claim, found, tolerance, mistakes)
     if stats.n_mismatches and item.mistake != "mismatches":
@@ -342,15 +333,11 @@ def _std_se(asked: _Question, _: Submission, m: AtDistance, claim: float) -> Ite
     n, pixels = m.stats.n_frames, m.stats.n_pixels
 
     def mistakes() -> Iterator[_Mistake]:
-        yield _Mistake("not_divided", std, "it is the std itself")
-        why = "it is the error of one pixel's std; the window has many pixels, though not all of "
-        why += "them independent"
-        yield _Mistake("one_pixel", std / math.sqrt(2 * max(n - 1, 1)), why)
-        why = "it is the error of a mean, std / sqrt(N); that of a std is std / sqrt(2 dof)"
-        yield _Mistake("one_pixel", std / math.sqrt(n), why)
-        why = "it takes all samples as independent, but neighbours share their noise"
-        yield _Mistake("independent", std / math.sqrt(2 * n * pixels), why)
-        yield _Mistake("independent", std / math.sqrt(n * pixels), why)
+        yield _Mistake("not_divided", std)
+        yield _Mistake("one_pixel", std / math.sqrt(2 * max(n - 1, 1)))
+        yield _Mistake("one_pixel.mean", std / math.sqrt(n))
+        yield _Mistake("independent", std / math.sqrt(2 * n * pixels))
+        yield _Mistake("independent", std / math.sqrt(n * pixels))
         yield from _other_units(found, 0.1 * found, 1e3 * m.scale_m)
 
     return _judge(asked, claim, found, _error_tolerance("std_se", found), mistakes)
@@ -361,17 +348,12 @@ def _invalid(asked: _Question, _: Submission, m: AtDistance, claim: float) -> It
     found, tolerance = m.invalid.value, _tolerance("invalid", m.invalid.se)
 
     def mistakes() -> Iterator[_Mistake]:
-        why = "it is in percent; a fraction lies between 0 and 1"
-        yield _Mistake("percent", 100 * found, why, 100 * tolerance)
-        yield _Mistake("complement", 1 - found, "it is the valid part, not the invalid", tolerance)
-        yield _Mistake("complement", 100 * (1 - found), "it is the valid part, in percent", 0.5)
+        yield _Mistake("percent", 100 * found, 100 * tolerance)
+        yield _Mistake("complement", 1 - found, tolerance)
+        yield _Mistake("complement.percent", 100 * (1 - found), 0.5)
         holes = m.stack.counts == 0
-        for axes, what in (
-            (0, "pixels that were ever invalid"),
-            ((1, 2), "frames that have a hole"),
-        ):
-            why = f"it counts {what}; asked for is the part of all samples"
-            yield _Mistake("ever", float(holes.any(axis=axes).mean()), why, tolerance)
+        yield _Mistake("ever", float(holes.any(axis=0).mean()), tolerance)
+        yield _Mistake("ever.frames", float(holes.any(axis=(1, 2)).mean()), tolerance)
 
     return _judge(asked, claim, found, tolerance, mistakes)
 
@@ -387,10 +369,9 @@ JUDGES: dict[str, tuple[str, Callable[[_Question, Submission, AtDistance, float]
 
 def _other_units(found: float, tolerance: float, step_mm: float) -> Iterator[_Mistake]:
     """Metres, and depth counts where these are no millimetres."""
-    yield _Mistake("metres", found / 1e3, "it is in metres: 1 m is 1000 mm", tolerance / 1e3)
+    yield _Mistake("metres", found / 1e3, tolerance / 1e3)
     if abs(step_mm - 1) > 0.01:
-        why = f"it is in depth counts, and a count is {step_mm:g} mm here"
-        yield _Mistake("counts", found / step_mm, why, tolerance / step_mm)
+        yield _Mistake("counts", found / step_mm, tolerance / step_mm, f"{step_mm:g}")
 
 
 # --- over all distances ---------------------------------------------------------------------------
@@ -506,8 +487,7 @@ def _sigma_d(asked: _Question, submission: Submission, found: Recomputed) -> Ite
 
     def mistakes() -> Iterator[_Mistake]:
         for factor in (1e3, 1e-3):
-            why = "millimetres and metres were mixed in sigma_Z fx B / Z²"
-            yield _Mistake("millimetres", factor * value, why, factor * tolerance)
+            yield _Mistake("millimetres", factor * value, factor * tolerance)
         product = camera.fx * (camera.baseline_m or 0.0)
         known = [m for m in found.at if m.std is not None]
 
@@ -515,14 +495,12 @@ def _sigma_d(asked: _Question, submission: Submission, found: Recomputed) -> Ite
             pairs = zip(stds_m, known, strict=True)
             return float(np.mean([std * product / m.distance_m**power for std, m in pairs]))
 
-        why = "it takes noise as proportional to Z, not to Z²"
-        yield _Mistake("not_squared", mean((m.stats.pixel_std_m for m in known), 1), why)
-        for code, stds, why in (
-            ("spatial", [m.stats.spatial_std_m for m in known], "the std over the pixels"),
-            ("of_the_mean", [m.stats.mean_std_m for m in known], "the std of the window's mean"),
+        yield _Mistake("not_squared", mean((m.stats.pixel_std_m for m in known), 1))
+        for key, stds in (
+            ("spatial", [m.stats.spatial_std_m for m in known]),
+            ("of_the_mean", [m.stats.mean_std_m for m in known]),
         ):
-            says = f"it is made from {why}; sigma_d is that of one pixel over time"
-            yield _Mistake(code, mean(stds, 2), says, 0.06 * mean(stds, 2))
+            yield _Mistake(key, mean(stds, 2), 0.06 * mean(stds, 2))
 
     return _judge(asked, claim, value, tolerance, mistakes)
 
@@ -548,33 +526,34 @@ def _exponent(asked: _Question, submission: Submission, found: Recomputed) -> It
         return asked.item("right", says)
     if free is None or free.exponent is None or free.exponent_interval is None:
         says = "Exponent: your raw depths give none to compare yours with."
-        return asked.item("missing", says, claimed=claim)
+        return asked.item("missing", says)
     if claim is None:
         says = "Exponent: there is an interval, but no exponent in it."
         return asked.item("partial", says, "incomplete")
     value, tolerance = free.exponent, _tolerance("exponent", _log_se(free, 1))
 
     def mistakes() -> Iterator[_Mistake]:
-        yield _Mistake("sign", -value, "its sign is turned: noise grows with distance", tolerance)
-        why = "it is that of the variance; the exponent of the std is half as large"
-        yield _Mistake("of_variance", 2 * value, why, tolerance)
+        yield _Mistake("sign", -value, tolerance)
+        yield _Mistake("of_variance", 2 * value, tolerance)
 
     item = _judge(asked, claim, value, tolerance, mistakes)
-    return _with_interval(asked, item, free, interval) if item.verdict == "right" else item
+    right = item.verdict == "right"
+    return _with_interval(asked, item, claim, free, interval) if right else item
 
 
-def _with_interval(asked: _Question, item: Item, free: NoiseFit, interval: Interval | None) -> Item:
+def _with_interval(
+    asked: _Question, item: Item, claim: float, free: NoiseFit, interval: Interval | None
+) -> Item:
     """The item of a right exponent, after a look at its interval."""
-    assert item.claimed is not None
     assert free.exponent_interval is not None
-    claim, (low, high) = item.claimed, free.exponent_interval
+    low, high = free.exponent_interval
     if interval is None:
         says = (
             f"Exponent: {claim:.2f} fits your raw depths, but without an interval it says more "
             f"than three distances can: they give {low:.2f} to {high:.2f}; quote that, or none."
         )
         return _kept(item, "no_interval", says)
-    ends = _judge_interval(asked, interval, free.exponent_interval, free, 1)
+    ends = _judge_interval(asked, interval, (low, high), free, 1)
     if ends.verdict == "right":
         says = (
             f"Exponent: you say {claim:.2f} ({interval[0]:.2f} to {interval[1]:.2f}), your raw "
@@ -613,13 +592,11 @@ def _judge_interval(
         return law.sigma_d_px / factor, law.sigma_d_px * factor
 
     wide, narrow = _log_se(law, i), _log_se(law, i, widened=False)
-    why = "it reaches one standard error to each side; 95 % takes about two"
-    others = [("one_sigma", about(se), why) for se in (wide, narrow)]
-    why = "the distances scatter about the law by more than their errors, and that widens it"
-    others.append(("not_widened", about(1.96 * narrow), why))
-    for mistake, ends, why in sorted(others, key=lambda other: _apart(claim, other[1])):
+    others = [("one_sigma", about(se)) for se in (wide, narrow)]
+    others.append(("not_widened", about(1.96 * narrow)))
+    for mistake, ends in sorted(others, key=lambda other: _apart(claim, other[1])):
         if _apart(claim, ends) <= 0.1 * (ends[1] - ends[0]) + _half_digit(topic):
-            says = f"{says}: wrong because {why}."
+            says = f"{says}: wrong because {WHY[mistake]}."
             return asked.item("partial", says, mistake, tolerance=tolerance)
     if off <= rule["near"] * tolerance:
         says = f"{says}: close, but not within that."
@@ -639,8 +616,7 @@ def _no_law(asked: _Question, claim: float | None, found: Recomputed) -> Item:
     if found.why_no_law.startswith("baseline_m"):
         says = f"{asked.name}: not counted; your camera does not say its baseline."
         return asked._replace(of=0.0).item("right" if claim is None else "missing", says)
-    says = f"{asked.name}: your raw depths give none ({found.why_no_law})."
-    return asked.item("missing", says, claimed=claim)
+    return asked.item("missing", f"{asked.name}: your raw depths give none ({found.why_no_law}).")
 
 
 # --- the conclusion -------------------------------------------------------------------------------
@@ -690,7 +666,7 @@ def _at_mounting(
     """
     at = np.array([m.distance_m for m in known])
     each = [m.bias.value for m in known if m.bias is not None]
-    errors = [m.bias_se_apart_mm or 0.0 for m in known]
+    errors = [m.bias.se for m in known if m.bias is not None]
     inside = float(np.clip(z, at[0], at[-1]))
     beyond = z / inside
     bias, se = float(np.interp(inside, at, each)) * beyond, float(np.interp(inside, at, errors))
@@ -727,17 +703,19 @@ def _judge(
         f"{asked.name}: you say {_shown(asked.topic, claim)}, your raw depths say "
         f"{_shown(asked.topic, found)} ({_accepted(asked.topic, tolerance)})"
     )
-    compared: dict[str, Any] = {"claimed": claim, "found": found, "tolerance": tolerance}
+    answer = partial(asked.item, tolerance=tolerance)
     off = abs(claim - found)
     if off <= tolerance:
-        return asked.item("right", f"{says}: right.", **compared)
-    for code, value, why, within in mistakes():
-        if abs(claim - value) <= max(within, EXPLAINED_WITHIN * abs(value)) < math.inf:
-            return asked.item("partial", f"{says}: wrong because {why}.", code, **compared)
+        return answer("right", f"{says}: right.")
+    for mistake in mistakes():
+        value = mistake.value
+        if abs(claim - value) <= max(mistake.within, EXPLAINED_WITHIN * abs(value)) < math.inf:
+            says, code = f"{says}: wrong because {mistake.why(asked.topic)}.", mistake.key
+            return answer("partial", says, code.partition(".")[0])
     if off <= grading_rules()["tolerance"]["near"] * tolerance:
-        return asked.item("partial", f"{says}: close, but not within that.", "close", **compared)
+        return answer("partial", f"{says}: close, but not within that.", "close")
     size = "large" if claim > found else "small"
-    return asked.item("wrong", f"{says}: wrong because it is too {size}.", **compared)
+    return answer("wrong", f"{says}: wrong because it is too {size}.")
 
 
 def _kept(item: Item, mistake: str, says: str) -> Item:
@@ -750,7 +728,7 @@ def _unknown(asked: _Question, claim: float) -> Item:
     """A claim about what the raw depths do not give."""
     said = _shown(asked.topic, claim)
     says = f"{asked.name}: you say {said}, but your raw depths do not give it."
-    return asked.item("wrong", says, claimed=claim)
+    return asked.item("wrong", says)
 
 
 def _half_digit(topic: str) -> float:

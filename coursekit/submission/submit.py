@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import wraps
 from pathlib import Path
 from typing import Any, Literal, ParamSpec, TypeVar, cast
@@ -40,10 +40,7 @@ from coursekit.words import counted
 
 MEASURED = "studio_1.measured"  # in results/
 LESSON_PREFIX = "depth_noise."  # of its checkpoints and exercises
-COLUMNS = (
-    *("depth_bias_mm", "depth_bias_se_mm", "depth_std_mm", "depth_std_se_mm"),
-    "invalid_fraction",
-)
+COLUMNS = [field.name for field in fields(TableRow)][1:]
 TABLE_UNITS = {  # of a quantity that is handed in, and what one of it is in the table's own
     "depth_bias": {"mm": 1.0, "m": 1e3},
     "depth_std": {"mm": 1.0, "m": 1e3},
