@@ -244,13 +244,9 @@ def distort(xy: ArrayLike, dist: ArrayLike) -> Floats:
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return np.stack(
-        [
-            x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-            y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
-        ],
-        axis=-1,
-    )
+    x_bent = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    y_bent = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+    return np.stack([x_bent, y_bent], axis=-1)
 
 
 def undistort(xy: ArrayLike, dist: ArrayLike) -> tuple[Floats, NDArray[np.bool_]]:

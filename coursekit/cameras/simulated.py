@@ -6,7 +6,7 @@ import zlib
 from collections.abc import Callable, Generator
 from dataclasses import replace
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -132,15 +132,10 @@ class SimulatedCamera(Camera):
         exposure: float | Literal["auto"] | None = None,
         depth_scale_m: float | None = None,
     ) -> str:
-        rig, scale_m = self._rig, self.depth_scale_m
-        if depth_scale_m is not None:
-            scale_m = check_depth_scale(depth_scale_m)
-        self._rig = replace(
-            rig,
-            ambient=rig.ambient if ambient is None else ambient,
-            exposure=rig.exposure if exposure is None else exposure,
-        )
-        self.depth_scale_m = scale_m
+        scale_m = self.depth_scale_m if depth_scale_m is None else check_depth_scale(depth_scale_m)
+        asked: dict[str, Any] = {"ambient": ambient, "exposure": exposure}
+        changed = {name: value for name, value in asked.items() if value is not None}
+        self._rig, self.depth_scale_m = replace(self._rig, **changed), scale_m
         self._start_afresh()
         fixed = self._rig.exposure
         return (
@@ -169,19 +164,10 @@ class SimulatedCamera(Camera):
         while not self._closed:
             view, color = _view(self._rig, self.scene), self.color_image()
             shot = view.frame(self._rng, self._drift_from_s + self._since_placed_s)
-            scale_m, number, eyes = self.depth_scale_m, self._given, (shot.left, shot.right)
-            depth, time_s = view.depth(shot, scale_m), number / FRAMES_PER_S
-            yield Frame(
-                depth,
-                color,
-                scale_m,
-                time_s,
-                number,
-                self.depth,
-                self.color,
-                self.T_color_depth,
-                eyes,
-            )
+            depth, scale_m = view.depth(shot, self.depth_scale_m), self.depth_scale_m
+            when, figures = self._given / FRAMES_PER_S, (self.depth, self.color, self.T_color_depth)
+            eyes = shot.left, shot.right
+            yield Frame(depth, color, scale_m, when, self._given, *figures, eyes)
 
     def color_image(self) -> Image:
         """The colour image (h, w, 3) of the next frame alone, which needs no stereo matching."""
@@ -243,12 +229,7 @@ def _true_lens(seed: int, reported: Intrinsics) -> Intrinsics:
     dx, dy = CENTRE_ERROR_PX * rng.standard_normal(2)
     radial = [mean + std * rng.standard_normal() for mean, std in RADIAL]
     missed = [*radial, *(TANGENTIAL * rng.standard_normal(2)), 0.0]
-    return replace(
-        reported,
-        fx=reported.fx * scale * (1 + aspect),
-        fy=reported.fy * scale * (1 - aspect),
-        cx=reported.cx + dx,
-        cy=reported.cy + dy,
-        model="brown_conrady",
-        coeffs=tuple(np.add(reported.coeffs, missed).tolist()),
-    )
+    fx, fy = reported.fx * scale * (1 + aspect), reported.fy * scale * (1 - aspect)
+    cx, cy = reported.cx + dx, reported.cy + dy
+    coeffs = tuple(np.add(reported.coeffs, missed).tolist())
+    return replace(reported, fx=fx, fy=fy, cx=cx, cy=cy, model="brown_conrady", coeffs=coeffs)

@@ -131,9 +131,7 @@ def _pixel(
 
 
 @njit(cache=True, error_model="numpy")
-def _map(
-    corners: Any, v: int, u: int, place: Any
-) -> tuple[float, float, float, float, float, float, float, float]:
+def _map(corners: Any, v: int, u: int, place: Any) -> tuple[float, ...]:
     """A pixel's middle on the sheet and its change across, down and in time, all in texels."""
     first, last = corners[0], corners[-1]
     X, Y = _middle(first[v, u], first[v, u + 1], first[v + 1, u], first[v + 1, u + 1])

@@ -172,12 +172,8 @@ def _shade(
     axis, sign = face // 2, 2.0 * (face % 2) - 1.0
     x, y, z = t * dx, t * dy, t
     lx, ly, lz = lamp[0] - x, lamp[1] - y, lamp[2] - z
-    normal_x, normal_y, normal_z = (
-        boxes[index, 6 + axis],
-        boxes[index, 9 + axis],
-        boxes[index, 12 + axis],
-    )
-    cosine = sign * (normal_x * lx + normal_y * ly + normal_z * lz)
+    nx, ny, nz = boxes[index, 6 + axis], boxes[index, 9 + axis], boxes[index, 12 + axis]
+    cosine = sign * (nx * lx + ny * ly + nz * lz)
     cosine = max(0.0, cosine) / math.sqrt(lx * lx + ly * ly + lz * lz)
     if cosine > 0.0 and not is_lit(boxes, index, x, y, z, lamp[0], lamp[1], lamp[2]):
         cosine *= IN_SHADOW

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any, Literal
 
@@ -501,8 +501,7 @@ class RigView:
 
     def __init__(self, rig: Rig, scene: Scene) -> None:
         self.rig, self.scene = rig, scene
-        where = (rig.left, rig.baseline_m, rig.baseline_error, rig.disparity_offset_px)
-        eyes = _light(scene, *where, rig.projector, rig.seed)
+        eyes = _light(scene, replace(rig, ambient=0.0, exposure="auto"))  # for all of these at once
         radiance = [laser + np.float32(rig.ambient * AMBIENT_UNIT) * room for laser, room in eyes]
         self.exposure_ms = _metered(radiance[0]) if rig.exposure == "auto" else rig.exposure
         grey = [np.float32(GREY_PER_MS * self.exposure_ms) * image for image in radiance]
@@ -565,31 +564,23 @@ def counts(
 
 
 @lru_cache(maxsize=2)
-def _light(
-    scene: Scene,
-    left: Intrinsics,
-    baseline_m: float,
-    baseline_error: float,
-    offset_px: float,
-    projector: bool,
-    seed: int,
-) -> list[tuple[FloatImage, FloatImage]]:
+def _light(scene: Scene, rig: Rig) -> list[tuple[FloatImage, FloatImage]]:
     """(laser, room) light (H, W) on each eye, of unit brightness, blurred by the lens."""
-    boxes = box_table(scene, None)
+    boxes, left = box_table(scene, None), rig.left
     skins = np.empty((len(scene), 4))
     for skin, box in zip(skins, scene, strict=True):
         skin[:3] = np.mean(box.color), box.specular, CONTRAST[box.texture]
         skin[3] = TEXTURES.index(box.texture)
-    place = np.array([PROJECTOR_AT * baseline_m, 0.0, 0.0, float(projector)])
+    place = np.array([PROJECTOR_AT * rig.baseline_m, 0.0, 0.0, float(rig.projector)])
     lens = np.array([left.fx, left.fy, left.cx, left.cy])
     lamp = (place, *_pattern(left.fx), _grain())
-    yaw = math.atan(offset_px / left.fx)
+    yaw = math.atan(rig.disparity_offset_px / left.fx)
     c, s = math.cos(yaw), math.sin(yaw)
     turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
     # Another scene, another speckle; the same scene, the same.
-    rng = np.random.default_rng([seed, zlib.crc32(boxes.tobytes())])
+    rng = np.random.default_rng([rig.seed, zlib.crc32(boxes.tobytes())])
     eyes = []
-    for eye, facing in ((0.0, np.eye(3)), (baseline_m * (1 + baseline_error), turn)):
+    for eye, facing in ((0.0, np.eye(3)), (rig.baseline_m * (1 + rig.baseline_error), turn)):
         laser, room = (np.empty(left.size[::-1], np.float32) for _ in range(2))
         render_eye(boxes, skins, np.array([eye, 0.0, 0.0]), facing, lens, lamp, laser, room)
         laser *= 1 + np.float32(SPECKLE) * _speckle(rng, laser.shape)
@@ -624,14 +615,9 @@ def _pattern(fx: float) -> tuple[Floats, Floats]:
     cell = DOT_SPACING_PX / fx
     columns, rows = (2 * math.ceil(half / cell) for half in PATTERN_HALF_TAN)
     j, i = np.indices((rows, columns))
-    dots = np.stack(
-        [
-            (i + 0.5 - columns / 2 + rng.uniform(-DOT_JITTER, DOT_JITTER, i.shape)) * cell,
-            (j + 0.5 - rows / 2 + rng.uniform(-DOT_JITTER, DOT_JITTER, i.shape)) * cell,
-            rng.uniform(DOT_FAINTEST, 1.0, i.shape),
-        ],
-        axis=-1,
-    )
+    x = (i + 0.5 - columns / 2 + rng.uniform(-DOT_JITTER, DOT_JITTER, i.shape)) * cell
+    y = (j + 0.5 - rows / 2 + rng.uniform(-DOT_JITTER, DOT_JITTER, i.shape)) * cell
+    dots = np.stack([x, y, rng.uniform(DOT_FAINTEST, 1.0, i.shape)], axis=-1)
     return dots, np.array([cell, DOT_SIGMA_PX / fx, BETWEEN_DOTS, SPECULAR_EXPONENT])
 
 
