@@ -158,9 +158,8 @@ class Arm:
         T = self._tool(frames, "gripper")
         flange, tip = frames[..., 6, :3, 3], T[..., :3, 3]
         camera = (T @ self.T_gripper_camera)[..., :3, 3]
-        lowest = np.concatenate(
-            [frames[..., 3:, 2, 3], tip[..., 2:], camera[..., 2:] - CAMERA_RADIUS_M], axis=-1
-        ).min(axis=-1)
+        heights = [frames[..., 3:, 2, 3], tip[..., 2:], camera[..., 2:] - CAMERA_RADIUS_M]
+        lowest = np.concatenate(heights, axis=-1).min(axis=-1)
         hand = np.stack([tip, (flange + tip) / 2, camera], axis=-2)
         column = np.broadcast_to([0.0, 0.0, 0.0], tip.shape), frames[..., 2, :3, 3]
         upper = frames[..., 2, :3, 3], frames[..., 3, :3, 3]
@@ -362,18 +361,11 @@ def fk_covariance(
     loose = by_joint * (errors.play_rad * (side == 0))[..., None, :]
     by_play = by_joint * side[..., None, :]
     by_link = _by_link(arm.link_frames(q), arm.forward(q))
-    shared = np.concatenate(
-        [by_joint, by_play, by_play.sum(axis=-1, keepdims=True), by_link], axis=-1
-    )
+    columns = [by_joint, by_play, by_play.sum(axis=-1, keepdims=True), by_link]
     common = np.sqrt(2 / np.pi)  # the mean of a half normal variable, over its root mean square
-    sigma = np.concatenate(
-        [
-            np.full(6, errors.offset_rad),
-            np.full(6, errors.play_rad * np.sqrt(1 - common**2)),
-            [errors.play_rad * common],
-            np.tile(np.repeat([errors.link_rad, errors.link_m], 3), 7),
-        ]
-    )
+    of_joints = [errors.offset_rad, errors.play_rad * np.sqrt(1 - common**2)]
+    of_origins = np.tile(np.repeat([errors.link_rad, errors.link_m], 3), 7)
+    sigma = np.concatenate([np.repeat(of_joints, 6), [errors.play_rad * common], of_origins])
     axes, origins = ("rx", "ry", "rz", "x", "y", "z"), (*arm.joints, "fingertip")
     names = (
         *(f"offset of {joint}" for joint in arm.joints),
@@ -381,7 +373,8 @@ def fk_covariance(
         "play of all joints",
         *(f"{axis} of {origin}" for origin in origins for axis in axes),
     )
-    return FkErrors(shared, sigma, names, loose @ np.swapaxes(loose, -1, -2))
+    each = loose @ np.swapaxes(loose, -1, -2)
+    return FkErrors(np.concatenate(columns, axis=-1), sigma, names, each)
 
 
 def _by_link(frames: Floats, T: Floats) -> Floats:

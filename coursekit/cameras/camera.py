@@ -136,11 +136,7 @@ class Camera(Description, ABC):
         return self.frames(1)[0]
 
     def record(
-        self,
-        path: str | os.PathLike[str],
-        n: int,
-        overwrite: bool = False,
-        infrared: bool = False,
+        self, path: str | os.PathLike[str], n: int, overwrite: bool = False, infrared: bool = False
     ) -> Path:
         """Record n frames to a .db3 file that `open_camera` plays back, and return its path.
 

@@ -10,29 +10,17 @@ from coursekit.simulation.arm_sessions import (
     touch_corners,
     truth_of,
 )
-from coursekit.simulation.board_images import render_board
-from coursekit.simulation.corner_sessions import Effects, Truth, corner_session
-from coursekit.simulation.rig import Rig, RigView, StereoFrame, cost_curve, match
-from coursekit.simulation.scenes import (
-    Box,
-    RenderResult,
-    Scene,
-    artefact_scene,
-    render,
-    tabletop,
-    wall_scene,
-)
+from coursekit.simulation.corner_sessions import Effects, corner_session
+from coursekit.simulation.rig import Rig, RigView, cost_curve, match
+from coursekit.simulation.scenes import Box, Scene, artefact_scene, render, tabletop, wall_scene
 
 __all__ = [
     "Box",
     "Effects",
     "HandEyeMistakes",
-    "RenderResult",
     "Rig",
     "RigView",
     "Scene",
-    "StereoFrame",
-    "Truth",
     "artefact_scene",
     "corner_session",
     "cost_curve",
@@ -40,7 +28,6 @@ __all__ = [
     "hand_eye_session",
     "match",
     "render",
-    "render_board",
     "shared_target",
     "tabletop",
     "touch_corners",

@@ -204,10 +204,7 @@ def hand_eye_session(
 
 
 def rendered_session(
-    mount: Mount,
-    seed: int,
-    n: int = 20,
-    arm_errors: ArmErrors | None = None,
+    mount: Mount, seed: int, n: int = 20, arm_errors: ArmErrors | None = None
 ) -> tuple[HandEyeSession, HandEyeTruth, list[Grey]]:
     """A healthy session of rendered images (h, w), whose corners `boards.detect` found.
 

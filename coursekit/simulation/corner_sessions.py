@@ -390,11 +390,7 @@ def bowed(board: Board, bow_m: float) -> Floats:
 
 
 def rolling_shutter(
-    points: Floats,
-    velocity: Floats,
-    readout_s: float,
-    rows: int,
-    see: Callable[[Floats], Floats],
+    points: Floats, velocity: Floats, readout_s: float, rows: int, see: Callable[[Floats], Floats]
 ) -> Floats:
     """Pixels (N, 2) of moving points, each at the time at which its row is read.
 

@@ -73,14 +73,13 @@ def _kept(values: Floats) -> Floats:
 Scene = tuple[Box, ...]
 
 
-def tabletop(distance_m: float = 0.45, wall_behind_m: float = 0.50, tilt_deg: float = 0.0) -> Scene:
+def tabletop(distance_m: float = 0.45, wall_behind_m: float = 0.50) -> Scene:
     """A wall, a table, a 60 mm block standing on it and a 25 mm cube beside the block.
 
     distance_m: Z of the block's front face, m; the face is parallel to the image plane of a camera
     at the scene's origin, its centre on the optical axis. wall_behind_m: from that face to the
-    wall, m, at least 0.10. tilt_deg: turns the wall as in `wall_scene`. Returns the four boxes, in
-    this order: "wall", "table", "60 mm block", "25 mm cube". Raises ValueError for a distance that
-    is not positive.
+    wall, m, at least 0.10. Returns the four boxes, in this order: "wall", "table", "60 mm block",
+    "25 mm cube". Raises ValueError for a distance that is not positive.
 
     >>> [box.name for box in tabletop(0.45)]
     ['wall', 'table', '60 mm block', '25 mm cube']
@@ -91,18 +90,11 @@ def tabletop(distance_m: float = 0.45, wall_behind_m: float = 0.50, tilt_deg: fl
     front, back = min(0.20, 0.6 * distance), distance + behind - 0.02
     table_size, table_middle = (2.00, TABLE_THICK_M, back - front), (back + front) / 2
     table = _box("table", table_size, (0.0, top + TABLE_THICK_M / 2, table_middle), MAPLE, "wood")
+    block_at = (0.0, top - BLOCK_M / 2, distance + BLOCK_M / 2)
+    block = _box("60 mm block", 3 * (BLOCK_M,), block_at, ALUMINIUM)
     cube_at = (0.075, top - CUBE_M / 2, distance + 0.015)
-    return (
-        _wall(distance + behind, tilt_deg),
-        table,
-        _box(
-            "60 mm block",
-            3 * (BLOCK_M,),
-            (0.0, top - BLOCK_M / 2, distance + BLOCK_M / 2),
-            ALUMINIUM,
-        ),
-        _box("25 mm cube", 3 * (CUBE_M,), cube_at, ORANGE, rotation=turned),
-    )
+    cube = _box("25 mm cube", 3 * (CUBE_M,), cube_at, ORANGE, rotation=turned)
+    return _wall(distance + behind, 0.0), table, block, cube
 
 
 def wall_scene(distance_m: float = 1.0, tilt_deg: float = 7.0) -> Scene:
@@ -149,8 +141,7 @@ def _wall(distance: float, tilt_deg: float) -> Box:
     """A wall of 100 mm whose front crosses the optical axis at this Z."""
     number("tilt_deg", tilt_deg)
     want(abs(tilt_deg) < 60, "tilt_deg", tilt_deg, "less than 60 degrees to either side")
-    turned = Rotation.from_euler("y", -tilt_deg, degrees=True)
-    thick = 0.10
+    turned, thick = Rotation.from_euler("y", -tilt_deg, degrees=True), 0.10
     center = np.array([0.0, 0.0, distance]) + turned.apply([0.0, 0.0, thick / 2])
     size = (8.0 * distance, 5.0 * distance, thick)
     return _box("wall", size, tuple(center), WALL_PAINT, texture="grid", rotation=turned)
