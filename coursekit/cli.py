@@ -90,7 +90,8 @@ def _parser() -> argparse.ArgumentParser:
 
     _add_export(command)
 
-    the = command("doctor", _doctor, "say what works here, and what to do about the rest")
+    says = "say what works here, and what to do about the rest"
+    the = command("doctor", lambda options: doctor.run(options.camera), says)
     the.add_argument("--camera", default="auto", metavar="WHICH", help=CAMERAS)
     return parser
 
@@ -165,10 +166,6 @@ def _grade(options: argparse.Namespace) -> None:
 
     where = options.folder, options.out
     print(grade_folder(*where, options.workers, options.timeout, overwrite=options.overwrite))
-
-
-def _doctor(options: argparse.Namespace) -> int:
-    return doctor.run(options.camera)
 
 
 if __name__ == "__main__":

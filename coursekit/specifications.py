@@ -83,8 +83,8 @@ class PublishedNoise:
 
     camera: str
     quantity: str
-    distances_m: tuple[float, ...]
-    std_mm: tuple[float, ...]
+    distances_m: list[float]
+    std_mm: list[float]
     source: str
 
 
@@ -125,13 +125,10 @@ def published_noise() -> list[PublishedNoise]:
     >>> [(len(series.distances_m), series.camera) for series in published_noise()]
     [(6, 'D435'), (5, 'D435')]
     """
-    published = []
-    for entry in json.loads((DATA / "published_depth_noise.json").read_text("utf-8"))["series"]:
-        if "std_mm" in entry:
-            known: dict[str, Any] = {key: entry[key] for key in PublishedNoise.__dataclass_fields__}
-            known |= {key: tuple(known[key]) for key in ("distances_m", "std_mm")}
-            published.append(PublishedNoise(**known))
-    return published
+    series = json.loads((DATA / "published_depth_noise.json").read_text("utf-8"))["series"]
+    known = [entry for entry in series if "std_mm" in entry]
+    names = PublishedNoise.__dataclass_fields__
+    return [PublishedNoise(**{name: entry[name] for name in names}) for entry in known]
 
 
 @cache
