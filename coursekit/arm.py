@@ -110,12 +110,12 @@ class Arm:
         **tool's origin** (m per rad), so a small step gives R <- exp(omega) R, t <- t + v.
         """
         frames = self.link_frames(q)
-        return self._jacobian(frames, self._tool(frames, tool))
+        return self.jacobian_at(frames, self._tool(frames, tool)[..., :3, 3])
 
-    def _jacobian(self, frames: Floats, T: Floats) -> Floats:
-        """`jacobian` of a tool at T (..., 4, 4) from the links' frames (..., 7, 4, 4)."""
+    def jacobian_at(self, frames: Floats, at: Floats) -> Floats:
+        """`jacobian` of a tool at (..., 3), m, from the links' frames (..., 7, 4, 4)."""
         axes = (frames[..., 1:, :3, :3] @ self.axes[:, :, None])[..., 0]
-        arms = T[..., None, :3, 3] - frames[..., 1:, :3, 3]
+        arms = at[..., None, :] - frames[..., 1:, :3, 3]
         return np.swapaxes(np.concatenate([axes, np.cross(axes, arms)], axis=-1), -1, -2)
 
     def _tool(self, frames: Floats, tool: Tool) -> Floats:
@@ -225,7 +225,7 @@ class Arm:
             if there.all():
                 break
             open_ = open_[~there]
-            step = _damped_step(self._jacobian(frames, T)[~there], miss[~there])
+            step = _damped_step(self.jacobian_at(frames, T[..., :3, 3])[~there], miss[~there])
             q[open_] = self._into_limits(q[open_] + step)
         return q, reached
 
@@ -404,9 +404,7 @@ def load_side(arm: Arm, q: ArrayLike) -> Floats:
     """
     frames = arm.link_frames(q)
     weight = frames[..., 6, :3, 3] + frames[..., 6, :3, :3] @ arm.T_flange_gripper[:3, 3] / 2
-    axes = (frames[..., 1:, :3, :3] @ arm.axes[:, :, None])[..., 0]
-    levers = weight[..., None, :] - frames[..., 1:, :3, 3]
-    arms = -np.cross(axes, levers)[..., 2]  # axis . (lever x down), positive where it turns along
+    arms = -arm.jacobian_at(frames, weight)[..., 5, :]  # positive where the joint turns it down
     return np.where(np.abs(arms) > GRAVITY_ARM_M, np.sign(arms), 0.0)
 
 
@@ -452,12 +450,9 @@ class SimulatedArm:
     nominal: the arm as drawn, whose `forward` at the reported angles is all that a user has.
     """
 
-    def __init__(
-        self, seed: int, errors: ArmErrors | None = None, nominal: Arm | None = None
-    ) -> None:
-        self.nominal = nominal or widowx()
-        self.errors = errors or ArmErrors()
-        rng, size = np.random.default_rng([seed, zlib.crc32(b"arm")]), self.errors
+    def __init__(self, seed: int, errors: ArmErrors | None = None) -> None:
+        self.nominal = widowx()
+        rng, size = np.random.default_rng([seed, zlib.crc32(b"arm")]), errors or ArmErrors()
         offset = size.offset_rad * rng.standard_normal(6)
         play = size.play_rad * np.abs(rng.standard_normal(6))
         link = np.repeat([size.link_rad, size.link_m], 3) * rng.standard_normal((7, 6))

@@ -93,12 +93,8 @@ class Intrinsics:
         from scipy.optimize import least_squares
 
         known = "none, brown_conrady or inverse_brown_conrady"
-        want(
-            self.model != "modified_brown_conrady" or not any(self.coeffs),
-            "model",
-            self.model,
-            known,
-        )
+        fits = self.model != "modified_brown_conrady" or not any(self.coeffs)
+        want(fits, "model", self.model, known)
         if self.model != "inverse_brown_conrady" and (k3 or not self.coeffs[4]):
             return self
         rays, seen = self._rays()
@@ -412,7 +408,11 @@ def invert_transform(T: ArrayLike) -> Floats:
     >>> print(invert_transform(T_base_camera)[:3, 3])
     [-0.1  0.   0.4]
     """
-    T = transforms("T", T)
+    return inverse_of(transforms("T", T))
+
+
+def inverse_of(T: Floats) -> Floats:
+    """As `invert_transform`, without its checks: a search inverts a hundred thousand."""
     inverse = np.zeros_like(T)
     inverse[..., :3, :3] = np.swapaxes(T[..., :3, :3], -1, -2)
     inverse[..., :3, 3:] = -inverse[..., :3, :3] @ T[..., :3, 3:]
@@ -488,10 +488,7 @@ def moved(T: Floats, twists: Floats) -> Floats:
     exp(xi) has R = exp(omega), rad, and t = v, m; T turns about the frame's origin and not, as in
     `turned`, about its own.
     """
-    step = np.broadcast_to(np.eye(4), T.shape).copy()
-    step[:, :3, :3] = Rotation.from_rotvec(twists[:, :3]).as_matrix()
-    step[:, :3, 3] = twists[:, 3:]
-    return step @ T
+    return turned(np.eye(4), twists) @ T
 
 
 # --- what a camera's numbers must be ---

@@ -7,11 +7,10 @@ along whole, and `export` writes them as other programs read them.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import platform
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -310,10 +309,11 @@ def _exportable(what: Any) -> Intrinsics | Placement:
         result = read(path)
     except ValueError:  # no result of a notebook: a lens, whose reader says what else it is
         return Intrinsics.from_file(path)
-    whole = result.lens or result.placement
-    again = f"{path.name}: holds no lens and no place of a camera, as notebooks 03 and 04 keep them"
-    if whole is None:
-        raise ValueError(f"{again}; of an older course, run the notebook again")
+    if not (whole := result.lens or result.placement):
+        raise ValueError(
+            f"{path.name}: holds no lens and no place of a camera, as notebooks 03 and 04 keep "
+            "them; of an older course, run the notebook again"
+        )
     return whole
 
 
@@ -344,14 +344,11 @@ def _place_text(
                 f"else as `ros2 run tf2_ros tf2_echo {link} {optical}` says it, for it may be "
                 "centimetres (a D435's colour camera is 15 mm beside its camera_link)"
             )
-        T = (
-            OPTICAL_TURN
-            if isinstance(T_link_optical, str) and T_link_optical == "turn"
-            else T_link_optical
-        )
-        if isinstance(T, str):
-            values = numbers(T.split(), "T_link_optical")
-            T = pose_files.posed(values, "T_link_optical")
+        T = T_link_optical
+        if isinstance(T, str) and T == "turn":
+            T = OPTICAL_TURN
+        elif isinstance(T, str):
+            T = pose_files.posed(numbers(T.split(), "T_link_optical"), "T_link_optical")
         placed = placed.of_link(link, checks.transform("T_link_optical", T))
         notes = [f"of {link}, which carries {optical}: X inv(T_link_optical)"]
     if to == "json":
@@ -368,24 +365,15 @@ def _place_text(
 
 def write_json(path: Path, content: Any) -> None:
     """Write JSON to a file beside `path`, then rename it: never half a file."""
-    text = json.dumps(content, indent=1, allow_nan=False) + "\n"
-    with _whole(path) as part:
-        part.write_text(text, encoding="utf-8")
+    write_bytes(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
 
 
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file beside `path`, then rename it: never half a file."""
-    with _whole(path) as part:
-        part.write_bytes(content)
-
-
-@contextlib.contextmanager
-def _whole(path: Path) -> Iterator[Path]:
-    """A file to write beside `path`, which becomes `path` if all goes well."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        yield part
+        part.write_bytes(content)
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)

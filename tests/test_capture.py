@@ -166,7 +166,7 @@ def test_the_simulated_camera_is_moved_and_says_so(tmp_path, capsys):
 def test_twenty_guided_views_lack_nothing_and_determine_the_lens(board, tmp_path):
     camera = SimulatedCamera()
     seen = capture(camera, board, 20, tmp_path)
-    assert guidance(seen, board, LENS.size, camera.color).missing == ()
+    assert guidance(seen, board, camera.color).missing == ()
     lens = camera.reveal().color_lens
     points = [board.points[view.ids].astype(np.float32) for view in seen]
     pixels = [view.pixels.astype(np.float32) for view in seen]
@@ -373,7 +373,7 @@ def session(poses, board=BOARD):
 
 @pytest.mark.parametrize("board", [BOARD, CHECKERS], ids=kind)
 def test_an_empty_session_lacks_everything_and_the_first_view_is_one_that_can_be_taken(board):
-    guide = guidance([], board, LENS.size, LENS)
+    guide = guidance([], board, LENS)
     kinds = [text.split(":")[0] for text in guide.missing]
     assert kinds == ["coverage", "tilt", "tilt", "tilt", "tilt", "distance"]
     image = render_board(board, guide.target, LENS, np.random.default_rng(0))
@@ -382,12 +382,12 @@ def test_an_empty_session_lacks_everything_and_the_first_view_is_one_that_can_be
 
 def test_a_careful_session_lacks_nothing():
     views, _ = corner_session(BOARD, LENS, seed=1, views=40)
-    assert guidance(views, BOARD, LENS.size, LENS).missing == ()
+    assert guidance(views, BOARD, LENS).missing == ()
 
 
 def test_flat_views_lack_all_tilts():
     flat = [pose((0, 0, 10 * n), (0.02 * n - 0.05, 0.0, 0.3 + 0.05 * n)) for n in range(6)]
-    lacks = guidance(session(flat), BOARD, LENS.size, LENS).missing
+    lacks = guidance(session(flat), BOARD, LENS).missing
     assert [text for text in lacks if text.startswith("tilt")] == [
         f"tilt: {edge} edge away, 0 of 3 views" for edge in ("left", "right", "top", "bottom")
     ]
@@ -399,14 +399,14 @@ def test_a_tilt_counts_for_the_edge_that_is_farther_away(angles_deg):
     farthest = BOARD.points[transform_points(T, BOARD.points)[:, 2].argmax()] - BOARD.middle
     axis = 0 if angles_deg[1] else 1
     away = (("left", "right"), ("top", "bottom"))[axis][int(farthest[axis] > 0)]
-    lacks = guidance(session([T] * 3), BOARD, LENS.size, LENS).missing
+    lacks = guidance(session([T] * 3), BOARD, LENS).missing
     lacking = {text.split()[1] for text in lacks if text.startswith("tilt")}
     assert lacking == {"left", "right", "top", "bottom"} - {away}
 
 
 def test_views_at_one_distance_and_in_one_corner_are_named():
     corner = [pose((5 * n, 0, 0), (-0.12, -0.09, 0.5)) for n in range(4)]
-    lacks = guidance(session(corner), BOARD, LENS.size, LENS).missing
+    lacks = guidance(session(corner), BOARD, LENS).missing
     assert "distance: all views between 0.50 and 0.50 m" in lacks
     (coverage,) = (text for text in lacks if text.startswith("coverage"))
     assert coverage.split("most ")[1] in ("at the bottom", "at the bottom right", "at the right")
@@ -416,14 +416,14 @@ def test_blurred_views_are_named():
     views, _ = corner_session(BOARD, LENS, seed=1, views=10)
     blurs = [(0.4 + 4.0 * (number < 2)) * np.eye(2) for number in range(10)]
     views = [Detection(v.ids, v.pixels, v.size, blur=b) for v, b in zip(views, blurs, strict=True)]
-    lacks = guidance(views, BOARD, LENS.size, LENS).missing
+    lacks = guidance(views, BOARD, LENS).missing
     assert "sharpness: 2 of 10 views are blurred" in lacks
 
 
 def test_the_words_describe_the_target():
     seen = []
     for _ in range(12):
-        guide = guidance(session(seen), BOARD, LENS.size, LENS)
+        guide = guidance(session(seen), BOARD, LENS)
         middle = transform_points(guide.target, BOARD.middle)
         assert f"{middle[2]:.2f} m from the camera" in guide.next
         u, v = project(middle, LENS.K)
@@ -436,14 +436,12 @@ def test_the_words_describe_the_target():
         seen.append(guide.target)
 
 
-def test_guidance_is_a_pure_function_and_needs_no_lens():
+def test_guidance_is_a_pure_function():
     views = session(POSES)
-    one, two = (guidance(views, BOARD, LENS.size) for _ in range(2))
+    one, two = (guidance(views, BOARD, LENS) for _ in range(2))
     assert repr(one) == repr(two)
     np.testing.assert_array_equal(one.target, two.target)
     assert repr(one).startswith("Still missing: coverage: ")
-    with pytest.raises(ValueError, match=r"^lens: got one for \(640, 480\) px, want \(848, 480\)"):
-        guidance(views, BOARD, (848, 480), LENS)
 
 
 def test_the_outline_is_the_pattern_s_edge():
@@ -461,7 +459,7 @@ def test_the_live_image_shows_what_is_seen_taken_and_wanted(capsys):
     live = LiveImage(BOARD, LENS, 28)
     assert capsys.readouterr() == ("", "")  # a widget that prints while it is built shows nothing
     views = session(POSES[:2])
-    guide = guidance(views[:1], BOARD, LENS.size, LENS)
+    guide = guidance(views[:1], BOARD, LENS)
     live.say("Locked exposure at 8 ms.")
     black = np.zeros((480, 640), np.uint8)
     live.show(Sight(black, views[1], guide, views[:1]))

@@ -67,11 +67,8 @@ PROPOSED_SHARE = 0.75  # of a ChArUco board's corners; a checkerboard must be se
 AWAY = ("right", "bottom right", "bottom", "bottom left", "left", "top left", "top", "top right")
 
 
-WANTED_COLOR, SEEN_COLOR, TAKEN_COLOR = (
-    (0, 159, 230),
-    (115, 158, 0),
-    (233, 180, 86),
-)  # Okabe-Ito, in BGR
+# Okabe-Ito, in BGR
+WANTED_COLOR, SEEN_COLOR, TAKEN_COLOR = (0, 159, 230), (115, 158, 0), (233, 180, 86)
 LINE_PX = 2
 
 
@@ -113,10 +110,15 @@ def capture(
                     shots = _moved(camera, camera.color, album, screen)
                 else:
                     shots = _held(camera, camera.color, album, screen, timeout_s)
-                _collect(album, shots, views)
+                with contextlib.closing(shots):
+                    while len(album.views) < views and (shot := next(shots, None)):
+                        album.add(shot)
         except KeyboardInterrupt:
             if not album.views:
                 raise
+        except CameraError as error:
+            kept = f"{len(album.views)} views are kept in {album.folder}; capture goes on from them"
+            raise CameraError(f"{error}. {kept}", error.frames) from error
     print(_summary(camera, album, views, before))
     return Detections(album.views, album.skipped)
 
@@ -126,17 +128,6 @@ class Shot(NamedTuple):
 
     image: Image
     detection: Detection
-
-
-def _collect(album: Album, shots: Generator[Shot, None, None], views: int) -> None:
-    """Save shots until there are so many views; what stops them says what is kept."""
-    try:
-        with contextlib.closing(shots):
-            while len(album.views) < views and (shot := next(shots, None)):
-                album.add(shot)
-    except CameraError as error:
-        kept = f"{len(album.views)} views are kept in {album.folder}; capture goes on from them"
-        raise CameraError(f"{error}. {kept}", error.frames) from error
 
 
 def _summary(camera: Camera, album: Album, views: int, before: int) -> str:
@@ -161,7 +152,7 @@ def _moved(
     """Views of the simulated camera, moved to where the guidance wants it."""
     board = album.board
     while True:
-        wanted = guidance(album.views, board, lens.size, lens)
+        wanted = guidance(album.views, board, lens)
         rng = np.random.default_rng([zlib.crc32(camera.serial.encode()), len(album.views)])
         for _ in range(HAND_TRIES):
             camera.show_board(board, _by_hand(wanted.target, board, rng))
@@ -192,7 +183,7 @@ def _held(
     screen.say(camera.lock())
     board = album.board
     waiting = _Waiting(board, timeout_s)
-    wanted = guidance(album.views, board, lens.size, lens)
+    wanted = guidance(album.views, board, lens)
     with contextlib.closing(camera.stream()) as stream:
         for frame in stream:
             if frame.color is None:
@@ -204,7 +195,7 @@ def _held(
             if detection is not None and waiting.is_over(detection, album.views):
                 yield Shot(image, detection)
                 waiting.start_again(frame.time_s)
-                wanted = guidance(album.views, board, lens.size, lens)
+                wanted = guidance(album.views, board, lens)
 
 
 def is_still(run: Sequence[Detection]) -> bool:
@@ -405,29 +396,17 @@ class _View:
         return (0, 0) if self.tilt_deg < FLAT_DEG else (1 + steep, self.away)
 
 
-def guidance(
-    detections: Sequence[Detection],
-    board: Board,
-    size: tuple[int, int],
-    lens: Intrinsics | None = None,
-) -> Guidance:
+def guidance(detections: Sequence[Detection], board: Board, lens: Intrinsics) -> Guidance:
     """What these views still lack, and the view that would add most to them.
 
-    size: (width, height) of the images, px. lens: roughly the camera's, such as the factory's; None
-    stands for a field of view of 53 degrees, which will do for the words but not for the metres.
-    The same arguments give the same answer. Raises ValueError for a lens of another size, and when
-    the board does not fit into the image at any distance.
+    lens: roughly the camera's, such as the factory's. The same arguments give the same answer.
+    Raises ValueError when the board does not fit into the image at any distance.
     """
-    width, height = size
-    if lens is None:
-        lens = Intrinsics(width, height, width, width, (width - 1) / 2, (height - 1) / 2)
-    if lens.size != (width, height):
-        raise ValueError(f"lens: got one for {lens.size} px, want {(width, height)} as the images")
     views = [_seen(detection, board, lens) for detection in detections]
     best = _most_useful(views, _proposals(board, lens))
     missing = [_coverage_lack(views), *_tilt_lacks(views), _distance_lack(views)]
     missing.append(_sharpness_lack(detections))
-    return Guidance(tuple(filter(None, missing)), _in_words(best, size), best.T_camera_board)
+    return Guidance(tuple(filter(None, missing)), _in_words(best, lens.size), best.T_camera_board)
 
 
 def outline(board: Board, T_camera_board: Floats, lens: Intrinsics) -> Floats:
@@ -452,14 +431,11 @@ def _coverage_lack(views: Sequence[_View]) -> str:
 
 def _tilt_lacks(views: Sequence[_View]) -> list[str]:
     sine = np.sin(np.radians(TILTED_DEG))
-    slopes = np.array([view.normal[:2] for view in views]).reshape(-1, 2)
-    lacks = []
-    for axis, edges in ((0, ("left", "right")), (1, ("top", "bottom"))):
-        for edge, side in zip(edges, (1, -1), strict=True):
-            have = int((side * slopes[:, axis] > sine).sum())
-            if have < TILTED_VIEWS:
-                lacks.append(f"tilt: {edge} edge away, {have} of {TILTED_VIEWS} views")
-    return lacks
+    across, down = np.array([view.normal[:2] for view in views]).reshape(-1, 2).T
+    slopes = {"left": across, "right": -across, "top": down, "bottom": -down}
+    have = {edge: int((slope > sine).sum()) for edge, slope in slopes.items()}
+    few = {edge: n for edge, n in have.items() if n < TILTED_VIEWS}
+    return [f"tilt: {edge} edge away, {n} of {TILTED_VIEWS} views" for edge, n in few.items()]
 
 
 def _distance_lack(views: Sequence[_View]) -> str:
@@ -523,17 +499,17 @@ def _aimed(
     """The view nearest to this aim of the board's middle that shows enough of the board."""
     needed = PROPOSED_SHARE if board.kind == "charuco" else 1.0
 
-    def shown(T: Floats) -> Bools:
-        return seen(board.points, T, lens, ROOM_PX)
+    def shown(T: Floats) -> Floats:
+        return board.points[seen(board.points, T, lens, ROOM_PX)]
+
+    def enough(T: Floats) -> bool:
+        return len(shown(T)) / len(board.points) >= needed
 
     R = facing.as_matrix() @ board.T_board_sheet[:3, :3].T
-    T = slide_into_view(
-        aim_px, distance_m, R, board.middle, lens, lambda T: bool(shown(T).mean() >= needed), 11
-    )
+    T = slide_into_view(aim_px, distance_m, R, board.middle, lens, enough, 11)
     if T is None:
         return None
-    pixels = project(through(T, board.points[shown(T)]), lens.K, lens.dist)
-    return _view(T, pixels, board, lens)
+    return _view(T, project(through(T, shown(T)), lens.K, lens.dist), board, lens)
 
 
 def _seen(detection: Detection, board: Board, lens: Intrinsics) -> _View:
@@ -627,12 +603,10 @@ class LiveImage(Screen):
         self._said = text
 
     def show(self, sight: Sight) -> None:
-        self._image.value = _jpeg(
-            draw(sight, outline(self._board, sight.wanted.target, self._lens))
-        )
-        count = f"<b>{len(sight.taken)} of {self._views} views.</b>"
-        lines = [f"{count} {html.escape(self._said)}"]
-        lines.append(f"<b>Next:</b> {html.escape(sight.wanted.next)}.")
+        ring = outline(self._board, sight.wanted.target, self._lens)
+        self._image.value = _jpeg(draw(sight, ring))
+        count = f"<b>{len(sight.taken)} of {self._views} views.</b> {html.escape(self._said)}"
+        lines = [count, f"<b>Next:</b> {html.escape(sight.wanted.next)}."]
         lines += [html.escape(f"Missing: {text}") for text in sight.wanted.missing]
         if sight.detection is None:
             lines.append(f"<i>{html.escape(sight.why)}</i>")

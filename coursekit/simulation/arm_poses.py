@@ -20,7 +20,7 @@ from coursekit.arrays import ArrayLike, Bools, Floats, Integers
 from coursekit.boards import Board
 from coursekit.boards.board import seen
 from coursekit.checks import choice, number, transform, transforms, whole
-from coursekit.geometry import Intrinsics, invert_transform, make_transform
+from coursekit.geometry import Intrinsics, inverse_of, invert_transform, make_transform
 from coursekit.hand_eye.poses import MOUNTS, Mount
 from coursekit.specifications import DATA
 
@@ -64,13 +64,10 @@ def board_in_gripper(board: Board) -> Floats:
     return make_transform(R, np.array([FINGERS_M + half, 0.0, 0.0]) - R @ board.middle)
 
 
-def over_the_shoulder(
-    at_m: tuple[float, float, float] = (-0.12, 0.18, 0.75),
-    looks_at_m: tuple[float, float, float] = (0.28, 0.0, 0.25),
-) -> Floats:
+def over_the_shoulder() -> Floats:
     """T_base_camera (4, 4) of a camera beside and above the arm's shoulder, its image upright."""
-    at = np.array(at_m)
-    forward = np.array(looks_at_m) - at
+    at = np.array([-0.12, 0.18, 0.75])
+    forward = np.array([0.28, 0.0, 0.25]) - at
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -151,8 +148,8 @@ class Setup:
 
     def _seen(self, T: Floats) -> Floats:
         """As `T_camera_board`, without its check."""
-        arm = _inverse(T) if self.mount == "eye_in_hand" else T
-        return _inverse(self.X) @ arm @ self.Y
+        arm = inverse_of(T) if self.mount == "eye_in_hand" else T
+        return inverse_of(self.X) @ arm @ self.Y
 
     def _faces(self, T: Floats) -> Bools:
         """(n,): whether the board is in front, little enough turned, and its squares large."""
@@ -168,15 +165,6 @@ class Setup:
             & (side_px >= SMALLEST_SQUARE_PX)
             & (self.upright(T) >= 1 + 2 * np.cos(self.turn_rad))
         )
-
-
-def _inverse(T: Floats) -> Floats:
-    """As `invert_transform`, without its checks: a search inverts a hundred thousand."""
-    inverse = np.empty_like(T)
-    inverse[..., :3, :3] = np.swapaxes(T[..., :3, :3], -1, -2)
-    inverse[..., :3, 3:] = -inverse[..., :3, :3] @ T[..., :3, 3:]
-    inverse[..., 3, :] = [0.0, 0.0, 0.0, 1.0]
-    return inverse
 
 
 # --- careful sessions ---

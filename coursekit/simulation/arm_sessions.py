@@ -25,17 +25,11 @@ from scipy.spatial.transform import Rotation
 
 from coursekit.arm import ArmErrors, SimulatedArm, widowx
 from coursekit.arrays import Floats, Grey
-from coursekit.boards import Board, BoardNotFound, Detection, Detections, detect
+from coursekit.boards import Board, Detection, Detections, detect
 from coursekit.boards.board import seen
 from coursekit.boards.detector import FEWEST_CORNERS, SESSION
 from coursekit.checks import choice, number, positive, want, whole
-from coursekit.geometry import (
-    invert_transform,
-    make_transform,
-    project,
-    transform_points,
-    turned,
-)
+from coursekit.geometry import invert_transform, make_transform, project, transform_points, turned
 from coursekit.hand_eye.poses import MOUNTS, Mount, camera_board
 from coursekit.hand_eye.session import HandEyeSession
 from coursekit.simulation.arm_poses import (
@@ -48,12 +42,7 @@ from coursekit.simulation.arm_poses import (
     random_poses,
 )
 from coursekit.simulation.board_images import render_board
-from coursekit.simulation.corner_sessions import (
-    Effects,
-    corner_noise,
-    printed,
-    with_street_errors,
-)
+from coursekit.simulation.corner_sessions import Effects, corner_noise, printed, with_street_errors
 from coursekit.specifications import device
 
 Design = Literal["careful", "grid", "single_axis", "small_rotations"]
@@ -219,20 +208,15 @@ def rendered_session(
     seed: int,
     n: int = 20,
     arm_errors: ArmErrors | None = None,
-    mistakes: HandEyeMistakes | None = None,
 ) -> tuple[HandEyeSession, HandEyeTruth, list[Grey]]:
-    """A session whose images (h, w) are rendered and whose corners `boards.detect` found.
+    """A healthy session of rendered images (h, w), whose corners `boards.detect` found.
 
-    As `hand_eye_session`, at about 0.1 s an image. Raises ValueError where the board is not found
-    in one, which the poses are chosen to avoid.
+    As `hand_eye_session`, at about 0.1 s an image. Raises BoardNotFound where the board is not
+    found in one, which the poses are chosen to avoid.
     """
-    truth, q, dq = _poses(mount, seed, n, arm_errors, mistakes or HandEyeMistakes())
-    images, found = list(images_of(truth, seed)), []
-    for i, image in enumerate(images):
-        try:
-            found.append(detect(image, truth.setup.board, f"view_{i:02d}"))
-        except BoardNotFound as reason:
-            raise ValueError(f"seed: no board in image {i} ({reason})") from reason
+    truth, q, dq = _poses(mount, seed, n, arm_errors, HandEyeMistakes())
+    images, board = list(images_of(truth, seed)), truth.setup.board
+    found = [detect(image, board, f"view_{i:02d}") for i, image in enumerate(images)]
     return _reported(truth, q, dq, Detections(found)), truth, images
 
 
@@ -253,12 +237,8 @@ def truth_of(folder: str | os.PathLike[str]) -> HandEyeTruth:
     card = json.loads(path.read_text("utf-8"))
     if card.get("source") != SIMULATED:
         raise ValueError(f"folder: {path.parent.name} is no simulated session; nobody knows its X")
-    mount, seed, views = (
-        choice("mount", card["mount"], MOUNTS),
-        int(card["seed"]),
-        int(card["views"]),
-    )
-    return _poses(mount, seed, views, ArmErrors(), HandEyeMistakes())[0]
+    asked = card["mount"], int(card["seed"]), int(card["views"])
+    return _poses(*asked, ArmErrors(), HandEyeMistakes())[0]
 
 
 def images_of(truth: HandEyeTruth, seed: int) -> Iterator[Grey]:
@@ -473,10 +453,8 @@ class SharedTarget:
     in_shoulder_camera: Floats
 
 
-def shared_target(
-    on_wrist: HandEyeTruth, over_shoulder: HandEyeTruth, view: int = 0, seed: int = 0
-) -> SharedTarget:
-    """The middle of the board on the table, seen from view `view` of the wrist and from above.
+def shared_target(on_wrist: HandEyeTruth, over_shoulder: HandEyeTruth) -> SharedTarget:
+    """The middle of the board on the table, seen from the wrist's first view and from above.
 
     Both cameras are good to 0.2 mm along each axis in their own frames.
     Raises ValueError for sessions of other mounts.
@@ -493,9 +471,9 @@ def shared_target(
     mounts = (on_wrist.mount, over_shoulder.mount)
     wanted = "an eye_in_hand and an eye_to_hand session"
     want(mounts == ("eye_in_hand", "eye_to_hand"), "on_wrist, over_shoulder", mounts, wanted)
-    rng = np.random.default_rng(seed)
-    place = transform_points(on_wrist.Y[view], on_wrist.setup.board.middle)
-    true = on_wrist.T_base_gripper[view]
+    rng = np.random.default_rng(0)
+    place = transform_points(on_wrist.Y[0], on_wrist.setup.board.middle)
+    true = on_wrist.T_base_gripper[0]
     near, far = (
         transform_points(invert_transform(T), place) + SEEN_TO_M * rng.normal(size=3)
         for T in (true @ on_wrist.setup.X, over_shoulder.setup.X)
@@ -508,11 +486,9 @@ def _reported_poses(arm: SimulatedArm, poses: Floats, name: str) -> Floats:
 
     First order: the arm's error, a few mm, is taken from the nearest place that it can command.
     """
-    nominal = arm.nominal
-    q, reached = nominal.inverse(poses)
+    q, reached = arm.nominal.inverse(poses)
     if not reached.all():
         raise ValueError(f"{name}: number {int(np.argmin(reached))} is out of the arm's reach")
-    read = arm.move(q)
-    computed = nominal.forward(read)
+    computed = arm.nominal.forward(arm.move(q))
     error = arm.true_pose() @ invert_transform(computed)  # about the base's origin
     return invert_transform(error) @ poses

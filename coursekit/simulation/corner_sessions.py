@@ -209,20 +209,9 @@ def corner_session(
         found = pixels + noise + wild
         said_px = effects.claimed * sigma_px
         detections.append(Detection(ids, found, lens.size, f"view {i:02d}", said_px, measured))
-    depth_m = tuple(Z for _, _, Z in looks)
-    truth = Truth(
-        lens=lens,
-        T_camera_board=poses,
-        effects=effects,
-        focal_scale=draw.focal_scale,
-        velocity_m_s=draw.velocity_m_s,
-        blurred=draw.blurred,
-        spoiled_view=draw.spoiled_view,
-        bad_corners=wrong,
-        depth_m=depth_m,
-        points=points,
-    )
-    return Detections(detections), truth
+    depth_m, drawn = tuple(Z for _, _, Z in looks), (draw.focal_scale, draw.velocity_m_s)
+    faults = draw.blurred, draw.spoiled_view, wrong
+    return Detections(detections), Truth(lens, poses, effects, *drawn, *faults, depth_m, points)
 
 
 # --- where the views are ---
@@ -239,38 +228,28 @@ def view_poses(
     azimuths = rng.permutation(views) / views * 2 * np.pi
     columns, rows = 4, 3
     cells = np.resize(rng.permutation(columns * rows), views)
-    poses = []
-    for azimuth, cell in zip(azimuths, cells, strict=True):
-        aim = (np.array([cell % columns, cell // columns]) + rng.random(2)) / [columns, rows]
-        target = aim * np.array(lens.size) - 0.5
-        poses.append(_pose_in_view(board, lens, rng, azimuth, target, effects))
-    return np.stack(poses)
-
-
-def _pose_in_view(
-    board: Board,
-    lens: Intrinsics,
-    rng: np.random.Generator,
-    azimuth: float,
-    target: Floats,
-    effects: Effects,
-) -> Floats:
-    """One pose (4, 4), tilted about the direction `azimuth`, its middle aimed at `target` (2,)."""
     aimed = _as_pinhole(lens, effects) if _beyond(effects) else lens
-    for _ in range(POSES_TRIED):
-        tilt = np.radians(effects.max_tilt_deg) * np.sqrt(rng.random())
+    enough = partial(_enough, board, lens, effects=effects)
+    poses: list[Floats] = []
+    for azimuth, cell in zip(azimuths, cells, strict=True):
         axis = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-        roll = Rotation.from_euler("z", rng.uniform(-np.pi / 4, np.pi / 4))
-        R = (Rotation.from_rotvec(tilt * axis) * roll).as_matrix()
-        distance_m = rng.uniform(NEAREST_M, FARTHEST_M)
-        enough = partial(_enough, board, lens, effects=effects)
-        T = slide_into_view(target, distance_m, R, board.middle, aimed, enough)
-        if T is not None:
-            return T
-    raise ValueError(
-        f"board: {board.size_m[0]:.3f} x {board.size_m[1]:.3f} m does not fit the "
-        f"{lens.width}x{lens.height} image at {NEAREST_M} to {FARTHEST_M} m"
-    )
+        aim = (np.array([cell % columns, cell // columns]) + rng.random(2)) / [columns, rows]
+        target, T = aim * np.array(lens.size) - 0.5, None
+        for _ in range(POSES_TRIED):
+            tilt = np.radians(effects.max_tilt_deg) * np.sqrt(rng.random())
+            roll = Rotation.from_euler("z", rng.uniform(-np.pi / 4, np.pi / 4))
+            R = (Rotation.from_rotvec(tilt * axis) * roll).as_matrix()
+            distance_m = rng.uniform(NEAREST_M, FARTHEST_M)
+            T = slide_into_view(target, distance_m, R, board.middle, aimed, enough)
+            if T is not None:
+                break
+        if T is None:
+            raise ValueError(
+                f"board: {board.size_m[0]:.3f} x {board.size_m[1]:.3f} m does not fit the "
+                f"{lens.width}x{lens.height} image at {NEAREST_M} to {FARTHEST_M} m"
+            )
+        poses.append(T)
+    return np.stack(poses)
 
 
 def _as_pinhole(lens: Intrinsics, effects: Effects) -> Intrinsics:
@@ -286,26 +265,18 @@ def _as_pinhole(lens: Intrinsics, effects: Effects) -> Intrinsics:
 def _enough(board: Board, lens: Intrinsics, T: Floats, effects: Effects) -> bool:
     """Whether so much of the board is seen that it makes a view."""
     if effects.inner_only or board.kind == "charuco":
-        visible = _visible(board, lens, T, effects)
+        visible = _visible(board.points, lens, T, effects)
         share = 1.0 if effects.inner_only else PARTIAL_SHARE
         return bool(visible.sum() >= max(share * len(visible), min(12, len(visible))))
-    return bool(_seen(np.concatenate([board.points, board.outline]), T, lens, effects).all())
+    return bool(_visible(np.concatenate([board.points, board.outline]), lens, T, effects).all())
 
 
-def _visible(board: Board, lens: Intrinsics, T: Floats, effects: Effects) -> Bools:
-    """Which corners (N,) are in the image, as far from its border as they must be."""
+def _visible(points: Floats, lens: Intrinsics, T: Floats, effects: Effects) -> Bools:
+    """Which points (N, 3) of the board are in the image, as far from its border as they must be.
+
+    As `seen`, through the session's own lens.
+    """
     border_px = np.maximum(BORDER_PX, effects.inner_only * np.array(lens.size))
-    return _seen(board.points, T, lens, effects, border_px)
-
-
-def _seen(
-    points: Floats,
-    T: Floats,
-    lens: Intrinsics,
-    effects: Effects,
-    border_px: float | Floats = BORDER_PX,
-) -> Bools:
-    """As `seen`, through the session's own lens."""
     if not _beyond(effects):
         return seen(points, T, lens, border_px)
     inside = transform_points(T, points)
@@ -344,7 +315,7 @@ def _look(
     velocity: Floats,
 ) -> tuple[Integers, Floats, Floats]:
     """The ids of the corners in the image, their pixels (N, 2) without noise, and their Z (N,)."""
-    ids = np.flatnonzero(_visible(board, lens, T, effects))
+    ids = np.flatnonzero(_visible(board.points, lens, T, effects))
     points = transform_points(T, shape[ids])
     see = _through(replace(lens, fx=lens.fx * scale, fy=lens.fy * scale), effects)
     return ids, rolling_shutter(points, velocity, effects.readout_s, lens.height, see), points[:, 2]
