@@ -73,7 +73,7 @@ def test_the_minimum_with_an_erring_arm_is_that_of_scipy(mount):
         pose_difference(known.X, result.X), pose_difference(known.Y, result.Y)
     ])  # fmt: skip
     np.testing.assert_allclose(found / sigma, fit.x[:12] / sigma, atol=2e-3)
-    assert problem.squares(state) == pytest.approx(2 * fit.cost, rel=1e-6)
+    assert problem.equations(state).squares == pytest.approx(2 * fit.cost, rel=1e-6)
     covariance = np.linalg.inv(fit.jac.T @ fit.jac)[:12, :12]
     reduced = np.linalg.inv(problem.equations(state).reduced)[:12, :12]
     assert np.abs((reduced - covariance) / np.outer(sigma, sigma)).max() < 0.01

@@ -7,6 +7,7 @@ import os
 import re
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,9 +18,10 @@ from sample_submissions import DISTANCES, honest, with_part, with_row
 
 from coursekit import cli
 from coursekit.stereo import window_stats
+from coursekit.submission import rubric
 from coursekit.submission.flags import Fingerprint, copies, fingerprint
 from coursekit.submission.format import Claims, Conclusion, Plot, Stack, Submission
-from coursekit.submission.recompute import MISTAKES, RULES, grading_rules, recompute
+from coursekit.submission.recompute import MISTAKES, RULES, WHY, grading_rules, recompute
 from coursekit.submission.report import student_page
 from coursekit.submission.rubric import JUDGES, Item, grade, shortcomings
 
@@ -195,6 +197,16 @@ def test_the_largest_count_is_an_invalid_sample_for_the_grader_too():
     ended, holed = (recompute(s).at[0] for s in (replace(HOLED, stacks=stacks), HOLED))
     assert ended.invalid.value == holed.invalid.value > 0
     assert ended.bias.value == holed.bias.value
+
+
+def test_every_mistake_that_is_looked_for_has_its_words_and_every_word_a_mistake():
+    source = Path(rubric.__file__).read_text(encoding="utf-8")
+    keys = set(re.findall(r'_Mistake\(\s*"([\w.]+)"', source))
+    assert len(keys) > 20
+    assert keys <= set(WHY)
+    for key in WHY:  # "sign", "exponent.sign" of a topic, "ever.frames" in one way
+        assert {key, key.partition(".")[2]} & set(re.findall(r'"([\w.]+)"', source)), key
+        assert set(key.split(".")) & set(MISTAKES), key
 
 
 def test_every_mistake_has_a_credit_and_a_sample_and_points_are_a_hundred():

@@ -22,7 +22,7 @@ effects from restricted maximum likelihood" (1997).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -77,7 +77,7 @@ class Problem:
     q (n, 6): where joint offsets are asked for. fk: the arm's errors that are stated, or None.
     guessed: whether the sizes of what fk shares are a guess up to a common factor, which is then
     estimated too. own_root (n, 6, 6): of the covariance of each pose's own error, and factor: of
-    the variances that fk shares; before they are estimated None and 1.
+    the variances that fk shares; 0, as where only poses are known, and 1 before the estimate.
     """
 
     T_base_gripper: Floats
@@ -88,7 +88,7 @@ class Problem:
     q: Floats | None = None
     fk: FkErrors | None = None
     guessed: bool = False
-    own_root: Floats | None = None
+    own_root: Floats = field(default_factory=lambda: np.zeros((1, 6, 6)))
     factor: float = 1.0
 
     @cached_property
@@ -148,8 +148,6 @@ class Problem:
 
     def own_twists(self, state: State) -> Floats:
         """What each pose's own error does to where the camera sees the board, (n, 6)."""
-        if self.own_root is None:
-            return np.zeros((len(self.T_base_gripper), 6))
         return np.einsum("nij,nj->ni", self.own_root, state.own)
 
     def weighed(self, own: Floats) -> Problem:
@@ -163,7 +161,7 @@ class Problem:
 
     def with_own(self, state: State, twists: Floats) -> State:
         """The state with each pose's own error such that it does what twists (n, 6) say."""
-        if self.own_root is None:
+        if isinstance(self.views, PoseViews):
             return state
         u = np.linalg.solve(self.own_root, twists[..., None])
         return replace(state, own=np.asarray(u[..., 0]))
@@ -197,10 +195,6 @@ class Problem:
             stated = by_arm @ self.fk.each @ np.swapaxes(by_arm, 1, 2)
         return stated, np.stack([half @ np.swapaxes(half, 1, 2) for half in halves])
 
-    def prior_squares(self, state: State) -> float:
-        """The sum of squares of the unknowns that have priors."""
-        return float(self.prior @ self.with_prior(state) ** 2 + (state.own**2).sum())
-
     def with_prior(self, state: State) -> Floats:
         """The unknowns (g,) that have priors, which are about 0; 0 for the others."""
         offsets = state.offsets[: len(self._offset_sigma)]
@@ -219,20 +213,15 @@ class Problem:
             state.own + own,
         )
 
-    def squares(self, state: State) -> float:
-        """What is minimised."""
-        seen = self.views.linear(self.camera_board(state), state.scale)[0]
-        return float(seen.sum()) + self.prior_squares(state)
-
     def equations(self, state: State) -> Equations:
         """The normal equations at a state."""
         squares, gradient, information = self.views.linear(self.camera_board(state), state.scale)
         shared, own = self._derivatives(state)
         pull = self.prior * self.with_prior(state)
-        total = float(squares.sum()) + self.prior_squares(state)
+        total = float(squares.sum() + pull @ self.with_prior(state) + (state.own**2).sum())
         return Equations(shared, own, gradient, information, self.prior, pull, state.own, total)
 
-    def _derivatives(self, state: State) -> tuple[Floats, Floats | None]:
+    def _derivatives(self, state: State) -> tuple[Floats, Floats]:
         """d the seven numbers of each view / d shared unknowns (n, 7, g), and / d own (n, 6, 6)."""
         arm_poses = self._arm_poses(state)
         given = arm_poses, state.X, state.Y, self.mount
@@ -247,8 +236,7 @@ class Problem:
         by_pose[:, :3] = Rotation.from_rotvec(own[:, :3]).as_matrix() @ by_pose[:, :3]
         by_scale = np.zeros((n, 1, by_pose.shape[2]))
         by_scale[..., 12 : 12 + self.free_scale] = 1.0
-        by_own = None if self.own_root is None else _growing(own) @ self.own_root
-        return np.concatenate([by_pose, by_scale], axis=1), by_own
+        return np.concatenate([by_pose, by_scale], axis=1), _growing(own) @ self.own_root
 
 
 def _growing(twists: Floats) -> Floats:
@@ -265,13 +253,13 @@ def _growing(twists: Floats) -> Floats:
 class Equations:
     """The normal equations of the shared unknowns (g) and each pose's own (6).
 
-    shared (n, 7, g) and own (n, 6, 6) or None: derivatives of each view's seven numbers. gradient
+    shared (n, 7, g) and own (n, 6, 6): derivatives of each view's seven numbers. gradient
     (n, 7) and information (n, 7, 7): of those. prior (g,), pull (g,): information and gradient of
     the priors. u (n, 6): the own unknowns now, of unit variance. squares: the sum now.
     """
 
     shared: Floats
-    own: Floats | None
+    own: Floats
     gradient: Floats
     information: Floats
     prior: Floats
@@ -282,12 +270,10 @@ class Equations:
     @cached_property
     def _cross(self) -> Floats:
         """(n, 6, g): N_i between own and shared unknowns."""
-        assert self.own is not None
         return np.swapaxes(self.own, 1, 2) @ (self.information[:, :6] @ self.shared)
 
     @cached_property
     def _own_inverse(self) -> Floats:
-        assert self.own is not None
         inner = np.swapaxes(self.own, 1, 2) @ self.information[:, :6, :6] @ self.own
         return np.asarray(np.linalg.inv(inner + np.eye(6)))
 
@@ -296,16 +282,12 @@ class Equations:
         """What is known of the shared unknowns, the own ones unknown, (g, g)."""
         total = np.einsum("nki,nkj->ij", self.shared, self.information @ self.shared)
         total += np.diag(self.prior)
-        if self.own is not None:
-            total -= np.einsum("nki,nkj->ij", self._cross, self._own_inverse @ self._cross)
+        total -= np.einsum("nki,nkj->ij", self._cross, self._own_inverse @ self._cross)
         return (total + total.T) / 2
 
     def step(self) -> tuple[Floats, Floats, float]:
         """The Gauss-Newton step, (g,) and (n, 6), and what it should take off the squares."""
         gradient = np.einsum("nki,nk->i", self.shared, self.gradient) - self.pull
-        if self.own is None:
-            change = determined_inverse(self.reduced) @ gradient
-            return change, np.zeros_like(self.u), float(change @ gradient)
         own_gradient = np.einsum("nki,nk->ni", self.own, self.gradient[:, :6]) - self.u
         inner = np.einsum("nij,nj->ni", self._own_inverse, own_gradient)
         reduced = gradient - np.einsum("nki,nk->i", self._cross, inner)
@@ -328,18 +310,20 @@ def determined_inverse(matrix: Floats) -> Floats:
 class _Scatter:
     """The equations with each pose's own error in the noise, for any sizes of that error.
 
-    rows (n, 6): how far each view is from where it is expected without an own error. columns
-    (n, 6, g): by the shared unknowns. image (n, 6, 6): covariance of the rows but for the parts
-    (k, n, 6, 6), each times one of `sizes`, variances in rad^2 or m^2. prior (g,): information of
-    the unknowns, at `values` (g,); where `guessed` (g,) it is over one more size, which is last.
+    rows (m, 6): how far each view is from where it is expected without an own error. columns
+    (m, 6, g): by the shared unknowns. image (m, 6, 6): covariance of the rows but for the parts
+    (k, m, 6, 6), each times one of `sizes` (k,), variances in rad^2 or m^2; none is below least
+    (k,). prior (g,): information of the unknowns, at `values` (g,). m is the number of views n, and
+    beyond it of the shared errors whose sizes are guessed, in sixes: as if each had been seen to be
+    0, with a variance that is one more size.
     """
 
     rows: Floats
     columns: Floats
     image: Floats
     parts: Floats
+    least: Floats
     prior: Floats
-    guessed: Floats
     values: Floats
     sizes: Floats
 
@@ -351,25 +335,28 @@ class _Scatter:
         rows = np.einsum("nij,nj->ni", image, at.gradient[:, :6]) + problem.own_twists(state)
         columns = image @ (at.information[:, :6] @ at.shared)
         stated, parts = problem.own_parts(state)
-        shared = np.arange(len(at.prior)) >= len(at.prior) - problem.shared.shape[2]
-        guessed = shared * float(problem.guessed)
-        if problem.own_root is None:
+        if isinstance(problem.views, PoseViews):
             image = np.zeros_like(image)
         else:
             parts = np.concatenate([parts, image[None]])
-        image = image + stated + LEAST_OWN
-        values, prior = problem.with_prior(state), np.where(shared, 1.0, at.prior)
-        return cls(rows, columns, image, parts, prior, guessed, values, sizes)
-
-    @property
-    def factor(self) -> float:
-        """Of the variances that are guessed; 1 where none are."""
-        return float(self.sizes[-1]) if self.guessed.any() else 1.0
+        image, values, prior = image + stated + LEAST_OWN, problem.with_prior(state), at.prior
+        least = np.full(len(parts), LEAST_OWN[0, 0])
+        if problem.guessed:
+            (n, _, g), k, m = columns.shape, len(parts), problem.shared.shape[2]
+            sixes = np.eye(g + -m % 6)[g - m :, :g].reshape(-1, 6, g)
+            filled = np.eye(6) * (1.0 - sixes.sum(axis=2))[..., None]
+            rows = np.concatenate([rows, -sixes @ values])
+            columns, image = np.concatenate([columns, sixes]), np.concatenate([image, filled])
+            beside = np.zeros((k + 1, len(rows), 6, 6))
+            beside[:k, :n], beside[k, n:] = parts, np.eye(6) - filled
+            prior = np.append(prior[:-m], np.zeros(m))
+            parts, least = beside, np.append(least, LEAST_FACTOR)
+        return cls(rows, columns, image, parts, least, prior, values, sizes)
 
     @cached_property
     def own(self) -> Floats:
-        """The covariance (n, 6, 6) of the own errors that are estimated."""
-        return np.einsum("k,knij->nij", self.sizes[: len(self.parts)], self.parts)
+        """The covariance (m, 6, 6) of the own errors that are estimated."""
+        return np.einsum("k,knij->nij", self.sizes, self.parts)
 
     @cached_property
     def _inverse(self) -> Floats:
@@ -380,78 +367,54 @@ class _Scatter:
         return self._inverse @ self.columns
 
     @cached_property
-    def _priors(self) -> Floats:
-        return np.where(self.guessed > 0, self.prior / self.factor, self.prior)
-
-    @cached_property
     def _known(self) -> Floats:
         """The covariance (g, g) if the sizes were known."""
         information = np.tensordot(self.columns, self._weighted, ([0, 1], [0, 1]))
-        return scaled_inverse(information + np.diag(self._priors))
+        return scaled_inverse(information + np.diag(self.prior))
 
     @cached_property
     def _by_size(self) -> Floats:
         """(k, g, g): what the information loses as a size grows."""
         spread = self.parts @ self._weighted
-        lost = [np.tensordot(self._weighted, one, ([0, 1], [0, 1])) for one in spread]
-        return np.stack([*lost, np.diag(self.guessed / self.factor**2)][: len(self.sizes)])
+        return np.stack([np.tensordot(self._weighted, one, ([0, 1], [0, 1])) for one in spread])
 
     @cached_property
     def _by_two(self) -> Floats:
         """(k, k, g, g): the same for two of them."""
         spread = self.parts @ self._weighted
-        k, g = len(self.sizes), len(self.prior)
-        lost = np.zeros((k, k, g, g))
-        for i, one in enumerate(spread):
-            for j, other in enumerate(self._inverse @ spread):
-                lost[i, j] = np.tensordot(one, other, ([0, 1], [0, 1]))
-        if self.guessed.any():
-            lost[-1, -1] = np.diag(self.guessed / self.factor**3)
-        return lost
+        return np.array([
+            [np.tensordot(one, other, ([0, 1], [0, 1])) for other in self._inverse @ spread]
+            for one in spread
+        ])  # fmt: skip
 
     @cached_property
     def _of_sizes(self) -> Floats:
         """The expected information (k, k) of the sizes."""
         each = self._inverse @ self.parts
-        k, own = len(self.sizes), len(self.parts)
-        trace = np.zeros((k, k))
-        trace[:own, :own] = np.einsum("knij,lnji->kl", each, each)
-        if self.guessed.any():
-            trace[-1, -1] = self.guessed.sum() / self.factor**2
+        trace = np.einsum("knij,lnji->kl", each, each)
         moved = self._known @ self._by_size
         trace -= 2 * np.einsum("ab,klba->kl", self._known, self._by_two)
         return (trace + np.einsum("kab,lba->kl", moved, moved)) / 2
 
     def _slope(self) -> Floats:
         """d restricted log likelihood / d sizes, (k,)."""
-        pull = np.einsum("nia,ni->a", self._weighted, self.rows) - self._priors * self.values
-        step = self._known @ pull
-        left = np.einsum("nij,nj->ni", self._inverse, self.rows - self.columns @ step)
+        pull = np.einsum("nia,ni->a", self._weighted, self.rows) - self.prior * self.values
+        left = self.rows - self.columns @ (self._known @ pull)
+        left = np.einsum("nij,nj->ni", self._inverse, left)
         squares = np.einsum("ni,knij,nj->k", left, self.parts, left)
         trace = np.einsum("nij,knji->k", self._inverse, self.parts)
-        if self.guessed.any():
-            far = self.guessed @ (self.values + step) ** 2
-            squares = np.append(squares, far / self.factor**2)
-            trace = np.append(trace, self.guessed.sum() / self.factor)
         trace -= np.einsum("ab,kba->k", self._known, self._by_size)
         return (squares - trace) / 2
 
-    @cached_property
-    def _least(self) -> Floats:
-        """Of the sizes, (k,): smaller ones are none."""
-        least = np.full(len(self.sizes), LEAST_OWN[0, 0])
-        least[len(self.parts) :] = LEAST_FACTOR
-        return least
-
     def estimated(self) -> _Scatter:
         """With the most likely sizes: Fisher scoring; a size that wants to be negative is least."""
-        now, least = self, self._least
+        now, least = self, self.least
         for _ in range(SCORING_STEPS):
             slope, step = now._slope(), np.zeros(len(least))
             free = (now.sizes > least) | (slope > 0)
             step[free] = determined_inverse(now._of_sizes[np.ix_(free, free)]) @ slope[free]
             sizes = np.clip(now.sizes + step, np.maximum(now.sizes / 10, least), 10 * now.sizes)
-            sizes[len(self.parts) :] = np.minimum(sizes[len(self.parts) :], MOST_FACTOR)
+            sizes = np.where(least == LEAST_FACTOR, np.minimum(sizes, MOST_FACTOR), sizes)
             settled = np.allclose(sizes, now.sizes, rtol=SETTLED, atol=0)
             now = replace(now, sizes=sizes)
             if settled:
@@ -460,13 +423,13 @@ class _Scatter:
 
     @property
     def whitened(self) -> Floats:
-        """The rows (n, 6) in units of their sigmas."""
+        """The rows (m, 6) in units of their sigmas."""
         return np.einsum("nji,nj->ni", np.linalg.cholesky(self._inverse), self.rows)
 
     @cached_property
     def _unsure(self) -> Floats:
         """The covariance (k, k) of the sizes; one that is nothing is known to be."""
-        some = self.sizes > 2 * self._least
+        some = self.sizes > 2 * self.least
         unsure = np.zeros_like(self._of_sizes)
         unsure[np.ix_(some, some)] = determined_inverse(self._of_sizes[np.ix_(some, some)])
         return unsure
@@ -525,17 +488,18 @@ def refine(problem: Problem, X: Floats, Y: Floats, measured: Floats) -> Refined:
     problem = problem.weighed(np.tile(np.eye(6), (n, 1, 1)))
     scatter = _Scatter.of(problem, problem.with_own(state, off), np.zeros(0))
     turn_shift = np.mean(off.reshape(n, 2, 3) ** 2, axis=(0, 2)) / 2 + LEAST_OWN[0, 0]
-    sizes = [*turn_shift, 1.0 if problem.own_root is not None else turn_shift[0]]
+    sizes = [*turn_shift, turn_shift[0] if isinstance(problem.views, PoseViews) else 1.0]
     scatter = replace(scatter, sizes=np.array(sizes + [1.0] * problem.guessed))
     for _ in range(SCATTER_ROUNDS):
         before, scatter = scatter.sizes, scatter.estimated()
-        own = scatter.own + problem.own_parts(state)[0] + LEAST_OWN
-        problem = replace(problem.weighed(own), factor=scatter.factor)
+        own = scatter.own[:n] + problem.own_parts(state)[0] + LEAST_OWN
+        factor = float(scatter.sizes[-1]) if problem.guessed else 1.0
+        problem = replace(problem.weighed(own), factor=factor)
         state, converged = _minimise(problem, problem.with_own(state, off))
         off, scatter = problem.own_twists(state), _Scatter.of(problem, state, scatter.sizes)
         if np.allclose(before, scatter.sizes, rtol=2 * SETTLED, atol=0):
             break
-    far, turns = scatter.whitened, problem.camera_board(state)[:, :3, :3]
+    far, turns = scatter.whitened[:n], problem.camera_board(state)[:, :3, :3]
     in_board = np.einsum("nji,nkj->nki", turns, far.reshape(n, 2, 3)).reshape(n, 6)
     alike = max(map(_alike, (far, in_board)))  # a camera that sinks, or a board that slides
     student = stdtrit(scatter.dof, 0.975) / stdtrit(np.inf, 0.975)
@@ -561,12 +525,12 @@ def _minimise(problem: Problem, state: State) -> tuple[State, bool]:
             return state, True
         for halving in range(STEP_HALVINGS):
             trial = problem.step(state, change / 2**halving, own / 2**halving)
-            now = problem.squares(trial)
-            if now <= equations.squares * (1 + 1e-14):
+            now = problem.equations(trial)
+            if now.squares <= equations.squares * (1 + 1e-14):
                 break
         else:
             return state, decrease < 1e-3
-        state, equations = trial, problem.equations(trial)
+        state, equations = trial, now
     return state, False
 
 

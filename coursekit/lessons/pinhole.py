@@ -145,12 +145,8 @@ def _centre_first(x: Floats, y: Floats, w: Any, fx: float, fy: float, cx: float,
 
 
 def _x_overwritten(x: Floats, y: Floats, *dist: float) -> Any:
-    k1, k2, p1, p2, k3 = dist
-    r2 = x * x + y * y
-    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-    x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    return x, y
+    new, bent_y = _bent()(x, y, *dist)
+    return new, bent_y + 2 * dist[3] * (new - x) * y  # in 2 p2 xy it is no longer x
 
 
 def _tangential_after_radial(x: Floats, y: Floats, *dist: float) -> Any:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from coursekit.arrays import ArrayLike, Floats
-from coursekit.plots.style import COLORS, MARKERS, STYLES, LessonFigure, figure, plain_ticks, single
+from coursekit.plots.style import COLORS, MARKERS, STYLES, LessonFigure, panels, plain_ticks, single
 
 RANGE_M = np.linspace(0.25, 3.0, 200)
 
@@ -104,8 +104,7 @@ def infrared_pair(
     2 half + 1 pixels a side.
     """
     u, v = pixel
-    fig = figure(9.0, 3.8)
-    axes = fig.subplots(1, 2, sharey=True)
+    fig, axes = panels(2, 2, 9.0, 3.8, sharey=True)
     for ax, image, centre, name in (
         (axes[0], left, float(u), "left"),
         (axes[1], right, u - disparity_px, "right"),
@@ -127,8 +126,7 @@ def cost_curve(costs: Floats, disparity_px: float) -> LessonFigure:
 
     costs: of the candidates 0, 1, 2, ... px, in grey levels. disparity_px: what the matcher says.
     """
-    fig = figure(9.0, 3.6)
-    whole, close = fig.subplots(1, 2)
+    fig, (whole, close) = panels(2, 2, 9.0, 3.6)
     d = np.arange(len(costs))
     whole.plot(d, costs, color=COLORS["model"], lw=1.2)
     best = int(np.argmin(costs))

@@ -12,7 +12,7 @@ from matplotlib.ticker import MultipleLocator
 from coursekit.arrays import ArrayLike, Floats
 from coursekit.attribution import SimulatedMisses
 from coursekit.budget import BestDistance, Draws, ErrorBudget, Gripper, Target
-from coursekit.plots.style import COLORS, LessonFigure, figure, single
+from coursekit.plots.style import COLORS, LessonFigure, figure, panels, single
 
 KINDS = {"bias": "measured", "noise": "depth"}
 CHI2_95_IN_A_PLANE = 5.991  # of two degrees of freedom
@@ -53,8 +53,7 @@ def bars(budget: ErrorBudget) -> LessonFigure:
 
 def biases(draws: Draws, tolerance_m: float) -> LessonFigure:
     """Many rigs of one budget: how long their bias is, and how much of it lies along closing."""
-    fig = figure(9.0, 3.6)
-    length, along = fig.subplots(1, 2)
+    fig, (length, along) = panels(2, 2, 9.0, 3.6)
     norm, closing = 1000 * draws.norm_m, 1000 * draws.along_m[:, 0]
     length.hist(norm, 60, color=COLORS["measured"], density=True)
     along.hist(closing, 60, color=COLORS["measured"], density=True)
@@ -172,8 +171,7 @@ def distances(best: BestDistance) -> LessonFigure:
 
 def misses(sets: Mapping[str, SimulatedMisses]) -> LessonFigure:
     """Sets of misses from above, each arrow where its grasp was and ten times as long."""
-    fig = figure(9.6, 3.4)
-    axes = fig.subplots(1, len(sets), sharex=True, sharey=True, squeeze=False)[0]
+    fig, axes = panels(len(sets), len(sets), 9.6, 3.4, sharex=True, sharey=True)
     for ax, (name, one) in zip(axes, sets.items(), strict=True):
         x, y = one.T_base_gripper[:, :2, 3].T
         ax.quiver(x, y, *(10 * one.misses[:, :2].T), angles="xy", scale_units="xy", scale=1,

@@ -16,7 +16,7 @@ from coursekit.plots.style import (
     STYLES,
     LessonFigure,
     cross,
-    figure,
+    panels,
     plain_ticks,
     single,
 )
@@ -31,8 +31,7 @@ def mounts(setups: Mapping[str, Setup], joints: Mapping[str, ArrayLike]) -> Less
     joints: the joint angles (6,), rad, at which each rig is drawn. Seen from the arm's right, so
     x of the base points to the right and z up.
     """
-    fig = figure(9.6, 4.4)
-    axes = fig.subplots(1, len(setups), sharey=True, squeeze=False)[0]
+    fig, axes = panels(len(setups), len(setups), 9.6, 4.4, sharey=True)
     for ax, (name, setup) in zip(axes, setups.items(), strict=True):
         _side_view(ax, setup, np.asarray(joints[name], float))
         ax.set_title(name)
@@ -86,8 +85,7 @@ def diversity(sessions: Mapping[str, Floats]) -> LessonFigure:
 
     Rotations are those from the session's mean, as rotation vectors along the gripper's axes.
     """
-    fig = figure(9.6, 4.0)
-    places, turns = fig.subplots(1, 2)
+    fig, (places, turns) = panels(2, 2, 9.6, 4.0)
     texts = []
     for marker, color, (name, T) in zip(
         MARKERS, ("measured", "model", "truth"), sessions.items(), strict=False
@@ -114,8 +112,7 @@ def diversity(sessions: Mapping[str, Floats]) -> LessonFigure:
 
 def study(points: Sequence[StudyPoint]) -> LessonFigure:
     """Median error of X against the range of rotation, one line for each number of axes."""
-    fig = figure(9.0, 3.8)
-    turn, shift = fig.subplots(1, 2)
+    fig, (turn, shift) = panels(2, 2, 9.0, 3.8)
     for style, marker, axes in zip(STYLES, MARKERS, sorted({p.axes for p in points}), strict=False):
         chosen = sorted((p for p in points if p.axes == axes), key=lambda p: p.range_deg)
         ranges = [p.range_deg for p in chosen]
@@ -141,8 +138,7 @@ def more_poses(
 
     error_mm, half_mm: one value for each of the counts, by the panel's name.
     """
-    fig = figure(9.6, 3.8)
-    axes = fig.subplots(1, len(error_mm), sharey=True, squeeze=False)[0]
+    fig, axes = panels(len(error_mm), len(error_mm), 9.6, 3.8, sharey=True)
     texts = []
     for ax, name in zip(axes, error_mm, strict=True):
         error, half = np.asarray(error_mm[name]), np.asarray(half_mm[name])

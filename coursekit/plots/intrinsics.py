@@ -106,8 +106,7 @@ def views(folder: Path, detections: Sequence[Detection]) -> LessonFigure:
     """The images of a folder with the corners that were found in them."""
     if not len(detections):
         raise ValueError("detections: there are none to show; print them to see why")
-
-    fig, axes = panels(len(detections), 3, 9.0, 2.35, 0.3, shared=True)
+    fig, axes = panels(len(detections), 3, 9.0, 2.35, 0.3, sharex=True, sharey=True)
     for ax, found in zip(axes, detections, strict=True):
         image = cv2.imread(str(folder / found.name), cv2.IMREAD_GRAYSCALE)
         ax.imshow(image, cmap="gray", vmin=0, vmax=255)
@@ -123,8 +122,7 @@ def views(folder: Path, detections: Sequence[Detection]) -> LessonFigure:
 
 def coverage(result: IntrinsicsResult) -> LessonFigure:
     """Where the corners are in the image, and how the board was tilted."""
-    fig = figure(9.0, 3.9)
-    image, tilt = fig.subplots(1, 2, width_ratios=(1.45, 1))
+    fig, (image, tilt) = panels(2, 2, 9.0, 3.9, width_ratios=(1.45, 1))
     width, height = result.intrinsics.size
     for found in result.detections:
         image.plot(found.pixels[:, 0], found.pixels[:, 1], ".", ms=3, color=COLORS["measured"])
@@ -151,8 +149,7 @@ def coverage(result: IntrinsicsResult) -> LessonFigure:
 
 def residuals(result: IntrinsicsResult) -> LessonFigure:
     """Residuals as arrows where they are in the image, and as a cloud."""
-    fig = figure(9.0, 3.9)
-    image, cloud = fig.subplots(1, 2, width_ratios=(1.45, 1))
+    fig, (image, cloud) = panels(2, 2, 9.0, 3.9, width_ratios=(1.45, 1))
     pixels = np.concatenate([d.pixels for d in result.detections])
     errors = np.concatenate(result.residuals)
     _arrows(image, pixels, errors, ARROWS)
@@ -189,8 +186,7 @@ def uncertainty(results: Mapping[str, IntrinsicsResult], range_m: float) -> Less
     """Maps of the standard deviation of a projected pixel, with one scale for all of them."""
     maps = {name: r.uncertainty_map(range_m, (30, 40)) for name, r in results.items()}
     top = max(float(np.nanmax(m)) for m in maps.values())  # NaN where a lens folds back
-    fig = figure(4.7 * len(maps) + 0.6, 3.9)
-    axes = fig.subplots(1, len(maps), squeeze=False, sharey=True)[0]
+    fig, axes = panels(len(maps), len(maps), 4.7 * len(maps) + 0.6, 3.9, sharey=True)
     levels = np.array([0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100])
     for ax, (name, sigma) in zip(axes, maps.items(), strict=True):
         width, height = results[name].intrinsics.size
@@ -201,7 +197,7 @@ def uncertainty(results: Mapping[str, IntrinsicsResult], range_m: float) -> Less
         image_axes(ax, width, height)
         ax.label_outer()
         ax.set_title(f"{name} at {range_m:g} m" if name else f"at {range_m:g} m")
-    fig.colorbar(shown, ax=list(axes), label="σ of a projected pixel (px)", shrink=0.9)
+    fig.colorbar(shown, ax=axes, label="σ of a projected pixel (px)", shrink=0.9)
     return fig.saying(
         f"Standard deviation of a projected pixel over the image, for points {range_m:g} m away: "
         + "; ".join(
@@ -251,8 +247,7 @@ def rules(rows: Mapping[str, IntrinsicsResult], range_m: float) -> LessonFigure:
     names = [f"{name} ({r.rms_px:.2f} px)" for name, r in rows.items()]
     fx = [100 * r.sigma("fx") / r.intrinsics.fx for r in rows.values()]
     worst = [float(np.nanmax(r.uncertainty_map(range_m, (12, 16)))) for r in rows.values()]
-    fig = figure(9.0, 0.55 * len(names) + 1.4)
-    axes = fig.subplots(1, 2, sharey=True)
+    fig, axes = panels(2, 2, 9.0, 0.55 * len(names) + 1.4, sharey=True)
     for ax, values, label in (
         (axes[0], fx, "σ of fx (%)"),
         (axes[1], worst, f"σ of the worst pixel at {range_m:g} m (px)"),
@@ -313,17 +308,14 @@ def power(table: Mapping[str, Mapping[str, Any]]) -> LessonFigure:
 
     table: by effect: `unit`, `sizes`, `named` (counts) and `sessions` (their number).
     """
-    fig = figure(9.6, 3.2)
-    axes = fig.subplots(1, len(table), sharey=True, squeeze=False)[0]
+    fig, axes = panels(len(table), len(table), 9.6, 3.2, sharey=True)
     texts = []
     for ax, (effect, row) in zip(axes, table.items(), strict=True):
         share = np.asarray(row["named"]) / row["sessions"]
         ax.plot(row["sizes"], share, "o-", color=COLORS["model"])
         ax.set(xscale="log", ylim=(-0.03, 1.03),
                xlabel=f"{effect.replace('_', ' ')} ({row['unit']})")  # fmt: skip
-        ticks = row["sizes"][::3]
-        ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
-        ax.set_xticks([], minor=True)
+        plain_ticks(ax.xaxis, row["sizes"][::3], widen=True)
         texts.append(
             f"{effect}: "
             + ", ".join(
@@ -343,8 +335,7 @@ def difference(comparison: Comparison) -> LessonFigure:
 
     Pixels after the best motion of the camera, millimetres without it; see `intrinsics.compare`.
     """
-    fig = figure(9.6, 3.9)
-    axes = fig.subplots(1, 2, sharey=True)
+    fig, axes = panels(2, 2, 9.6, 3.9, sharey=True)
     pixels, shift_mm = comparison.difference_px, 1000 * comparison.shift_m
     width, height = comparison.size
     for ax, values, label in (

@@ -32,8 +32,7 @@ def similar_triangles(focal_length_mm: float = 1.93, depth_m: float = 0.45) -> L
     "image 0.500 mm off the sensor's centre for f = 4.00 mm."
     """
     x_mm = focal_length_mm * POINT_X_M / depth_m
-    fig = figure(9.0, 3.8)
-    above, sensor = fig.subplots(1, 2, width_ratios=[2.4, 1])
+    fig, (above, sensor) = panels(2, 2, 9.0, 3.8, width_ratios=[2.4, 1])
     _triangles(above, 0.080 * focal_length_mm, depth_m)
     cross(sensor)
     sensor.plot([x_mm], [0], "o", color=COLORS["measured"], ms=10)
@@ -196,7 +195,7 @@ def displacement(lenses: Mapping[str, Intrinsics]) -> LessonFigure:
         ax.set_title(f"{name}\nedge {edge:.1f} px, corner {corner:.1f} px", fontsize=10)
         image_axes(ax, *lens.size)
         texts.append(f"{name}, {edge:.1f} px at an edge, {corner:.1f} px in a corner")
-    bar = fig.colorbar(shown, ax=list(axes), label="displacement (px)", shrink=0.6)
+    bar = fig.colorbar(shown, ax=axes, label="displacement (px)", shrink=0.6)
     bar.set_ticks([0.1, 1, 10, 100], labels=["0.1", "1", "10", "100"])
     return fig.saying("Maps of the displacement by distortion: " + "; ".join(texts) + ".")
 
@@ -222,8 +221,7 @@ def edge_and_corner(size: Floats) -> tuple[float, float]:
 def frame(shot: Frame) -> LessonFigure:
     """The depth image, and the colour image where there is one, as the camera delivers them."""
     images = 1 if shot.color is None else 2
-    fig = figure(4.6 * images, 3.3)
-    axes = np.atleast_1d(fig.subplots(1, images))
+    fig, axes = panels(images, images, 4.6 * images, 3.3)
     depth = np.where(shot.depth_m > 0, shot.depth_m, np.nan)
     shown = axes[0].imshow(depth, vmin=np.nanquantile(depth, 0.01), vmax=_far(depth))
     fig.colorbar(shown, ax=axes[0], label="depth Z (m)", shrink=0.8)

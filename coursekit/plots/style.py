@@ -84,15 +84,16 @@ def single(width: float, height: float) -> tuple[LessonFigure, Axes]:
 
 
 def panels(
-    n: int, columns: int, width: float, row: float, more: float = 0.0, shared: bool = False
+    n: int, columns: int, width: float, row: float, more: float = 0.0, **others: Any
 ) -> tuple[LessonFigure, list[Any]]:
-    """A figure of n axes in so many columns, and the n axes; `shared`: with the same limits.
+    """A figure of n axes in so many columns, and the n axes.
 
-    width of the figure and height of a row in inches; more: how much higher the figure is.
+    width of the figure and height of a row in inches; more: how much higher the figure is. others:
+    for Matplotlib's `Figure.subplots`, such as sharey=True.
     """
     rows = -(-n // columns)
     fig = figure(width, row * rows + more)
-    axes = fig.subplots(rows, columns, squeeze=False, sharex=shared, sharey=shared).ravel()
+    axes = fig.subplots(rows, columns, squeeze=False, **others).ravel()
     for empty in axes[n:]:
         empty.set_visible(False)
     return fig, list(axes[:n])

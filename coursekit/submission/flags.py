@@ -394,9 +394,9 @@ def _shared(one: StackPrint, two: StackPrint) -> tuple[int, bool]:
     if len(ask) < FRAMES_FOUND or len(two.frames) < FRAMES_FOUND:
         return 0, False
     likeness = _unit(ask) @ _unit(two.frames).T
-    hits = likeness.max(axis=1) >= FRAME_LIKENESS
-    best = two.frames[likeness.argmax(axis=1)]
-    return int(hits.sum()), bool((best[hits] == ask[hits]).all())
+    hits = np.flatnonzero(likeness.max(axis=1) >= FRAME_LIKENESS)
+    same = len(hits) and (two.frames[likeness[hits].argmax(axis=1)] == ask[hits]).all()
+    return len(hits), bool(same)
 
 
 def copies(prints: Mapping[str, Fingerprint]) -> list[Copy]:

@@ -443,11 +443,8 @@ def _document(members: dict[str, bytes], name: str) -> dict[str, Any]:
     try:
         text = members[name].decode("utf-8")
         # NaN becomes what is no value of JSON, so that the schema says where it stands
-        hooks: dict[str, Any] = {
-            "object_pairs_hook": _without_doubles,
-            "parse_constant": str.encode,
-        }
-        document = _with_tuples(json.loads(text, **hooks), MAX_NESTED)
+        read = json.loads(text, object_pairs_hook=_without_doubles, parse_constant=str.encode)
+        document = _with_tuples(read, MAX_NESTED)
     except (ValueError, RecursionError) as error:  # also an integer of thousands of digits
         raise Refused("not_json", f"{name} cannot be read ({error})") from None
     if name == MANIFEST and isinstance(document, dict) and document.get("format") != VERSION:
