@@ -12,14 +12,8 @@ from pathlib import Path
 from typing import Literal
 
 from coursekit import checks
+from coursekit.cameras import recording
 from coursekit.cameras.frames import CameraError, Description, Frame, Frames
-from coursekit.cameras.recording import (
-    Index,
-    check_distance,
-    depth_frame_numbers,
-    scene_to_record,
-    write_recording,
-)
 from coursekit.geometry import Intrinsics
 
 
@@ -85,7 +79,7 @@ class Camera(Description, ABC):
         Raises ValueError for a bad distance, or for a name that the simulated camera does not know,
         and CameraError for what a recorded set does not hold (the message lists what it does).
         """
-        check_distance(distance_m)
+        recording.check_distance(distance_m)
         print(f"{self.name}: a recording cannot be rearranged, it shows what it shows.")
 
     def set(
@@ -146,7 +140,8 @@ class Camera(Description, ABC):
         file is kept unless `overwrite`), and CameraError.
         """
         checks.whole("n", n)
-        return write_recording(path, self, self._take(n, progress=True), overwrite, infrared)
+        frames = self._take(n, progress=True)
+        return recording.write_recording(path, self, frames, overwrite, infrared)
 
     def record_set(
         self,
@@ -167,13 +162,13 @@ class Camera(Description, ABC):
         checks.whole("n", n)
         if not self.can_place:
             raise CameraError(f"{self.name}: a recording cannot be rearranged, so it makes no set")
-        index = Index.to_extend(Path(folder).expanduser(), name, distances_m, overwrite)
+        index = recording.Index.to_extend(Path(folder).expanduser(), name, distances_m, overwrite)
         for distance_m in distances_m:
-            scene = scene_to_record(name, distance_m)
+            scene = recording.scene_to_record(name, distance_m)
             self.place(name, distance_m)
             path = self.record(index.folder / scene.file, n, overwrite=True, infrared=infrared)
             index.add(scene)
-            if self.source != "recorded" and len(depth_frame_numbers(path)) < n:
+            if self.source != "recorded" and len(recording.depth_frame_numbers(path)) < n:
                 print(f"The set {index.folder.name} holds {index}.")  # stopped by Ctrl-C
                 break
         return index.folder

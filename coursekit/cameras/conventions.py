@@ -71,12 +71,9 @@ def _measure(model: str, name: str, pixels: Floats, depths: Floats) -> Agreement
     theirs = realsense_intrinsics(rs, camera)
     points = geometry.deproject(pixels, depths, camera.K, camera.dist)
     projected = np.array([rs.rs2_project_point_to_pixel(theirs, p) for p in points.tolist()])
-    again = np.array(
-        [
-            rs.rs2_project_point_to_pixel(theirs, rs.rs2_deproject_pixel_to_point(theirs, uv, z))
-            for uv, z in zip(projected.tolist(), depths.tolist(), strict=True)
-        ]
-    )
+    seen = zip(projected.tolist(), depths.tolist(), strict=True)
+    back = [rs.rs2_deproject_pixel_to_point(theirs, uv, z) for uv, z in seen]
+    again = np.array([rs.rs2_project_point_to_pixel(theirs, p) for p in back])
     ours = geometry.project(points, camera.K, camera.dist)
     return Agreement(model, name, _largest(projected - ours), _largest(again - projected))
 

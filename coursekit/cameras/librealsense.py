@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import re
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -18,20 +19,14 @@ UDEV_ADVICE = (
     "/etc/udev/rules.d, then `sudo udevadm control --reload-rules && sudo udevadm trigger`) "
     "and plug the camera in again"
 )
-# (words in librealsense's message, what happened and what to do next)
-START_ADVICE = (
-    (
-        ("busy", "power state"),
-        "another program uses it: close the RealSense Viewer, shut down other notebooks' kernels, "
-        "or unplug it and plug it in again",
-    ),
-    (("permission", "access"), f"you have no permission to use it: {UDEV_ADVICE}"),
-    (
-        ("resolve", "no device connected"),
-        "it does not offer depth 848x480 with colour 640x480 at 30 Hz here: plug it into a USB 3 "
-        "port with a USB 3 cable",
-    ),
-)
+# By words in librealsense's message: what happened and what to do next
+START_ADVICE = {
+    "busy|power state": "another program uses it: close the RealSense Viewer, shut down other "
+    "notebooks' kernels, or unplug it and plug it in again",
+    "permission|access": f"you have no permission to use it: {UDEV_ADVICE}",
+    "resolve|no device connected": "it does not offer depth 848x480 with colour 640x480 at 30 Hz "
+    "here: plug it into a USB 3 port with a USB 3 cable",
+}
 
 
 class LibraryMissing(CameraError):
@@ -95,9 +90,8 @@ def device_info(rs: ModuleType, device: Any, name: str) -> str:
 
 def start_problem(what: str, error: RuntimeError) -> str:
     """The message for a live camera that does not start: what happened and what to do next."""
-    text = str(error).lower()
-    for words, advice in START_ADVICE:
-        if any(word in text for word in words):
+    for words, advice in START_ADVICE.items():
+        if re.search(words, str(error).lower()):
             return f"{what} does not start; {advice} (librealsense says: {error})"
     return f"{what} does not start (librealsense says: {error}): unplug it, plug it in, try again"
 

@@ -20,18 +20,10 @@ import numpy as np
 
 from coursekit import checks, results, specifications
 from coursekit.arrays import AnyArray, Image
+from coursekit.cameras import recording
 from coursekit.cameras.camera import Camera
 from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Description, Frame
 from coursekit.cameras.librealsense import device_info, load_librealsense, start_problem
-from coursekit.cameras.recording import (
-    INTRINSICS,
-    Index,
-    RecordedScene,
-    check_depth_scale,
-    check_distance,
-    check_recording,
-    depth_frame_numbers,
-)
 from coursekit.geometry import Intrinsics, make_transform
 from coursekit.words import counted
 
@@ -77,7 +69,7 @@ class RealSense(Camera):
         if path is not None:
             self._what = f"the recording {path.name}"
             self.source = "recorded"
-            check_recording(path)
+            recording.check_recording(path)
         elif self.serial in _live_cameras:  # the setup cell was run again
             _live_cameras[self.serial].close()
         self._start()
@@ -194,12 +186,7 @@ class RealSense(Camera):
 
     def __repr__(self) -> str:
         where = f"recording {self._path.name}" if self._path else f"live, serial {self.serial}"
-        color = f"colour {self.color.width}x{self.color.height}" if self.color else "no colour"
-        baseline = "unknown" if self.baseline_m is None else f"{1000 * self.baseline_m:.1f} mm"
-        return (
-            f"{self.name} ({where}): depth {self.depth.width}x{self.depth.height}, {color}, "
-            f"baseline {baseline}, depth unit {1000 * self.depth_scale_m:g} mm"
-        )
+        return _described(self, where, "unknown")
 
     # --- frames --------------------------------------------------------------------------------
 
@@ -232,7 +219,7 @@ class RealSense(Camera):
         librealsense ends it silently at the first message that it cannot decode.
         """
         if self._path is not None and self._path.suffix == ".db3":
-            numbers = depth_frame_numbers(self._path)
+            numbers = recording.depth_frame_numbers(self._path)
             lost = len(numbers)
             if last is not None and last.number in numbers:
                 lost = numbers[::-1].index(last.number)
@@ -266,17 +253,11 @@ class RealSense(Camera):
 
     def _frame(self, group: _Group) -> Frame:
         depth, color, infrared = group
-        return Frame(
-            depth=np.array(depth.get_data(), dtype=np.uint16),
-            color=self._to_rgb(np.asarray(color.get_data())) if color and self._to_rgb else None,
-            depth_scale_m=self.depth_scale_m,
-            time_s=depth.get_timestamp() / 1000.0,
-            number=depth.get_frame_number(),
-            depth_intrinsics=self.depth,
-            color_intrinsics=self.color,
-            T_color_depth=self.T_color_depth,
-            infrared=_pixels(infrared),
-        )
+        counts = np.array(depth.get_data(), dtype=np.uint16)
+        rgb = self._to_rgb(np.asarray(color.get_data())) if color and self._to_rgb else None
+        time_s, number = depth.get_timestamp() / 1000.0, depth.get_frame_number()
+        figures = self.depth, self.color, self.T_color_depth
+        return Frame(counts, rgb, self.depth_scale_m, time_s, number, *figures, _pixels(infrared))
 
     def _skip(self, n: int) -> None:
         for _ in itertools.islice(self.stream(), n):
@@ -288,7 +269,7 @@ class RealSense(Camera):
         if self._path is not None:
             super().place(name, distance_m)
             return
-        check_distance(distance_m)
+        recording.check_distance(distance_m)
         device = specified(self.name)
         glass_m = device.nominal.glass_m if device else 0.0
         what = PLACING.get(name, f"Put the {name}")
@@ -313,7 +294,7 @@ class RealSense(Camera):
         if exposure is not None:
             said.append("exposure stays: lock() fixes it where automatic exposure has put it")
         if depth_scale_m is not None:
-            said.append(self._set_depth_scale(check_depth_scale(depth_scale_m)))
+            said.append(self._set_depth_scale(recording.check_depth_scale(depth_scale_m)))
         sentence = "; ".join(said or ["nothing to change"])
         return sentence[0].upper() + sentence[1:] + "."
 
@@ -504,14 +485,21 @@ def _pixels(infrared: tuple[Any, ...]) -> tuple[Image, Image] | None:
     return left, right
 
 
+def _described(camera: Camera, where: str, without: str) -> str:
+    """A camera's figures in a line; without: what is said of a baseline that it does not have."""
+    depth, color, baseline_m = camera.depth, camera.color, camera.baseline_m
+    colour = f"colour {color.width}x{color.height}" if color else "no colour"
+    baseline = without if baseline_m is None else f"{1000 * baseline_m:.1f} mm"
+    return (
+        f"{camera.name} ({where}): depth {depth.width}x{depth.height}, {colour}, "
+        f"baseline {baseline}, depth unit {1000 * camera.depth_scale_m:g} mm"
+    )
+
+
 def _rgb_converter(form: str) -> Callable[[AnyArray], Image]:
     """The function that makes (h, w, 3) RGB of a colour image in librealsense's format `form`."""
-    slices = {
-        "rgb8": np.s_[..., :3],
-        "rgba8": np.s_[..., :3],
-        "bgr8": np.s_[..., ::-1],
-        "bgra8": np.s_[..., 2::-1],
-    }
+    slices = {"rgb8": np.s_[..., :3], "rgba8": np.s_[..., :3]}
+    slices |= {"bgr8": np.s_[..., ::-1], "bgra8": np.s_[..., 2::-1]}
     if form in slices:
         return lambda image: image[slices[form]].copy()
     if form in ("yuyv", "uyvy"):
@@ -554,10 +542,10 @@ class RecordedSet(Camera):
     can_place = True
 
     def __init__(self, folder: Path) -> None:
-        self._index = Index.read(folder)
+        self._index = recording.Index.read(folder)
         self._turn_to(self._index.scenes[0])
 
-    def _turn_to(self, scene: RecordedScene, before: RealSense | None = None) -> None:
+    def _turn_to(self, scene: recording.RecordedScene, before: RealSense | None = None) -> None:
         """Open a recording, and say what it says; CameraError if another camera took it."""
         played = RealSense(path=self._index.folder / scene.file)
         if before is not None and played.serial != before.serial:
@@ -579,7 +567,7 @@ class RecordedSet(Camera):
         )
 
     def place(self, name: str, distance_m: float) -> None:
-        check_distance(distance_m)
+        recording.check_distance(distance_m)
         scene = next((s for s in self._index.scenes if s.is_at(name, distance_m)), None)
         if scene is None:
             raise CameraError(
@@ -609,41 +597,34 @@ class ImageFolder(Camera):
     """
 
     def __init__(self, folder: Path) -> None:
-        path, self._what = folder / INTRINSICS, f"the folder {folder.name}"
+        path, self._what = folder / recording.INTRINSICS, f"the folder {folder.name}"
         numbers = re.compile(r"(\d+)")  # a text's odd parts: img_2 comes before img_10
         self._images = sorted(
             folder.glob("*.png"),
             key=lambda png: [int(t) if i % 2 else t for i, t in enumerate(numbers.split(png.stem))],
         )
         if not self._images or not path.exists():
-            missing = INTRINSICS if self._images else "16-bit PNGs"
+            missing = recording.INTRINSICS if self._images else "16-bit PNGs"
             raise CameraError(
                 f"{self._what} lacks {missing}: to be a camera it holds 16-bit PNGs of depth and "
-                f"{INTRINSICS} with width, height, fx, fy, cx, cy (px) and depth_scale_m"
+                f"{recording.INTRINSICS} with width, height, fx, fy, cx, cy (px) and depth_scale_m"
             )
         try:
             given = results.read_json(path)
-            self.depth_scale_m = check_depth_scale(given.pop("depth_scale_m", None))
+            self.depth_scale_m = recording.check_depth_scale(given.pop("depth_scale_m", None))
             self.baseline_m = given.pop("baseline_m", None)
             if self.baseline_m is not None:
                 self.baseline_m = checks.positive("baseline_m", self.baseline_m)
             self.name = str(given.pop("name", "Depth camera"))
-            self._frames_per_s = checks.positive(
-                "frames_per_s", given.pop("frames_per_s", FRAMES_PER_S)
-            )
-            given["coeffs"] = tuple(given.get("coeffs", (0.0,) * 5))
+            rate = given.pop("frames_per_s", FRAMES_PER_S)
+            self._frames_per_s = checks.positive("frames_per_s", rate)
             self.depth = Intrinsics(**given)
         except (TypeError, ValueError) as error:
             raise CameraError(f"{path} cannot be used ({error}): correct it") from error
         self.source, self.serial, self.color, self.T_color_depth = "recorded", "", None, None
 
     def __repr__(self) -> str:
-        baseline = "none" if self.baseline_m is None else f"{1000 * self.baseline_m:.1f} mm"
-        return (
-            f"{self.name} ({self._what}, {counted(len(self._images), 'image')}): depth "
-            f"{self.depth.width}x{self.depth.height}, no colour, baseline {baseline}, depth unit "
-            f"{1000 * self.depth_scale_m:g} mm"
-        )
+        return _described(self, f"{self._what}, {counted(len(self._images), 'image')}", "none")
 
     def stream(self) -> Generator[Frame, None, None]:
         import cv2
@@ -654,7 +635,7 @@ class ImageFolder(Camera):
             image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
             if image is None or image.dtype != np.uint16 or image.shape != size:
                 got = "no image" if image is None else f"{image.dtype} {image.shape}"
-                wanted = f"16-bit grey of {size}, as {INTRINSICS} says"
+                wanted = f"16-bit grey of {size}, as {recording.INTRINSICS} says"
                 raise CameraError(f"{path} is {got}: want {wanted}")
             depth, time_s = image.astype(np.uint16), number / self._frames_per_s
             yield Frame(depth, None, self.depth_scale_m, time_s, number, self.depth)

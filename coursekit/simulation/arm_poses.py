@@ -159,12 +159,9 @@ class Setup:
         focal = min(self.intrinsics.fx, self.intrinsics.fy)
         with np.errstate(divide="ignore"):
             side_px = focal * self.board.square_m * facing / middle[:, 2]
-        return (
-            (middle[:, 2] > 0)
-            & (facing >= np.cos(STEEPEST_RAD))
-            & (side_px >= SMALLEST_SQUARE_PX)
-            & (self.upright(T) >= 1 + 2 * np.cos(self.turn_rad))
-        )
+        large = (middle[:, 2] > 0) & (side_px >= SMALLEST_SQUARE_PX)
+        upright = self.upright(T) >= 1 + 2 * np.cos(self.turn_rad)
+        return large & upright & (facing >= np.cos(STEEPEST_RAD))
 
 
 # --- careful sessions ---

@@ -32,15 +32,8 @@ from coursekit.checks import choice, number, positive, want, whole
 from coursekit.geometry import invert_transform, make_transform, project, transform_points, turned
 from coursekit.hand_eye.poses import MOUNTS, Mount, camera_board
 from coursekit.hand_eye.session import HandEyeSession
-from coursekit.simulation.arm_poses import (
-    Setup,
-    board_in_gripper,
-    board_on_table,
-    careful_poses,
-    degenerate_poses,
-    over_the_shoulder,
-    random_poses,
-)
+from coursekit.simulation import arm_poses
+from coursekit.simulation.arm_poses import Setup
 from coursekit.simulation.board_images import render_board
 from coursekit.simulation.corner_sessions import Effects, corner_noise, printed, with_street_errors
 from coursekit.specifications import device
@@ -162,9 +155,10 @@ def default_setup(mount: Mount) -> Setup:
     arm = widowx()
     if choice("mount", mount, MOUNTS) == "eye_in_hand":
         lens, board = device("D405").unit.color, TABLE_BOARD
-        return Setup(arm, mount, arm.T_gripper_camera, board_on_table(board), lens, board)
+        return Setup(arm, mount, arm.T_gripper_camera, arm_poses.board_on_table(board), lens, board)
     lens, board = device("D435").unit.color, HELD_BOARD
-    return Setup(arm, mount, over_the_shoulder(), board_in_gripper(board), lens, board)
+    X, Y = arm_poses.over_the_shoulder(), arm_poses.board_in_gripper(board)
+    return Setup(arm, mount, X, Y, lens, board)
 
 
 def hand_eye_session(
@@ -285,7 +279,7 @@ def _poses(
 @cache
 def _configurations(mount: Mount) -> Floats:
     """What the careful sessions of a default setup are drawn from, (160, 6) rad: half a second."""
-    return random_poses(default_setup(mount), np.random.default_rng(0), CONFIGURATIONS)
+    return arm_poses.random_poses(default_setup(mount), np.random.default_rng(0), CONFIGURATIONS)
 
 
 def _placed(mount: Mount, rng: np.random.Generator, n: int, design: Design) -> tuple[Setup, Floats]:
@@ -296,7 +290,7 @@ def _placed(mount: Mount, rng: np.random.Generator, n: int, design: Design) -> t
     default = default_setup(mount)
     in_place = FLAT_ON_TABLE if mount == "eye_in_hand" else np.ones(6)
     if design != "careful":
-        sets = degenerate_poses(mount, design)
+        sets = arm_poses.degenerate_poses(mount, design)
         whole("n", n, f"at most {sets.shape[1]} poses", least=3, most=sets.shape[1])
         if design != "grid":  # which is what it is with all its places only
             sets = sets[:, np.linspace(0, sets.shape[1] - 1, n).round().astype(int)]
@@ -311,10 +305,10 @@ def _placed(mount: Mount, rng: np.random.Generator, n: int, design: Design) -> t
             continue
         q = _configurations(mount)
         try:
-            return rig, careful_poses(rig, rng, n, q[rig.sees(rig.arm.forward(q))])
+            return rig, arm_poses.careful_poses(rig, rng, n, q[rig.sees(rig.arm.forward(q))])
         except ValueError:  # too few are left, or they turn too little: another place then
             continue
-    return default, careful_poses(default, rng, n) if design == "careful" else sets[0]
+    return default, arm_poses.careful_poses(default, rng, n) if design == "careful" else sets[0]
 
 
 def _joint_zero(seed: int, mistakes: HandEyeMistakes) -> tuple[Floats, int | None]:
