@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import copy
 import html
 import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import overload
+from typing import Self, TypeVar, overload
 
 from coursekit.arrays import Interval
 from coursekit.checks import is_number, want
 
+T = TypeVar("T")
 WIDTH = 88  # characters: fits a notebook's output cell; JupyterLab breaks longer lines in mid-word
 
 
@@ -91,7 +93,28 @@ class Finding:
         return "\n".join([self.title, *(wrapped(line, WIDTH - 3, "  ") for line in lines)])
 
 
-class Findings(Sequence[Finding]):
+class Listed(Sequence[T]):
+    """Things in their order, like an immutable list; a slice keeps what is said of them."""
+
+    def __init__(self, things: Iterable[T] = ()) -> None:
+        self._things = tuple(things)
+
+    @overload
+    def __getitem__(self, index: int) -> T: ...
+    @overload
+    def __getitem__(self, index: slice) -> Self: ...
+    def __getitem__(self, index: int | slice) -> T | Self:
+        if not isinstance(index, slice):
+            return self._things[index]
+        part = copy.copy(self)
+        part._things = self._things[index]
+        return part
+
+    def __len__(self) -> int:
+        return len(self._things)
+
+
+class Findings(Listed[Finding]):
     """Findings, the gravest first, and what was looked for without being found.
 
     looked_for: one phrase for each cause that was tested, whether it was found or not.
@@ -104,31 +127,17 @@ class Findings(Sequence[Finding]):
         looked_for: Iterable[str] = (),
         not_tested: Iterable[str] = (),
     ) -> None:
-        self._findings = tuple(findings)
+        super().__init__(findings)
         self.looked_for = tuple(looked_for)
         self.not_tested = tuple(not_tested)
 
     @property
     def names(self) -> tuple[str, ...]:
         """The ids of the findings, in order."""
-        return tuple(finding.name for finding in self._findings)
-
-    @overload
-    def __getitem__(self, index: int) -> Finding: ...
-    @overload
-    def __getitem__(self, index: slice) -> Findings: ...
-    def __getitem__(self, index: int | slice) -> Finding | Findings:
-        if isinstance(index, slice):
-            return Findings(self._findings[index], self.looked_for, self.not_tested)
-        return self._findings[index]
-
-    def __len__(self) -> int:
-        return len(self._findings)
+        return tuple(finding.name for finding in self)
 
     def _headline(self) -> str:
-        if not self._findings:
-            return "Nothing found."
-        return f"{counted(len(self), 'finding')}."
+        return f"{counted(len(self), 'finding')}." if self else "Nothing found."
 
     def _looked_for(self) -> list[str]:
         lines = []

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal, overload
+from typing import Literal
 
 import numpy as np
 
 from coursekit.arrays import AnyArray, Floats, Image, NDArray
 from coursekit.geometry import Intrinsics, align_depth_to_color, deproject_image
-from coursekit.words import counted
+from coursekit.words import Listed, counted
 
 NO_DEPTH = np.iinfo(np.uint16).max  # what some devices say of what is too far or not seen
 FRAMES_PER_S = 30  # of all streams that the course opens, simulates and records
@@ -97,7 +97,7 @@ class Frame:
         return f"Frame {self.number} at {self.time_s:.3f} s: depth {_size(self.depth)}, {color}"
 
 
-class Frames(Sequence[Frame]):
+class Frames(Listed[Frame]):
     """Frames in the order they were taken, like an immutable list; a slice of them is Frames too.
 
     >>> Frames()
@@ -106,30 +106,17 @@ class Frames(Sequence[Frame]):
     0
     """
 
-    def __init__(self, frames: Iterable[Frame] = ()) -> None:
-        self._frames = tuple(frames)
-
-    @overload
-    def __getitem__(self, index: int) -> Frame: ...
-    @overload
-    def __getitem__(self, index: slice) -> Frames: ...
-    def __getitem__(self, index: int | slice) -> Frame | Frames:
-        return Frames(self._frames[index]) if isinstance(index, slice) else self._frames[index]
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
     @property
     def depth(self) -> NDArray[np.uint16]:
         """All depth images as one array of counts, (N, H, W); ValueError when there is none."""
-        if not self._frames:
+        if not self:
             raise ValueError("frames: there are none, so there is no depth to stack")
-        return np.stack([frame.depth for frame in self._frames])
+        return np.stack([frame.depth for frame in self])
 
     def __repr__(self) -> str:
-        if not self._frames:
+        if not self:
             return "no frames"
-        seconds = self._frames[-1].time_s - self._frames[0].time_s
+        seconds = self[-1].time_s - self[0].time_s
         return f"{counted(len(self), 'frame')} in {seconds:.2f} s, first: {self[0]!r}"
 
 
