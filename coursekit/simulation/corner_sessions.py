@@ -210,8 +210,9 @@ def corner_session(
         said_px = effects.claimed * sigma_px
         detections.append(Detection(ids, found, lens.size, f"view {i:02d}", said_px, measured))
     depth_m, drawn = tuple(Z for _, _, Z in looks), (draw.focal_scale, draw.velocity_m_s)
-    faults = draw.blurred, draw.spoiled_view, wrong
-    return Detections(detections), Truth(lens, poses, effects, *drawn, *faults, depth_m, points)
+    blurred, spoiled = draw.blurred, draw.spoiled_view
+    truth = Truth(lens, poses, effects, *drawn, blurred, spoiled, wrong, depth_m, points)
+    return Detections(detections), truth
 
 
 # --- where the views are ---
