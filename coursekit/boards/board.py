@@ -13,7 +13,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import Any, Literal, get_args, overload
+from typing import Any, Literal, get_args
 
 import cv2
 import numpy as np
@@ -29,7 +29,7 @@ from coursekit.geometry import (
     project,
     transform_points,
 )
-from coursekit.words import counted
+from coursekit.words import Listed, counted
 
 BoardKind = Literal["checkerboard", "charuco"]
 FEWEST_SQUARES = {"checkerboard": 4, "charuco": 3}  # OpenCV finds none with fewer corners than 3x3
@@ -342,16 +342,16 @@ class Skipped:
         return f"{self.name}: {self.reason}"
 
 
-class Detections(Sequence[Detection]):
+class Detections(Listed[Detection]):
     """What was seen in many images, in their order, like an immutable list.
 
     skipped: the images that were not used. A slice keeps it; `pick` takes any choice of views.
     """
 
     def __init__(self, views: Iterable[Detection] = (), skipped: Iterable[Skipped] = ()) -> None:
-        self._views = tuple(views)
+        super().__init__(views)
         self.skipped = tuple(skipped)
-        for view in self._views:
+        for view in self:
             instance("views", view, Detection)
 
     @classmethod
@@ -368,10 +368,10 @@ class Detections(Sequence[Detection]):
     @property
     def size(self) -> tuple[int, int]:
         """(width, height) of all images, px; ValueError when there is none or they differ."""
-        if not self._views:
+        if not self:
             raise ValueError("detections: there are none, so there is no image size")
-        first = self._views[0]
-        for index, view in enumerate(self._views):
+        first = self[0]
+        for index, view in enumerate(self):
             if view.size != first.size:
                 raise ValueError(
                     f"detections: view {index} ({view.name}) is {_times(view.size)} px, the first "
@@ -379,27 +379,15 @@ class Detections(Sequence[Detection]):
                 )
         return first.size
 
-    @overload
-    def __getitem__(self, index: int) -> Detection: ...
-    @overload
-    def __getitem__(self, index: slice) -> Detections: ...
-    def __getitem__(self, index: int | slice) -> Detection | Detections:
-        if isinstance(index, slice):
-            return Detections(self._views[index], self.skipped)
-        return self._views[index]
-
     def pick(self, which: Iterable[int]) -> Detections:
         """The views with these numbers, in this order."""
-        return Detections((self._views[number] for number in which), self.skipped)
-
-    def __len__(self) -> int:
-        return len(self._views)
+        return Detections((self[number] for number in which), self.skipped)
 
     def __repr__(self) -> str:
-        corners = sum(len(view) for view in self._views)
+        corners = sum(len(view) for view in self)
         unused = f", {len(self.skipped)} not used" if self.skipped else ""
         lines = [f"{counted(len(self), 'view')} with {corners} corners{unused}"]
-        lines += [f"  {view!r}" for view in self._views[:LISTED]]
+        lines += [f"  {view!r}" for view in self[:LISTED]]
         if len(self) > LISTED:
             lines.append(f"  and {len(self) - LISTED} more")
         lines += [f"  not used: {skip!r}" for skip in self.skipped[:LISTED_SKIPPED]]
