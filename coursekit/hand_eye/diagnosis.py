@@ -20,8 +20,9 @@ from coursekit.checks import want
 from coursekit.hand_eye import causes, misread
 from coursekit.hand_eye.causes import Arms, Fit, MendedPairs, PosePairs
 from coursekit.hand_eye.closed_form import FEWEST_POSES
-from coursekit.hand_eye.poses import camera_board, mean_pose
+from coursekit.hand_eye.poses import camera_board, observability
 from coursekit.hand_eye.session import HandEyeSession
+from coursekit.hand_eye.views import nearer
 from coursekit.words import Finding, Findings
 
 _FARTHEST_M = 10.0  # that an arm reaches or a board is seen at; more is in millimetres
@@ -150,17 +151,19 @@ class _Case:
 
     def design(self) -> bool:
         """Whether the poses leave X free, which is then a finding."""
-        (first, second, third), axis, largest = _turns(self.pairs.T_base_gripper)
-        seen = _turns(self.pairs.T_camera_board)[0]
-        if seen[0] > SMALL_DEG and seen[0] > 5 * first:
+        known = observability(self.pairs.T_base_gripper, "eye_to_hand")
+        seen = observability(self.pairs.T_camera_board, "eye_to_hand").turns_deg[0]
+        first, second, third = known.turns_deg
+        if seen > SMALL_DEG and seen > 5 * first:
             return False  # the camera saw larger turns than the arm tells of: a matter of units
+        largest = known.largest_turn_deg
         turns = {"first": first, "second": second, "third": third, "largest": largest}
         if first < STILL_DEG:
             self.add("pure_translation", **turns)
         elif first < SMALL_DEG:
             self.add("small_rotations", **turns)
         elif second < SINGLE_DEG:
-            x, y, z = axis * np.sign(axis[np.argmax(np.abs(axis))]) + 0.0
+            x, y, z = known.axis * np.sign(known.axis[np.argmax(np.abs(known.axis))]) + 0.0
             self.add("single_axis", x=x, y=y, z=z, **turns)
         else:
             return False
@@ -254,13 +257,9 @@ class _Case:
         fit = self.pairs.fit
         expected = camera_board(self.pairs.T_base_gripper, fit.X, fit.Y[0], self.pairs.mount)
         chosen = self.pairs.T_camera_board.copy()
-        for row, view in enumerate(self.pairs.view):
-            other = boards[view].other
-            if other is None or not np.allclose(chosen[row], boards[view].T_camera_board):
-                continue
-            both = np.stack([chosen[row], other])
-            match = np.einsum("kij,ij->k", both[:, :3, :3], expected[row, :3, :3])
-            chosen[row] = both[match.argmax()]
+        given = np.stack([boards[view].T_camera_board for view in self.pairs.view])
+        as_given = np.isclose(chosen, given).all(axis=(1, 2))  # not put right meanwhile
+        chosen[as_given] = nearer([boards[view] for view in self.pairs.view], expected)[as_given]
         self.pairs = replace(self.pairs, T_camera_board=chosen)
 
     def residuals(self) -> list[str]:
@@ -308,19 +307,6 @@ def _by_differences(T: Floats, times: Floats) -> Floats | None:
         return None
     rates = step / np.diff(times)[:, None]
     return np.concatenate([rates[:1], (rates[1:] + rates[:-1]) / 2, rates[-1:]])
-
-
-def _turns(T: Floats) -> tuple[Floats, Floats, float]:
-    """Rms turns (3,) about the principal axes, deg; the first axis (3,); the largest turn, deg."""
-    from scipy.spatial.transform import Rotation
-
-    R = mean_pose(T)[:3, :3].T @ T[:, :3, :3]
-    vectors = np.degrees(Rotation.from_matrix(R).as_rotvec())
-    _, values, axes = np.linalg.svd(vectors, full_matrices=False)
-    i, j = np.triu_indices(len(T), 1)
-    cosine = (np.einsum("nij,nij->n", T[i, :3, :3], T[j, :3, :3]).min() - 1) / 2
-    axis = mean_pose(T)[:3, :3] @ axes[0]
-    return values / np.sqrt(len(T)), axis, float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
 # --- in words ---

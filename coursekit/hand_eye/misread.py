@@ -21,7 +21,7 @@ from coursekit.arrays import Floats, NDArray
 from coursekit.causes import log_chi2_tail
 from coursekit.geometry import invert_transform, pose_difference
 from coursekit.hand_eye.causes import LEAST_M, LEAST_RAD, Fit, PosePairs
-from coursekit.hand_eye.poses import Mount, camera_board, nearest_rotation
+from coursekit.hand_eye.poses import Mount, base_gripper, camera_board, nearest_rotation
 from coursekit.hand_eye.session import HandEyeSession
 
 PER_RADIAN = 180.0 / np.pi
@@ -522,8 +522,7 @@ def undo_notation(given: Fit, expected: Floats) -> Reading | None:
             continue
         fit = with_rotations(given.pairs, R).fit
         # `expected` leans on positions alone; with X and Y a pose's neighbours are told apart
-        M = fit.X @ fit.pairs.T_camera_board @ invert_transform(fit.Y[0])
-        arm = M if fit.pairs.mount == "eye_to_hand" else invert_transform(M)
+        arm = base_gripper(fit.pairs.T_camera_board, fit.X, fit.Y[0], fit.pairs.mount)
         numbers, _ = misreading.nearest(misreading.read.numbers(G), arm[:, :3, :3])
         fit = with_rotations(given.pairs, misreading.written.rotations(numbers)).fit
         if misreading.log_p(G, fit) < np.log(NOTATION_LEVEL):

@@ -41,7 +41,7 @@ from coursekit.boards.detector import SESSION, natural
 from coursekit.checks import array, choice, instance, transform, want
 from coursekit.formats import poses as pose_files
 from coursekit.formats.poses import JOINTS, PLACE, THREE, TURN, VELOCITIES, PoseRow
-from coursekit.geometry import Intrinsics, invert_transform, pose_difference
+from coursekit.geometry import Intrinsics, pose_difference
 from coursekit.hand_eye import refinement, views
 from coursekit.hand_eye.closed_form import CLOSED_FORMS, FEWEST_POSES, closed_form
 from coursekit.hand_eye.poses import (
@@ -49,9 +49,9 @@ from coursekit.hand_eye.poses import (
     LEVER_M,
     MOUNTS,
     Mount,
+    base_gripper,
     camera_board,
     check_poses,
-    first_alike,
     mean_pose,
     observability,
     stand_board,
@@ -64,6 +64,8 @@ POSES = "poses.csv"
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 OPTIONAL = {"times": ("time",), "q": JOINTS, "dq": VELOCITIES}
 REPEATS = "repeats"  # how the reason begins for which a pair is left out by `once`
+# Arm poses no farther apart, rad and m, are one pose, if the board is not seen to move by more.
+SAME_POSE, SAME_SIGHT = (np.radians(0.1), 1e-3), (np.radians(3.0), 0.01)
 BELONGS = 0.03  # rad and m, between an arm pose and that of its joint angles: an arm may err so
 
 
@@ -177,7 +179,16 @@ class HandEyeSession:
     @cached_property
     def first_alike(self) -> Integers:
         """Which pair (n,) each repeats: its own number where it repeats none before it."""
-        return first_alike(self.T_base_gripper, self.T_camera_board)
+        first = np.arange(len(self))
+        for i in range(1, len(first)):
+            earlier = np.flatnonzero(first[:i] == np.arange(i))
+            near = np.ones(len(earlier), bool)
+            for T, most in ((self.T_base_gripper, SAME_POSE), (self.T_camera_board, SAME_SIGHT)):
+                off = pose_difference(T[i], T[earlier]).reshape(-1, 2, 3)
+                near &= (np.linalg.norm(off, axis=2) < most).all(axis=1)
+            if near.any():
+                first[i] = earlier[near.argmax()]
+        return first
 
     @property
     def once(self) -> HandEyeSession:
@@ -514,12 +525,9 @@ def _first(
         else:
             X, Y = closed_form(arm, measured, mount, method)
         expected = camera_board(arm, X, Y, mount)
-        before, measured = measured, session.T_camera_board.copy()
-        for index, pose in enumerate(session.board_poses):
-            if pose.other is not None:
-                both = np.stack([pose.T_camera_board, pose.other])
-                turns = np.linalg.norm(pose_difference(expected[index], both)[:, :3], axis=1)
-                measured[index] = both[np.argmin(turns)]
+        before, measured = measured, session.T_camera_board
+        if session.board_poses:
+            measured = views.nearer(session.board_poses, expected)
         if np.array_equal(before, measured):
             break
     return X, Y, measured
@@ -707,8 +715,8 @@ class HandEyeResult(Estimate):
     @property
     def gripper_twists(self) -> Floats:
         """From where the arm says the gripper is to where the camera implies, (n, 6), rad and m."""
-        M = self.X @ views.enlarged(self.measured, self.scale) @ invert_transform(self.Y)
-        implied = M if self.mount == "eye_to_hand" else invert_transform(M)
+        seen = views.enlarged(self.measured, self.scale)
+        implied = base_gripper(seen, self.X, self.Y, self.mount)
         return pose_difference(self.T_base_gripper, implied)
 
     @property
@@ -795,7 +803,7 @@ class HandEyeResult(Estimate):
                 lines.append(f"scale = {value:.5f} ± {half:.5f}{self._level}")
             elif name.startswith("offset_"):
                 value, half = math.degrees(value), math.degrees(half)
-                lines.append(f"{name} = {value:.3f} ± {half:.3f} deg{self._level}")
+                lines.append(f"{name} = {round(value, 3) + 0.0:.3f} ± {half:.3f} deg{self._level}")
         if self.session.repeated:
             lines.append(self.session.repeated)
         if self.free:

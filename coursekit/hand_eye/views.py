@@ -208,6 +208,21 @@ def board_poses(
     return found
 
 
+def nearer(boards: Sequence[BoardPose], expected: Floats) -> Floats:
+    """Of the two poses that an image may allow the one that turns least from those expected.
+
+    expected (n, 4, 4): T_camera_board, as is what is returned.
+    """
+    chosen = [
+        min(
+            (pose.T_camera_board, pose.T_camera_board if pose.other is None else pose.other),
+            key=lambda T: float(np.linalg.norm(pose_difference(there, T)[:3])),
+        )
+        for pose, there in zip(boards, expected, strict=True)
+    ]
+    return np.stack(chosen)
+
+
 def _starts(seen: Detection, board: Board, intrinsics: Intrinsics, name: str) -> Floats:
     """The one or two poses (k, 4, 4) of IPPE."""
     rays = (seen.pixels - [intrinsics.cx, intrinsics.cy]) / [intrinsics.fx, intrinsics.fy]
