@@ -15,13 +15,13 @@ import numpy as np
 
 from coursekit.arm import Arm, ArmErrors, pose_difference
 from coursekit.arrays import Floats
-from coursekit.causes import Accepted, CauseSearch, DiagnosisTexts
+from coursekit.causes import Accepted, CauseSearch
 from coursekit.checks import want
 from coursekit.hand_eye import causes, misread
 from coursekit.hand_eye.causes import Arms, Fit, MendedPairs, PosePairs
 from coursekit.hand_eye.closed_form import FEWEST_POSES
 from coursekit.hand_eye.poses import camera_board, observability
-from coursekit.hand_eye.session import HandEyeSession
+from coursekit.hand_eye.session import TEXTS, HandEyeSession
 from coursekit.hand_eye.views import nearer
 from coursekit.words import Finding, Findings
 
@@ -35,7 +35,6 @@ POOR_RAD, POOR_M = np.radians(2.0), 0.02  # residuals that no working arm has
 HOPELESS_RAD = np.radians(10.0)  # beyond any slip, delay or wrong zero
 VIDEO_STEP_M, VIDEO_STEP_RAD = 0.1, np.radians(20.0)  # at most, for velocities from positions
 FAR_FROM_MIDDLE = 0.12  # of the image: no camera's principal point is so far off
-_TEXTS = DiagnosisTexts.of("hand_eye")
 
 
 def diagnose(
@@ -85,13 +84,13 @@ class _Case:
 
     def add(self, key: str, **figures: Any) -> None:
         """A finding."""
-        self.found.append(_TEXTS.finding(key, **figures))
+        self.found.append(TEXTS.finding(key, **figures))
 
     def findings(self, *unseen: str) -> Findings:
         """What was found, with what could not be tested."""
         figures = {"pairs": causes.FEWEST_PAIRS, "repeated": self.session.repeated}
-        reasons = [_TEXTS.not_tested[key].format(**figures) for key in unseen]
-        return Findings(self.found, _TEXTS.looked_for, reasons)
+        reasons = [TEXTS.not_tested[key].format(**figures) for key in unseen]
+        return Findings(self.found, TEXTS.looked_for, reasons)
 
     # --- units ---
 
@@ -183,7 +182,7 @@ class _Case:
         better = misread.better_reading(given, either, misread.PAIRING_SHIFT_LEFT)
         if better:
             self.pairs = better.fit.pairs
-            options = misread.candidates(better.fit, self.session, misread.INVERTED)
+            options = misread.candidates(better.fit, self.session, "inverted")
             if self._off_joints(self.session.T_base_gripper, self.q) < AS_COMPUTED_M:
                 against = (*options[0].against, "the arm poses are those of the joint angles")
                 options[0] = replace(options[0], against=against)
@@ -195,7 +194,7 @@ class _Case:
         elif given.turn_rad > POOR_RAD:
             self._rotations(given)
         elif given.shift_m < POOR_M:
-            asked, *others = misread.candidates(given, self.session, misread.DECLARED)
+            asked, *others = misread.candidates(given, self.session, "declared")
             others = [other for other in others if not other.against]
             if asked.against and others:
                 self.add("two_that_cancel", asked=asked.says(), candidates=_listed(others))
@@ -206,7 +205,8 @@ class _Case:
         """Board poses in a camera frame whose z does not look forward; X absorbs that."""
         axis, share, ahead = misread.looking_along(self.pairs.T_camera_board)
         if axis != "z" and ahead < 1 - misread.SHARE_IN_VIEW < misread.SHARE_IN_VIEW < share:
-            what, cure = misread.CAMERA_AXES.get(axis, misread.OTHER_AXES)
+            known = TEXTS.words["camera_axes"]
+            what, cure = known.get(axis, known["other"])
             self.add("camera_axes", axis=axis, share=100 * share, what=what, cure=cure)
 
     def _rotations(self, given: Fit) -> None:
@@ -346,7 +346,7 @@ def _from_residuals(search: CauseSearch[MendedPairs], session: HandEyeSession) -
         figures = _figures(step, search.model, session) | _change(step.before.fit, step.after.fit)
         if odd:
             figures |= {"names": ", ".join(names), "left": odd[-1].after.fit.says()}
-        found.append(_TEXTS.finding(step.test.cause, step.test.p_value, **figures))
+        found.append(TEXTS.finding(step.test.cause, step.test.p_value, **figures))
     return found
 
 

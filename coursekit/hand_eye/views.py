@@ -213,14 +213,14 @@ def nearer(boards: Sequence[BoardPose], expected: Floats) -> Floats:
 
     expected (n, 4, 4): T_camera_board, as is what is returned.
     """
-    chosen = [
-        min(
-            (pose.T_camera_board, pose.T_camera_board if pose.other is None else pose.other),
-            key=lambda T: float(np.linalg.norm(pose_difference(there, T)[:3])),
-        )
-        for pose, there in zip(boards, expected, strict=True)
-    ]
-    return np.stack(chosen)
+    both = np.array(
+        [
+            [pose.T_camera_board, pose.T_camera_board if pose.other is None else pose.other]
+            for pose in boards
+        ]
+    )
+    turns = np.linalg.norm(pose_difference(expected[:, None], both)[..., :3], axis=-1)
+    return both[np.arange(len(both)), turns.argmin(axis=1)]
 
 
 def _starts(seen: Detection, board: Board, intrinsics: Intrinsics, name: str) -> Floats:
