@@ -427,7 +427,7 @@ class DiagnosisTexts:
     """What a room's diagnosis says, from `findings.toml`: templates with names for the figures.
 
     findings: `says`, `evidence` and `remedy` of each. looked_for: one phrase a cause. not_tested:
-    one sentence for each reason why something could not be tested.
+    one sentence for each reason why something could not be tested. words: what else the room says.
 
     >>> texts = DiagnosisTexts.of("intrinsics")
     >>> texts.finding("focus_drift", drift=1.25, normal=0.2, took="").evidence[:30]
@@ -437,6 +437,7 @@ class DiagnosisTexts:
     findings: dict[str, dict[str, str]]
     looked_for: Sequence[str]
     not_tested: dict[str, str]
+    words: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
     def of(cls, room: str) -> DiagnosisTexts:

@@ -150,7 +150,7 @@ def test_candidates_are_listed_and_the_true_one_has_the_true_X(seed: int, kind: 
         assert f"({number}) {name}" in finding.evidence
     inverted = invert_transform(given.T_base_gripper)
     fit = replace(PosePairs.of(given), T_base_gripper=inverted).fit
-    options = misread.candidates(fit, given, misread.INVERTED)
+    options = misread.candidates(fit, given, "inverted")
     [mine] = [option for option in options if option.name.startswith(words[kind])]
     assert mine.mount == truth.mount
     assert not mine.against

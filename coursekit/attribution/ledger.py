@@ -22,16 +22,7 @@ from coursekit.checks import want
 from coursekit.results import folder, now, write_bytes
 from coursekit.words import counted
 
-FORMULA_SIGNS = (
-    "=",
-    "+",
-    "-",
-    "@",
-    "＝",
-    "＋",
-    "－",
-    "＠",
-)  # what a spreadsheet takes as a formula
+FORMULA_SIGNS = tuple("=+-@＝＋－＠")  # what a spreadsheet takes as a formula
 LONGEST = 500
 
 
@@ -162,9 +153,7 @@ def _entry(row: list[str]) -> Entry:
     """The entry that is written in a row of cells; ValueError for what is none."""
     if len(row) != len(LEDGER_HEADER):
         raise ValueError(f"has {len(row)} fields, want {len(LEDGER_HEADER)}")
-    return Entry(
-        **{name: _value(name, cell) for name, cell in zip(LEDGER_HEADER, row, strict=True)}
-    )
+    return Entry(*map(_value, LEDGER_HEADER, row))
 
 
 def _value(name: str, cell: str) -> Any:

@@ -54,46 +54,40 @@ def _ray(view: View) -> Floats:
     return (view.R_base_camera @ view.ray)[:, None]
 
 
+def _across(view: View) -> Floats:
+    return view.R_base_camera @ view.by_pixel
+
+
+def _turn(view: View) -> Floats:
+    return -cross_matrix(view.lever_base)
+
+
+def _by_K(view: View) -> Floats:
+    return view.R_base_camera @ view.by_parameter
+
+
 def _disparity(view: View) -> Floats:
     return float(depth_slope(view.distance_m, view.intrinsics.fx, view.baseline_m)) * _ray(view)
 
 
 @dataclass(frozen=True)
 class _Conversion:
-    """How a kind of term reaches the object: unit of its magnitude, unit and factor for people,
-    in words, and M (3, k) from a view."""
+    """How a kind of term reaches the object: unit and factor of its magnitude for people, in
+    words, and M (3, k) from a view."""
 
-    unit: str
     shown: tuple[str, float]
     words: str
     matrix: Callable[[View], Floats]
 
 
 _CONVERSIONS: dict[str, _Conversion] = {
-    "image": _Conversion(
-        "px",
-        ("px", 1.0),
-        "times Z/f, across the view",
-        lambda view: view.R_base_camera @ view.by_pixel,
-    ),
-    "ray": _Conversion("m", ("mm", 1e3), "along the ray, leaks sideways by tan", _ray),
-    "scale": _Conversion(
-        "1", ("%", 1e2), "times Z along the ray", lambda view: view.distance_m * _ray(view)
-    ),
-    "disparity": _Conversion("px", ("px", 1.0), "times Z²/(f B), along the ray", _disparity),
-    "turn": _Conversion(
-        "rad",
-        ("deg", math.degrees(1.0)),
-        "times the lever arm, across it",
-        lambda view: -cross_matrix(view.lever_base),
-    ),
-    "shift": _Conversion("m", ("mm", 1e3), "direct", lambda view: np.eye(3)),
-    "intrinsics": _Conversion(
-        "1",
-        ("σ", 1.0),
-        "through the derivatives by K and lens",
-        lambda view: view.R_base_camera @ view.by_parameter,
-    ),
+    "image": _Conversion(("px", 1.0), "times Z/f, across the view", _across),
+    "ray": _Conversion(("mm", 1e3), "along the ray, leaks sideways by tan", _ray),
+    "scale": _Conversion(("%", 1e2), "times Z along the ray", lambda v: v.distance_m * _ray(v)),
+    "disparity": _Conversion(("px", 1.0), "times Z²/(f B), along the ray", _disparity),
+    "turn": _Conversion(("deg", math.degrees(1.0)), "times the lever arm, across it", _turn),
+    "shift": _Conversion(("mm", 1e3), "direct", lambda _: np.eye(3)),
+    "intrinsics": _Conversion(("σ", 1.0), "through the derivatives by K and lens", _by_K),
 }
 
 
@@ -140,11 +134,6 @@ class ErrorTerm:
         checks.number("floor", self.floor, "0 or more, and 0 for a bias", least=0.0, most=most)
         rooted = self.along != "intrinsics" or self.factor is not None
         want(rooted, "factor", self.factor, "a square root of the covariance of K")
-
-    @property
-    def unit(self) -> str:
-        """Of low and high: "px", "m", "rad" or "1"."""
-        return _CONVERSIONS[self.along].unit
 
     @property
     def conversion(self) -> str:

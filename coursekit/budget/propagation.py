@@ -19,7 +19,7 @@ from coursekit import checks
 from coursekit.arrays import ArrayLike, Floats
 from coursekit.budget.view import View
 from coursekit.checks import want
-from coursekit.geometry import cross_matrix
+from coursekit.geometry import cross_matrix, distortion_jacobian
 from coursekit.hand_eye.poses import Mount
 from coursekit.intrinsics.derivatives import PARAMETERS, scaled_root
 
@@ -264,9 +264,10 @@ def _depth(Z: float, error: Floats, through_disparity: bool) -> Floats:
     return np.asarray(Z / np.where(disparity > 0, disparity, np.nan))
 
 
-def _ideal(x: Floats, y: Floats, start: Floats, lens: list[Floats]) -> tuple[Floats, Floats]:
+def _ideal(x: Floats, y: Floats, start: Floats, lens: Any) -> tuple[Floats, Floats]:
     """The ideal coordinates of distorted ones, each with its own lens, from a point close by.
 
+    lens: k1, k2, p1, p2, k3, of one number or (m,) each.
     NaN where Newton's method has not arrived: close to a fold, or beyond it.
     """
     k1, k2, p1, p2, k3 = lens
@@ -276,10 +277,7 @@ def _ideal(x: Floats, y: Floats, start: Floats, lens: list[Floats]) -> tuple[Flo
         radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
         off_x = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a) - x
         off_y = b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b - y
-        slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
-        xx = radial + a * a * slope + 2 * p1 * b + 6 * p2 * a
-        xy = a * b * slope + 2 * p1 * a + 2 * p2 * b
-        yy = radial + b * b * slope + 6 * p1 * b + 2 * p2 * a
+        xx, xy, yy = distortion_jacobian(np.stack([a, b], axis=-1), lens)
         determinant = xx * yy - xy * xy
         step_a = (yy * off_x - xy * off_y) / determinant
         step_b = (xx * off_y - xy * off_x) / determinant

@@ -139,15 +139,10 @@ def _kalibr(camera: Any, name: str) -> dict[str, Any]:
 
 
 def _colmap(words: list[str], name: str) -> dict[str, Any]:
-    known = ", ".join(FORMAT_TEXTS["colmap"])
-    model = words[1]
-    want(
-        model in FORMAT_TEXTS["colmap"],
-        f"{name}, model",
-        model,
-        f"one of {known}: no other is pinhole",
-    )
-    names = ("width", "height", *FORMAT_TEXTS["colmap"][model].split())
+    model, models = words[1], FORMAT_TEXTS["colmap"]
+    wanted = f"one of {', '.join(models)}: no other is pinhole"
+    want(model in models, f"{name}, model", model, wanted)
+    names = ("width", "height", *models[model].split())
     values = numbers(words[2:], name)
     want(len(values) == len(names), name, words, f"{len(names)} numbers after {model}")
     found: dict[str, Any] = dict(zip(names, values, strict=True))

@@ -31,7 +31,8 @@ PLACE, TURN, THREE = ("x", "y", "z"), ("qx", "qy", "qz", "qw"), ("rx", "ry", "rz
 JOINTS = tuple(f"q{joint}" for joint in range(6))
 VELOCITIES = tuple(f"d{name}" for name in JOINTS)
 ANGULAR = (*THREE, *JOINTS, *VELOCITIES)
-UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "rad": 1.0, "deg": math.pi / 180}
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "rad": 1.0}
+UNITS |= dict.fromkeys(("deg", "degrees", "°"), math.pi / 180)
 AXIS_ORDERS = [f"{a}{b}{c}" for a, b, c in itertools.product("xyz", repeat=3) if a != b != c]
 ROTATIONS = ("rotation_vector", *AXIS_ORDERS, *(order.upper() for order in AXIS_ORDERS))
 COLUMN_NAMES = {
@@ -39,10 +40,8 @@ COLUMN_NAMES = {
 }
 HEADING = re.compile(r"(.+?)(?:[ _]*[\[(]|[ _])(mm|cm|m|deg|degrees|rad|°)[\])]?")
 UNIT_TOLERANCE = 1e-3  # of a quaternion's length: four digits
-LONGEST_ARM_M, SHORTEST_ARM_M = (
-    10.0,
-    0.005,
-)  # no arm's gripper is farther from its base's origin, nor that near
+# No arm's gripper is farther from its base's origin than the one, nor as near as the other, always
+LONGEST_ARM_M, SHORTEST_ARM_M = 10.0, 0.005
 TABLE = "a table of arm poses"
 SAMPLES = "pose samples of easy_handeye2 or MoveIt"
 PLACE_FORMATS = ("tf2", "urdf", "moveit", "easy_handeye2")
@@ -80,9 +79,7 @@ class PoseTable:
 
     def row(self, line: int, cells: Sequence[str]) -> PoseRow:
         """A line of the table, with what is wrong in it."""
-        texts = {
-            ours: cells[at].strip() if at < len(cells) else "" for ours, at in self.places.items()
-        }
+        texts = {ours: "".join(cells[at : at + 1]).strip() for ours, at in self.places.items()}
         file, values = texts.pop("file", "").replace("\\", "/"), {}
         for ours, text in texts.items():
             plain = text.strip('p[]()" ')  # as Universal Robots write a pose: p[0.1, ..., 3.1]
@@ -99,9 +96,8 @@ class PoseTable:
         turn = [values[name] for name in (THREE if self.rotation else TURN)]
         length = float(np.linalg.norm(turn))
         if not self.rotation and abs(length - 1) > UNIT_TOLERANCE:
-            return PoseRow(
-                line, file, values, None, f"the quaternion has length {length:.4g}, want 1"
-            )
+            problem = f"the quaternion has length {length:.4g}, want 1"
+            return PoseRow(line, file, values, None, problem)
         T[:3, :3] = turned_by(turn, self.rotation).as_matrix()
         return PoseRow(line, file, values, T)
 
@@ -172,11 +168,7 @@ def _known(cell: str) -> tuple[str, str, str]:
     plain = re.sub(r"[.\-/]", "_", cell[:60].strip('" ').lower())
     found = HEADING.fullmatch(plain)
     if found and found[1] in COLUMN_NAMES:
-        return (
-            COLUMN_NAMES[found[1]],
-            found[1],
-            {"degrees": "deg", "°": "deg"}.get(found[2], found[2]),
-        )
+        return COLUMN_NAMES[found[1]], found[1], found[2]
     return COLUMN_NAMES.get(plain, plain), plain, ""
 
 
@@ -185,9 +177,8 @@ def _columns(
 ) -> PoseTable:
     """What the header and the caller say of the columns; ValueError where that is not enough."""
     places: dict[str, int] = {}
-    units = dict.fromkeys(PLACE, UNITS[length or "m"]) | dict.fromkeys(
-        ANGULAR, UNITS[angle or "rad"]
-    )
+    units = dict.fromkeys(PLACE, UNITS[length or "m"])
+    units |= dict.fromkeys(ANGULAR, UNITS[angle or "rad"])
     says, angular = None, angle is not None
     for at, (ours, plain, unit) in enumerate(map(_known, cells)):
         if ours not in FORMAT_TEXTS["columns"]:
@@ -215,11 +206,8 @@ def _plausible(table: PoseTable, rows: list[dict[str, float]]) -> None:
         raise ValueError(f"{table.name}: {what}; {say}, or name the columns so ('x_mm', 'rz_deg')")
 
     for names in (PLACE, THREE, JOINTS):
-        if (
-            not rows
-            or not table.places.keys() >= {*names}
-            or (names == THREE and not table.rotation)
-        ):
+        there = table.places.keys() >= {*names} and (names != THREE or table.rotation)
+        if not rows or not there:
             continue
         most = max(abs(row[name]) for row in rows for name in names)
         few, degrees = len(rows) < 3, table.units[names[0]] < 1

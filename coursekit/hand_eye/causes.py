@@ -23,12 +23,13 @@ from functools import cached_property
 from itertools import product
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from coursekit.arm import Arm, ArmErrors, fk_covariance, pose_difference
 from coursekit.arrays import Floats, NDArray
 from coursekit.causes import CauseSearch, Hypothesis, Tested, likelihood_ratios, search
-from coursekit.geometry import invert_transform, turned
-from coursekit.hand_eye.closed_form import motions, rotation_by_axes
+from coursekit.geometry import turned
+from coursekit.hand_eye.closed_form import motions, rotation_by_axes, translation_half
 from coursekit.hand_eye.poses import (
     Mount,
     by_arm_twist,
@@ -36,8 +37,10 @@ from coursekit.hand_eye.poses import (
     camera_board,
     carrier_stand,
     mean_pose,
+    stand_board,
 )
 from coursekit.hand_eye.session import HandEyeSession
+from coursekit.hand_eye.views import enlarged
 
 ROBUST_STEPS, SMALLEST_STEP = 15, 1e-7  # m and rad
 CAUCHY_WIDTH = 3.0  # times the usual residual: from there on a pair counts less and less
@@ -113,9 +116,8 @@ class PosePairs:
 
     def keep(self, mask: NDArray[np.bool_]) -> PosePairs:
         """The pairs where mask (n,) is true."""
-        arm, seen, image = (a[mask] for a in (self.T_base_gripper, self.T_camera_board, self.image))
-        segment, view, row = (a[mask] for a in (self.segment, self.view, self.row))
-        return PosePairs(arm, seen, self.mount, image, segment, view, row)
+        names = ("T_base_gripper", "T_camera_board", "image", "segment", "view", "row")
+        return replace(self, **{name: getattr(self, name)[mask] for name in names})
 
     @cached_property
     def fit(self) -> Fit:
@@ -124,17 +126,12 @@ class PosePairs:
 
     def scaled(self, factor: float) -> PosePairs:
         """With a board that is `factor` times as large as it was taken for."""
-        T, image = self.T_camera_board.copy(), self.image.copy()
-        T[:, :3, 3] *= factor
-        image[:, 3:] *= factor
-        image[:, :, 3:] *= factor
-        return replace(self, T_camera_board=T, image=image)
+        by, T = np.repeat([1.0, factor], 3), enlarged(self.T_camera_board, factor)
+        return replace(self, T_camera_board=T, image=self.image * np.outer(by, by))
 
     def arm_scaled(self, factor: float) -> PosePairs:
         """With the arm's translations times `factor`."""
-        T = self.T_base_gripper.copy()
-        T[:, :3, 3] *= factor
-        return replace(self, T_base_gripper=T)
+        return replace(self, T_base_gripper=enlarged(self.T_base_gripper, factor))
 
     def exchanged(self) -> PosePairs:
         """Camera and arm with their parts exchanged, as eye-to-hand: C Y^-1 = X^-1 M."""
@@ -177,13 +174,16 @@ class Fit:
     @property
     def columns(self) -> Floats:
         """d predicted twists / d twists of X and of each segment's Y: (n, 6, 6 + 6 k)."""
-        columns = np.zeros((len(self.pairs), 6, 6 + 6 * len(self.Y)))
-        for number, Y in enumerate(self.Y):
-            mine = self.pairs.segment == number
-            both = by_X_and_Y(self.pairs.T_base_gripper[mine], self.X, Y, self.pairs.mount)
-            columns[mine, :, :6] = both[..., :6]
-            columns[mine, :, 6 + 6 * number : 12 + 6 * number] = both[..., 6:]
-        return columns
+        by_X, by_Y = np.split(self.by_X_and_Y, 2, axis=2)
+        mine = np.eye(len(self.Y))[self.pairs.segment]
+        each = mine[:, None, :, None] * by_Y[:, :, None]
+        return np.concatenate([by_X, each.reshape(len(mine), 6, -1)], axis=2)
+
+    @property
+    def by_X_and_Y(self) -> Floats:
+        """d predicted twists / d twists of X and of the Y that is each pair's, (n, 6, 12)."""
+        pairs = self.pairs
+        return by_X_and_Y(pairs.T_base_gripper, self.X, self.Y[pairs.segment], pairs.mount)
 
     def says(self) -> str:
         """Its typical residual in words: "0.4 mm and 0.05 deg"."""
@@ -235,11 +235,8 @@ def _closed_form(pairs: PosePairs) -> tuple[Floats, Floats]:
     A, B = motions(main.T_base_gripper, main.T_camera_board, pairs.mount)
     X = np.eye(4)
     X[:3, :3] = rotation_by_axes(A, B)
-    rows = (A[:, :3, :3] - np.eye(3)).reshape(-1, 3)
-    right = (B[:, :3, 3] @ X[:3, :3].T - A[:, :3, 3]).ravel()
-    X[:3, 3] = np.linalg.lstsq(rows, right, rcond=1e-10)[0]
-    stand = invert_transform(carrier_stand(pairs.T_base_gripper, pairs.mount))
-    places = stand @ X @ pairs.T_camera_board
+    X[:3, 3] = translation_half(A, B, X[:3, :3])
+    places = stand_board(pairs.T_base_gripper, pairs.T_camera_board, X, pairs.mount)
     Y = [mean_pose(places[pairs.segment == k]) for k in range(pairs.segment.max() + 1)]
     return X, np.stack(Y)
 
@@ -317,11 +314,6 @@ class MendedPairs:
         if test.cause == OUTLIER:
             left = pairs.keep(np.arange(len(pairs)) != at)
             return replace(self, fit=left.fit, odd=self.odd + 1)
-        if test.cause == STEADY:
-            effect = (test.hypothesis.columns @ test.coefficients).reshape(-1, 6)
-            straight = replace(pairs, T_camera_board=turned(pairs.T_camera_board, -effect))
-            after = replace(self, smooth=(*self.smooth, (STEADY, at)), fit=straight.fit)
-            return after if after.fit.better_than(self.fit) > 1.0 else None
         if test.cause == SLIP:
             segment, Y = pairs.segment.copy(), self.fit.Y
             moved = turned(Y[segment[at]], test.coefficients)
@@ -329,7 +321,10 @@ class MendedPairs:
             start = (self.fit.X, np.concatenate([Y, moved[None]]))
             return replace(self, fit=robust_fit(replace(pairs, segment=segment), start))
         after = replace(self, smooth=(*self.smooth, (test.cause, at)))
-        if test.cause == SCALE:
+        if test.cause == STEADY:
+            effect = (test.hypothesis.columns @ test.coefficients).reshape(-1, 6)
+            pairs = replace(pairs, T_camera_board=turned(pairs.T_camera_board, -effect))
+        elif test.cause == SCALE:
             pairs = pairs.scaled(1.0 + size)
             after = replace(after, scale=self.scale * (1.0 + size))
         elif test.cause == LATE:
@@ -361,9 +356,9 @@ class MendedPairs:
                 found.append(Hypothesis(ARM_ERROR, column, joint, tried=4))
         rows = np.arange(6 * n).reshape(n, 6)
         found += [Hypothesis(OUTLIER, np.eye(6), i, rows[i], tried=n) for i in range(n)]
-        by_Y = fit.columns[:, :, 6:].reshape(n, 6, -1, 6).sum(axis=2)
+        both = np.split(fit.by_X_and_Y, 2, axis=2)
         time = (pairs.view - pairs.view.mean()) / np.ptp(pairs.view)  # 1 over the whole session
-        for place, columns in enumerate((fit.columns[:, :, :6], by_Y)):
+        for place, columns in enumerate(both):
             steady = (time[:, None, None] * columns).reshape(-1, 6)
             found.append(Hypothesis(STEADY, steady, place, tried=2))
         later = {}
@@ -373,7 +368,7 @@ class MendedPairs:
             if SHORTEST_SEGMENT <= len(after) <= len(mine) - SHORTEST_SEGMENT:
                 later[at] = after
         for at, after in later.items():
-            columns = by_Y[after].reshape(-1, 6)
+            columns = both[1][after].reshape(-1, 6)
             found.append(Hypothesis(SLIP, columns, at, rows[after].ravel(), tried=len(later)))
         return found
 
@@ -386,7 +381,7 @@ class MendedPairs:
     def covariances(self) -> Iterator[Floats]:
         """Of all residuals, (6 n, 6 n): for each factor of the arm's errors, and of each pose's."""
         pairs, n = self.fit.pairs, len(self.fit.pairs)
-        image = _diagonal(pairs.image + np.diag(np.repeat([CAMERA_RAD**2, CAMERA_M**2], 3)))
+        image = block_diag(*pairs.image + np.diag(np.repeat([CAMERA_RAD**2, CAMERA_M**2], 3)))
         size, same_axis = self._usual.ravel(), np.eye(6)
         owns = [np.outer(size, size) * np.kron(alike, same_axis) for alike in self._alike()]
         arms = [np.zeros((6 * n, 6 * n))]
@@ -394,7 +389,7 @@ class MendedPairs:
             errors = fk_covariance(self._joints(), self.arms.errors, self.arms.arm)
             shared = (self._by_arm @ errors.shared * errors.sigma).reshape(6 * n, -1)
             each = self._by_arm @ errors.each @ np.swapaxes(self._by_arm, 1, 2)
-            arm = shared @ shared.T + _diagonal(each)
+            arm = shared @ shared.T + block_diag(*each)
             arms = [factor**2 * arm for factor in ARM_FACTORS]
         for arm, own, factor in product(arms, owns, OWN_FACTORS):
             yield image + arm + factor**2 * own
@@ -430,12 +425,8 @@ class MendedPairs:
     @cached_property
     def _by_arm(self) -> Floats:
         """d predicted twist / d the gripper's twist in the base's axes, (n, 6, 6)."""
-        pairs = self.fit.pairs
-        by_arm = np.empty((len(pairs), 6, 6))
-        for number, Y in enumerate(self.fit.Y):
-            mine = pairs.segment == number
-            by_arm[mine] = by_arm_twist(pairs.T_base_gripper[mine], self.fit.X, Y, pairs.mount)
-        return by_arm
+        pairs, fit = self.fit.pairs, self.fit
+        return by_arm_twist(pairs.T_base_gripper, fit.X, fit.Y[pairs.segment], pairs.mount)
 
     def _joints(self) -> Floats:
         """The joint angles (n, 6) with their zeros put right, rad."""
@@ -455,14 +446,6 @@ def turn_and_shift(test: Tested) -> tuple[float, float]:
     """How far a slip or an odd pose turns, rad, and moves, m."""
     turn, shift = np.linalg.norm(test.coefficients.reshape(2, 3), axis=1)
     return float(turn), float(shift)
-
-
-def _diagonal(blocks: Floats) -> Floats:
-    """(n, 6, 6) along the diagonal of (6 n, 6 n)."""
-    n = len(blocks)
-    full = np.zeros((n, 6, n, 6))
-    full[np.arange(n), :, np.arange(n)] = blocks
-    return full.reshape(6 * n, 6 * n)
 
 
 def _moved(pairs: PosePairs, twists: Floats) -> PosePairs:

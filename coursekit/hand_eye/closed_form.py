@@ -41,6 +41,7 @@ CLOSED_FORMS = ("closed_form", *HAND_EYE, *ROBOT_WORLD)
 FEWEST_POSES = 3
 HALF_TURN_DEG = 170.0  # beyond it noise can turn an axis round
 LEAST_TURN_RAD = np.radians(0.1)  # less than any arm's own wobble
+SINGULAR = 1e-13  # of the normal matrix' largest eigenvalue: rounding errors are as large
 NO_CAMERA_M = 1e5  # farther away is no camera, not even in millimetres that pass for metres
 NONSENSE_ROTATION = 1e-2  # R R^T - 1 of a solver's output: below it rounding, above it nonsense
 
@@ -100,13 +101,14 @@ def translation_half(A: Floats, B: Floats, R_X: Floats) -> Floats:
     """t_X (..., 3) in m of (R_A - 1) t_X = R_X t_B - t_A, by least squares over p pairs.
 
     A, B (..., p, 4, 4) and R_X (..., 3, 3), which comes first: an error of R_X acts on t_B, so the
-    board's distance decides how much of it ends up in t_X. Raises LinAlgError where the rotations
-    of A have fewer than two axes and the normal matrix is singular.
+    board's distance decides how much of it ends up in t_X. The shortest t_X where the rotations of
+    A have fewer than two axes.
     """
     rows = A[..., :3, :3] - np.eye(3)
     right = B[..., :3, 3] @ np.swapaxes(R_X, -1, -2) - A[..., :3, 3]
     normal = np.einsum("...pki,...pkj->...ij", rows, rows)
-    return np.linalg.solve(normal, np.einsum("...pki,...pk->...i", rows, right)[..., None])[..., 0]
+    inverse = np.linalg.pinv(normal, rcond=SINGULAR, hermitian=True)
+    return np.einsum("...ij,...pkj,...pk->...i", inverse, rows, right, optimize=True)
 
 
 def rotation_from_shifts(

@@ -15,13 +15,14 @@ import numpy as np
 
 from coursekit.arm import Arm, ArmErrors, pose_difference
 from coursekit.arrays import Floats
-from coursekit.causes import Accepted, CauseSearch, DiagnosisTexts
+from coursekit.causes import Accepted, CauseSearch
 from coursekit.checks import want
 from coursekit.hand_eye import causes, misread
 from coursekit.hand_eye.causes import Arms, Fit, MendedPairs, PosePairs
 from coursekit.hand_eye.closed_form import FEWEST_POSES
-from coursekit.hand_eye.poses import camera_board, mean_pose
-from coursekit.hand_eye.session import HandEyeSession
+from coursekit.hand_eye.poses import camera_board, observability
+from coursekit.hand_eye.session import TEXTS, HandEyeSession
+from coursekit.hand_eye.views import nearer
 from coursekit.words import Finding, Findings
 
 _FARTHEST_M = 10.0  # that an arm reaches or a board is seen at; more is in millimetres
@@ -34,7 +35,6 @@ POOR_RAD, POOR_M = np.radians(2.0), 0.02  # residuals that no working arm has
 HOPELESS_RAD = np.radians(10.0)  # beyond any slip, delay or wrong zero
 VIDEO_STEP_M, VIDEO_STEP_RAD = 0.1, np.radians(20.0)  # at most, for velocities from positions
 FAR_FROM_MIDDLE = 0.12  # of the image: no camera's principal point is so far off
-_TEXTS = DiagnosisTexts.of("hand_eye")
 
 
 def diagnose(
@@ -84,13 +84,13 @@ class _Case:
 
     def add(self, key: str, **figures: Any) -> None:
         """A finding."""
-        self.found.append(_TEXTS.finding(key, **figures))
+        self.found.append(TEXTS.finding(key, **figures))
 
     def findings(self, *unseen: str) -> Findings:
         """What was found, with what could not be tested."""
         figures = {"pairs": causes.FEWEST_PAIRS, "repeated": self.session.repeated}
-        reasons = [_TEXTS.not_tested[key].format(**figures) for key in unseen]
-        return Findings(self.found, _TEXTS.looked_for, reasons)
+        reasons = [TEXTS.not_tested[key].format(**figures) for key in unseen]
+        return Findings(self.found, TEXTS.looked_for, reasons)
 
     # --- units ---
 
@@ -150,17 +150,19 @@ class _Case:
 
     def design(self) -> bool:
         """Whether the poses leave X free, which is then a finding."""
-        (first, second, third), axis, largest = _turns(self.pairs.T_base_gripper)
-        seen = _turns(self.pairs.T_camera_board)[0]
-        if seen[0] > SMALL_DEG and seen[0] > 5 * first:
+        known = observability(self.pairs.T_base_gripper, "eye_to_hand")
+        seen = observability(self.pairs.T_camera_board, "eye_to_hand").turns_deg[0]
+        first, second, third = known.turns_deg
+        if seen > SMALL_DEG and seen > 5 * first:
             return False  # the camera saw larger turns than the arm tells of: a matter of units
+        largest = known.largest_turn_deg
         turns = {"first": first, "second": second, "third": third, "largest": largest}
         if first < STILL_DEG:
             self.add("pure_translation", **turns)
         elif first < SMALL_DEG:
             self.add("small_rotations", **turns)
         elif second < SINGLE_DEG:
-            x, y, z = axis * np.sign(axis[np.argmax(np.abs(axis))]) + 0.0
+            x, y, z = known.axis * np.sign(known.axis[np.argmax(np.abs(known.axis))]) + 0.0
             self.add("single_axis", x=x, y=y, z=z, **turns)
         else:
             return False
@@ -180,7 +182,7 @@ class _Case:
         better = misread.better_reading(given, either, misread.PAIRING_SHIFT_LEFT)
         if better:
             self.pairs = better.fit.pairs
-            options = misread.candidates(better.fit, self.session, misread.INVERTED)
+            options = misread.candidates(better.fit, self.session, "inverted")
             if self._off_joints(self.session.T_base_gripper, self.q) < AS_COMPUTED_M:
                 against = (*options[0].against, "the arm poses are those of the joint angles")
                 options[0] = replace(options[0], against=against)
@@ -192,7 +194,7 @@ class _Case:
         elif given.turn_rad > POOR_RAD:
             self._rotations(given)
         elif given.shift_m < POOR_M:
-            asked, *others = misread.candidates(given, self.session, misread.DECLARED)
+            asked, *others = misread.candidates(given, self.session, "declared")
             others = [other for other in others if not other.against]
             if asked.against and others:
                 self.add("two_that_cancel", asked=asked.says(), candidates=_listed(others))
@@ -203,7 +205,8 @@ class _Case:
         """Board poses in a camera frame whose z does not look forward; X absorbs that."""
         axis, share, ahead = misread.looking_along(self.pairs.T_camera_board)
         if axis != "z" and ahead < 1 - misread.SHARE_IN_VIEW < misread.SHARE_IN_VIEW < share:
-            what, cure = misread.CAMERA_AXES.get(axis, misread.OTHER_AXES)
+            known = TEXTS.words["camera_axes"]
+            what, cure = known.get(axis, known["other"])
             self.add("camera_axes", axis=axis, share=100 * share, what=what, cure=cure)
 
     def _rotations(self, given: Fit) -> None:
@@ -254,13 +257,9 @@ class _Case:
         fit = self.pairs.fit
         expected = camera_board(self.pairs.T_base_gripper, fit.X, fit.Y[0], self.pairs.mount)
         chosen = self.pairs.T_camera_board.copy()
-        for row, view in enumerate(self.pairs.view):
-            other = boards[view].other
-            if other is None or not np.allclose(chosen[row], boards[view].T_camera_board):
-                continue
-            both = np.stack([chosen[row], other])
-            match = np.einsum("kij,ij->k", both[:, :3, :3], expected[row, :3, :3])
-            chosen[row] = both[match.argmax()]
+        given = np.stack([boards[view].T_camera_board for view in self.pairs.view])
+        as_given = np.isclose(chosen, given).all(axis=(1, 2))  # not put right meanwhile
+        chosen[as_given] = nearer([boards[view] for view in self.pairs.view], expected)[as_given]
         self.pairs = replace(self.pairs, T_camera_board=chosen)
 
     def residuals(self) -> list[str]:
@@ -310,19 +309,6 @@ def _by_differences(T: Floats, times: Floats) -> Floats | None:
     return np.concatenate([rates[:1], (rates[1:] + rates[:-1]) / 2, rates[-1:]])
 
 
-def _turns(T: Floats) -> tuple[Floats, Floats, float]:
-    """Rms turns (3,) about the principal axes, deg; the first axis (3,); the largest turn, deg."""
-    from scipy.spatial.transform import Rotation
-
-    R = mean_pose(T)[:3, :3].T @ T[:, :3, :3]
-    vectors = np.degrees(Rotation.from_matrix(R).as_rotvec())
-    _, values, axes = np.linalg.svd(vectors, full_matrices=False)
-    i, j = np.triu_indices(len(T), 1)
-    cosine = (np.einsum("nij,nij->n", T[i, :3, :3], T[j, :3, :3]).min() - 1) / 2
-    axis = mean_pose(T)[:3, :3] @ axes[0]
-    return values / np.sqrt(len(T)), axis, float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-
-
 # --- in words ---
 
 
@@ -360,7 +346,7 @@ def _from_residuals(search: CauseSearch[MendedPairs], session: HandEyeSession) -
         figures = _figures(step, search.model, session) | _change(step.before.fit, step.after.fit)
         if odd:
             figures |= {"names": ", ".join(names), "left": odd[-1].after.fit.says()}
-        found.append(_TEXTS.finding(step.test.cause, step.test.p_value, **figures))
+        found.append(TEXTS.finding(step.test.cause, step.test.p_value, **figures))
     return found
 
 

@@ -21,8 +21,8 @@ from coursekit.arrays import Floats, NDArray
 from coursekit.causes import log_chi2_tail
 from coursekit.geometry import invert_transform, pose_difference
 from coursekit.hand_eye.causes import LEAST_M, LEAST_RAD, Fit, PosePairs
-from coursekit.hand_eye.poses import Mount, camera_board, nearest_rotation
-from coursekit.hand_eye.session import HandEyeSession
+from coursekit.hand_eye.poses import Mount, base_gripper, camera_board, nearest_rotation
+from coursekit.hand_eye.session import TEXTS, HandEyeSession
 
 PER_RADIAN = 180.0 / np.pi
 # The most displacement that a reading may leave over, in units of that as given. Pairs put right
@@ -48,38 +48,12 @@ FIXED, MOVING = (
     ("ZYX", "XYZ", "YZX", "ZXY", "XZY", "YXZ"),
 )
 TWICE = ("ZYZ", "ZXZ", "zyz", "zxz")  # about the first axis once more
-# Camera frames that do not look along z: what they are, and what brings them to the optical one.
-_TO_OPTICAL = "T_camera_board = F @ T, F[:3, :3] = "
-CAMERA_AXES = {
-    "x": (
-        "x forward, y left, z up (ROS' camera_link, and every body frame of REP 103)",
-        _TO_OPTICAL + "[[0, -1, 0], [0, 0, -1], [1, 0, 0]]; in tf ask for camera_optical_frame",
-    ),
-    "-z": (
-        "x right, y up, z backward (OpenGL, Blender)",
-        _TO_OPTICAL + "np.diag([1, -1, -1])",
-    ),
-}
-OTHER_AXES = ("none that is common", _TO_OPTICAL + "the camera's own axes, seen from the optical")
 CAMERA_ON_GRIPPER_M = 0.4  # no wrist carries a camera farther away
 BOARD_IN_GRIPPER_M = 0.5  # nor a board
 ROOM_M = 4.0  # from the base to a camera or a board that it works with
 WIDE_DEG = 50.0  # from the optical axis to the board's middle, where no intrinsics are known
 BEYOND_IMAGE = 1.1  # of the field of view: a board's middle may be a little outside
 SHARE_IN_VIEW = 0.9  # of the images in which the board must be in view
-# Mistakes that obey the same equation: those behind a session that fits with its arm poses
-# inverted, and those that cancel in one that fits as declared. The second exchanges X and Y and
-# inverts the board's poses, the third belongs to the other mount.
-INVERTED = (
-    "arm poses inverted (T_gripper_base given)",
-    "board poses inverted (T_board_camera given)",
-    "another mount than declared ({other})",
-)
-DECLARED = (
-    "as declared",
-    "arm poses and board poses both inverted",
-    "arm poses inverted and another mount than declared ({other})",
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -522,8 +496,7 @@ def undo_notation(given: Fit, expected: Floats) -> Reading | None:
             continue
         fit = with_rotations(given.pairs, R).fit
         # `expected` leans on positions alone; with X and Y a pose's neighbours are told apart
-        M = fit.X @ fit.pairs.T_camera_board @ invert_transform(fit.Y[0])
-        arm = M if fit.pairs.mount == "eye_to_hand" else invert_transform(M)
+        arm = base_gripper(fit.pairs.T_camera_board, fit.X, fit.Y[0], fit.pairs.mount)
         numbers, _ = misreading.nearest(misreading.read.numbers(G), arm[:, :3, :3])
         fit = with_rotations(given.pairs, misreading.written.rotations(numbers)).fit
         if misreading.log_p(G, fit) < np.log(NOTATION_LEVEL):
@@ -555,10 +528,10 @@ class Candidate:
         return line + (f"; against it: {', '.join(self.against)}" if self.against else "")
 
 
-def candidates(fit: Fit, session: HandEyeSession, names: tuple[str, ...]) -> list[Candidate]:
+def candidates(fit: Fit, session: HandEyeSession, kind: str) -> list[Candidate]:
     """Three readings that obey the same equation, with the X that each implies.
 
-    names: `INVERTED` for a fit of the declared mount with inverted arm poses, `DECLARED` for a fit
+    kind: "inverted" for a fit of the declared mount with inverted arm poses, "declared" for a fit
     as declared. With M = T_carrier_stand of the declared mount and C = T_camera_board, data that
     fit inverted obey C = X^-1 M^-1 Y. So M was inverted; or the mount is the other one, whose M
     this is; or C^-1 = Y^-1 M X was meant, where X and Y exchange their parts.
@@ -567,7 +540,9 @@ def candidates(fit: Fit, session: HandEyeSession, names: tuple[str, ...]) -> lis
     seen, other = pairs.T_camera_board, other_mount(pairs.mount)
     rows = ((pairs.mount, X, Y, seen), (pairs.mount, Y, X, invert_transform(seen)))
     found = []
-    for name, (mount, X_, Y_, C) in zip(names, (*rows, (other, X, Y, seen)), strict=True):
+    for name, (mount, X_, Y_, C) in zip(
+        TEXTS.words[kind], (*rows, (other, X, Y, seen)), strict=True
+    ):
         against = list(_implausible(mount, X_, Y_, C, session))
         if session.detections is not None and C is not seen:
             against.append("the board's poses were computed here from the images")

@@ -28,9 +28,9 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coursekit.arrays import ArrayLike, Floats, Integers
+from coursekit.arrays import ArrayLike, Floats
 from coursekit.checks import array, choice, transform, transforms, want
-from coursekit.geometry import cross_matrix, invert_transform, pose_difference
+from coursekit.geometry import cross_matrix, invert_transform
 from coursekit.words import wrapped
 
 Mount = Literal["eye_in_hand", "eye_to_hand"]
@@ -44,8 +44,6 @@ WRITTEN_TOLERANCE = 1e-4  # of R R^T: poses are often written with five digits
 SCATTER = np.repeat([np.radians(0.1), 0.5e-3], 3)
 LEVER_M = 0.3  # a rotation of X counts by what it does this far in front of the camera
 IN_METRES = np.array([LEVER_M, LEVER_M, LEVER_M, 1.0, 1.0, 1.0])  # times (omega, v)
-# Arm poses no farther apart, rad and m, are one pose, if the board is not seen to move by more.
-SAME_POSE, SAME_SIGHT = (np.radians(0.1), 1e-3), (np.radians(3.0), 0.01)
 FREE_M = 0.03  # a direction known no better than this is free: nobody would mount a camera so
 
 
@@ -61,20 +59,6 @@ def check_poses(name: str, value: ArrayLike, least: int = 1) -> Floats:
         transforms(f"{name}[{index}]", pose, WRITTEN_TOLERANCE)
     poses[:, :3, :3] = nearest_rotation(poses[:, :3, :3])
     return poses
-
-
-def first_alike(T_base_gripper: Floats, T_camera_board: Floats) -> Integers:
-    """Which pair (n,) each of n pairs repeats: its own number where it repeats none before it."""
-    first = np.arange(len(T_base_gripper))
-    for i in range(1, len(first)):
-        earlier = np.flatnonzero(first[:i] == np.arange(i))
-        near = np.ones(len(earlier), bool)
-        for T, (turn, shift) in ((T_base_gripper, SAME_POSE), (T_camera_board, SAME_SIGHT)):
-            off = np.linalg.norm(pose_difference(T[i], T[earlier]).reshape(-1, 2, 3), axis=2)
-            near &= (off < [turn, shift]).all(axis=1)
-        if near.any():
-            first[i] = earlier[near.argmax()]
-    return first
 
 
 # --- frames ---
@@ -95,11 +79,19 @@ def stand_board(T_base_gripper: Floats, T_camera_board: Floats, X: Floats, mount
     return invert_transform(carrier_stand(T_base_gripper, mount)) @ X @ T_camera_board
 
 
+def base_gripper(T_camera_board: Floats, X: Floats, Y: Floats, mount: Mount) -> Floats:
+    """The arm poses (n, 4, 4) at which the camera should see the board as it does."""
+    return carrier_stand(X @ T_camera_board @ invert_transform(Y), mount)
+
+
 def by_X_and_Y(T_base_gripper: Floats, X: Floats, Y: Floats, mount: Mount) -> Floats:
-    """d twist of T_camera_board / d twists of X, then Y: (n, 6, 12), at arm poses (n, 4, 4)."""
+    """d twist of T_camera_board / d twists of X, then Y: (n, 6, 12), at arm poses (n, 4, 4).
+
+    Y (4, 4), or (n, 4, 4) where it is another one at each.
+    """
     M = carrier_stand(T_base_gripper, mount)
     to_camera = X[:3, :3].T
-    board = np.einsum("nij,j->ni", M[:, :3, :3], Y[:3, 3]) + M[:, :3, 3]  # in the carrier's frame
+    board = (M @ Y)[:, :3, 3]  # in the carrier's frame
     columns = np.zeros((len(M), 6, 12))
     columns[:, :3, 0:3] = columns[:, 3:, 3:6] = -to_camera
     columns[:, 3:, 0:3] = to_camera @ cross_matrix(board - X[:3, 3])
@@ -108,9 +100,12 @@ def by_X_and_Y(T_base_gripper: Floats, X: Floats, Y: Floats, mount: Mount) -> Fl
 
 
 def by_arm_twist(T_base_gripper: Floats, X: Floats, Y: Floats, mount: Mount) -> Floats:
-    """d twist of T_camera_board / d twist of the gripper in the base's axes: (n, 6, 6)."""
+    """d twist of T_camera_board / d twist of the gripper in the base's axes: (n, 6, 6).
+
+    Y as in `by_X_and_Y`.
+    """
     M = carrier_stand(T_base_gripper, mount)
-    arm = np.einsum("nij,j->ni", M[:, :3, :3], Y[:3, 3])
+    arm = (M @ Y)[:, :3, 3] - M[:, :3, 3]
     by_carrier = np.zeros((len(M), 6, 6))
     by_carrier[:, :3, :3] = by_carrier[:, 3:, 3:] = X[:3, :3].T
     by_carrier[:, 3:, :3] = -X[:3, :3].T @ cross_matrix(arm)
@@ -149,13 +144,15 @@ class Observability:
     deviation with which X comes out along each direction. directions (6, 6): rows (omega, v), the
     directions in the frame that X is given in, rotations measured by what they do at `LEVER_M`.
     free: the undetermined ones, in words. turns_deg (3,): rms rotation between poses about their
-    three principal axes. largest_turn_deg: between any two poses. poses: how many there are.
+    three principal axes, the first of which is axis (3,). largest_turn_deg: between any two poses.
+    poses: how many there are.
     """
 
     singular_values: Floats
     directions: Floats
     free: tuple[str, ...]
     turns_deg: Floats
+    axis: Floats
     largest_turn_deg: float
     poses: int
 
@@ -211,12 +208,10 @@ def observability(
     free = tuple(_in_words(directions[values * FREE_M < 1.0]))
     # Each pose against the mean one, about the carrier's axes, because X is given there.
     from_mean = Rotation.from_matrix(M[:, :3, :3] @ mean_pose(M)[:3, :3].T).as_rotvec()
-    turns = np.sqrt(np.linalg.svd(from_mean.T @ from_mean / len(M), compute_uv=False))
+    _, turns, axes = np.linalg.svd(np.degrees(from_mean) / math.sqrt(len(M)), full_matrices=False)
     cosine = (np.einsum("nij,mij->nm", M[:, :3, :3], M[:, :3, :3]).min() - 1) / 2
     largest = math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))
-    return Observability(
-        values, directions / IN_METRES, free, np.degrees(turns), largest, len(poses)
-    )
+    return Observability(values, directions / IN_METRES, free, turns, axes[0], largest, len(poses))
 
 
 def _nearest_stand(M: Floats, X: Floats) -> Floats:

@@ -38,10 +38,11 @@ from coursekit.arrays import ArrayLike, Floats, Integers
 from coursekit.boards import Board, Detection, Detections, detect_all
 from coursekit.boards.board import Skipped
 from coursekit.boards.detector import SESSION, natural
+from coursekit.causes import DiagnosisTexts
 from coursekit.checks import array, choice, instance, transform, want
 from coursekit.formats import poses as pose_files
 from coursekit.formats.poses import JOINTS, PLACE, THREE, TURN, VELOCITIES, PoseRow
-from coursekit.geometry import Intrinsics, invert_transform, pose_difference
+from coursekit.geometry import Intrinsics, pose_difference
 from coursekit.hand_eye import refinement, views
 from coursekit.hand_eye.closed_form import CLOSED_FORMS, FEWEST_POSES, closed_form
 from coursekit.hand_eye.poses import (
@@ -49,9 +50,9 @@ from coursekit.hand_eye.poses import (
     LEVER_M,
     MOUNTS,
     Mount,
+    base_gripper,
     camera_board,
     check_poses,
-    first_alike,
     mean_pose,
     observability,
     stand_board,
@@ -59,11 +60,14 @@ from coursekit.hand_eye.poses import (
 from coursekit.results import write_bytes
 from coursekit.words import Estimate, wrapped
 
+TEXTS = DiagnosisTexts.of("hand_eye")
 METHODS = ("refine", *CLOSED_FORMS)
 POSES = "poses.csv"
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 OPTIONAL = {"times": ("time",), "q": JOINTS, "dq": VELOCITIES}
 REPEATS = "repeats"  # how the reason begins for which a pair is left out by `once`
+# Arm poses no farther apart, rad and m, are one pose, if the board is not seen to move by more.
+SAME_POSE, SAME_SIGHT = (np.radians(0.1), 1e-3), (np.radians(3.0), 0.01)
 BELONGS = 0.03  # rad and m, between an arm pose and that of its joint angles: an arm may err so
 
 
@@ -177,7 +181,16 @@ class HandEyeSession:
     @cached_property
     def first_alike(self) -> Integers:
         """Which pair (n,) each repeats: its own number where it repeats none before it."""
-        return first_alike(self.T_base_gripper, self.T_camera_board)
+        first = np.arange(len(self))
+        for i in range(1, len(first)):
+            earlier = np.flatnonzero(first[:i] == np.arange(i))
+            near = np.ones(len(earlier), bool)
+            for T, most in ((self.T_base_gripper, SAME_POSE), (self.T_camera_board, SAME_SIGHT)):
+                off = pose_difference(T[i], T[earlier]).reshape(-1, 2, 3)
+                near &= (np.linalg.norm(off, axis=2) < most).all(axis=1)
+            if near.any():
+                first[i] = earlier[near.argmax()]
+        return first
 
     @property
     def once(self) -> HandEyeSession:
@@ -514,12 +527,9 @@ def _first(
         else:
             X, Y = closed_form(arm, measured, mount, method)
         expected = camera_board(arm, X, Y, mount)
-        before, measured = measured, session.T_camera_board.copy()
-        for index, pose in enumerate(session.board_poses):
-            if pose.other is not None:
-                both = np.stack([pose.T_camera_board, pose.other])
-                turns = np.linalg.norm(pose_difference(expected[index], both)[:, :3], axis=1)
-                measured[index] = both[np.argmin(turns)]
+        before, measured = measured, session.T_camera_board
+        if session.board_poses:
+            measured = views.nearer(session.board_poses, expected)
         if np.array_equal(before, measured):
             break
     return X, Y, measured
@@ -707,8 +717,8 @@ class HandEyeResult(Estimate):
     @property
     def gripper_twists(self) -> Floats:
         """From where the arm says the gripper is to where the camera implies, (n, 6), rad and m."""
-        M = self.X @ views.enlarged(self.measured, self.scale) @ invert_transform(self.Y)
-        implied = M if self.mount == "eye_to_hand" else invert_transform(M)
+        seen = views.enlarged(self.measured, self.scale)
+        implied = base_gripper(seen, self.X, self.Y, self.mount)
         return pose_difference(self.T_base_gripper, implied)
 
     @property
@@ -731,49 +741,37 @@ class HandEyeResult(Estimate):
     @cached_property
     def judgement(self) -> Trust:
         """How far to trust X, and why; of a closed form only what its poses and residuals say."""
-        known = observability(self.session.T_base_gripper, self.mount)
+        known, says = observability(self.session.T_base_gripper, self.mount), TEXTS.words
         weak = [f"{direction}: the poses do not determine it." for direction in known.free]
         weak += [f"{self.session.repeated}."] * bool(self.session.repeated)
         if known.poses < GOOD_POSES:
-            weak.append(f"{known.poses} poses are few: take 15 to 30.")
+            weak.append(says["few"].format(poses=known.poses))
         if known.turns_deg[1] < GOOD_TURN_DEG:
-            weak.append(
-                f"about its second axis the wrist turned by {known.turns_deg[1]:.0f} deg (rms) "
-                "only: turn it by 30 deg or more about two axes."
-            )
+            weak.append(says["narrow"].format(turned=known.turns_deg[1]))
         if self.refined is not None and self.refined.alike:
-            weak.append(
-                f"successive poses err alike (correlation {self.refined.alike:.1f}): something "
-                "moved slowly (camera, board, base), or the arm's error follows its pose. The "
-                "intervals are wider for it."
-            )
+            weak.append(says["alike"].format(alike=self.refined.alike))
         worst = self.quantile() * self.reach_sigma_mm if self.refined is not None else math.inf
         return Trust(worst, tuple(weak), self._disagreement(), tuple(self._broken()))
 
     def _disagreement(self) -> str:
         """That arm and images disagree by more than arms that stand still do, or ""."""
         mm, deg = self.spread_gripper_mm, self.spread_gripper_deg
-        if mm <= LARGE_MM and deg <= LARGE_DEG:
-            return ""
-        return (
-            f"arm and images disagree by {mm:.1f} mm and {deg:.2f} deg at the gripper, more than "
-            "arms that stand still are off: did arm and camera rest when both were read, and does "
-            "each image have its own pose?"
-        )
+        large = mm > LARGE_MM or deg > LARGE_DEG
+        return TEXTS.words["large"].format(mm=mm, deg=deg) if large else ""
 
     def _broken(self) -> Iterator[str]:
         """Why the intervals are not to be trusted."""
         if self.refined is None:
             return
         if not self.refined.converged:
-            yield "the refinement did not converge: are some pairs of pose and image wrong?"
+            yield TEXTS.words["not_converged"]
         if self.spread_gripper_mm > BROKEN_MM or self.spread_gripper_deg > BROKEN_DEG:
-            yield "no working arm is off by so much: `hand_eye.diagnose` looks for the reason."
+            yield TEXTS.words["broken"]
         far = self.refined.far
         odd = np.flatnonzero(far > FAR_OUT * np.median(far))
         if len(odd):
             names = ", ".join(self.session.names[i] for i in odd)
-            yield f"{names}: off by {FAR_OUT:.0f} times as much as the typical pair or more: wrong?"
+            yield TEXTS.words["odd"].format(names=names, times=FAR_OUT)
 
     def __repr__(self) -> str:
         name_X, name_Y = FRAMES[self.mount]
@@ -795,7 +793,7 @@ class HandEyeResult(Estimate):
                 lines.append(f"scale = {value:.5f} ± {half:.5f}{self._level}")
             elif name.startswith("offset_"):
                 value, half = math.degrees(value), math.degrees(half)
-                lines.append(f"{name} = {value:.3f} ± {half:.3f} deg{self._level}")
+                lines.append(f"{name} = {round(value, 3) + 0.0:.3f} ± {half:.3f} deg{self._level}")
         if self.session.repeated:
             lines.append(self.session.repeated)
         if self.free:
@@ -843,19 +841,14 @@ class HandEyeResult(Estimate):
     def _head(self) -> str:
         """The finding in a sentence or two."""
         if self.refined is None:
-            return (
-                f"Uncertain: {self.method} says nothing about its own error. Solve with 'refine' "
-                "for an interval."
-            )
+            return str(TEXTS.words["closed_form"].format(method=self.method))
         judged = self.judgement
         if not judged.trusted:
             return f"{judged.grade}: the intervals hold for sessions without such faults only."
         if math.isinf(judged.worst_mm):
             return f"{judged.grade} how good it is: {self._untold}."
-        return (
-            f"{judged.grade}: a point {1e3 * LEVER_M:.0f} mm in front of the camera is placed "
-            f"within ± {judged.worst_mm:.1f} mm (95 %, worst direction), as far as the mount goes."
-        )
+        reaches = TEXTS.words["reaches"].format(ahead=1e3 * LEVER_M, worst=judged.worst_mm)
+        return f"{judged.grade}: {reaches}"
 
     @property
     def reach_sigma_mm(self) -> float:

@@ -208,6 +208,21 @@ def board_poses(
     return found
 
 
+def nearer(boards: Sequence[BoardPose], expected: Floats) -> Floats:
+    """Of the two poses that an image may allow the one that turns least from those expected.
+
+    expected (n, 4, 4): T_camera_board, as is what is returned.
+    """
+    both = np.array(
+        [
+            [pose.T_camera_board, pose.T_camera_board if pose.other is None else pose.other]
+            for pose in boards
+        ]
+    )
+    turns = np.linalg.norm(pose_difference(expected[:, None], both)[..., :3], axis=-1)
+    return both[np.arange(len(both)), turns.argmin(axis=1)]
+
+
 def _starts(seen: Detection, board: Board, intrinsics: Intrinsics, name: str) -> Floats:
     """The one or two poses (k, 4, 4) of IPPE."""
     rays = (seen.pixels - [intrinsics.cx, intrinsics.cy]) / [intrinsics.fx, intrinsics.fy]
