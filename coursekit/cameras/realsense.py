@@ -498,7 +498,7 @@ def _described(camera: Camera, where: str, without: str) -> str:
 
 def _rgb_converter(form: str) -> Callable[[AnyArray], Image]:
     """The function that makes (h, w, 3) RGB of a colour image in librealsense's format `form`."""
-    slices = {"rgb8": np.s_[..., :3], "rgba8": np.s_[..., :3]}
+    slices: dict[str, Any] = {"rgb8": np.s_[..., :3], "rgba8": np.s_[..., :3]}
     slices |= {"bgr8": np.s_[..., ::-1], "bgra8": np.s_[..., 2::-1]}
     if form in slices:
         return lambda image: image[slices[form]].copy()

@@ -210,8 +210,8 @@ def corner_session(
         said_px = effects.claimed * sigma_px
         detections.append(Detection(ids, found, lens.size, f"view {i:02d}", said_px, measured))
     depth_m, drawn = tuple(Z for _, _, Z in looks), (draw.focal_scale, draw.velocity_m_s)
-    blurred, spoiled = draw.blurred, draw.spoiled_view
-    truth = Truth(lens, poses, effects, *drawn, blurred, spoiled, wrong, depth_m, points)
+    blurred, odd_view = draw.blurred, draw.spoiled_view
+    truth = Truth(lens, poses, effects, *drawn, blurred, odd_view, wrong, depth_m, points)
     return Detections(detections), truth
 
 
