@@ -103,10 +103,8 @@ def effective_axes(S: Floats, n: int) -> float:
     v = n - 1
     if v == 1:
         return 1.0
-    square_of_trace, trace_of_square = float(np.trace(S)) ** 2, float((S * S).sum())
-    a, b = np.linalg.solve(
-        [[1.0, 2.0 / v], [1.0 / v, 1.0 + 1.0 / v]], [square_of_trace, trace_of_square]
-    )
+    both = [float(np.trace(S)) ** 2, float((S * S).sum())]  # trace squared, trace of the square
+    a, b = np.linalg.solve([[1.0, 2.0 / v], [1.0 / v, 1.0 + 1.0 / v]], both)
     return float(np.clip(a / b, 1.0, 3.0)) if b > 0 else 3.0
 
 

@@ -316,15 +316,14 @@ class Attribution:
             for axis, mean, (low, high) in zip("xyz", self.mean_m, self.interval_m, strict=True)
         )
         scatter = ", ".join(f"{1e3 * std:.1f}" for std in self.scatter_m)
-        t2 = (
-            "" if seen.mean.t2 is None else f"; T² = {seen.mean.t2:.1f}, alone {_p(seen.mean.p_t2)}"
-        )
+        mean = seen.mean
+        t2 = "" if mean.t2 is None else f"; T² = {mean.t2:.1f}, alone {_p(mean.p_t2)}"
         find = f"; power to find {1e3 * self.matters_m:.0f} mm: "
         constant = seen.constant.power(self.matters_m, seen.n)
         lines = [
             f"mean miss {axes} mm (95 %)",
             f"scatter of one trial {scatter} mm along x, y, z",
-            f"mean of zero: {_p(seen.mean.p_value)}{t2}{find}{constant:.0%}",
+            f"mean of zero: {_p(mean.p_value)}{t2}{find}{constant:.0%}",
         ]
         if pose is not None:
             shares = [f"{name} {share:.0%}" for name, share in pose.shares.items()]
@@ -403,9 +402,8 @@ def attribute(
     longest = float(np.linalg.norm(rows, axis=1).max())
     shorter = f"less than {TOO_LONG_M} m (are these millimetres?)"
     want(longest < TOO_LONG_M, "misses", f"{longest:.1f} m", shorter)
-    checks.number(
-        "matters_m", matters_m, "a length in m, such as 0.003", above=0.0, most=TOO_LONG_M
-    )
+    length = "a length in m, such as 0.003"
+    checks.number("matters_m", matters_m, length, above=0.0, most=TOO_LONG_M)
     if poses is not None:
         poses = checks.transforms("poses", poses, FEW_DIGITS)
         want(poses.shape == (n, 4, 4), "poses", poses, f"one (4, 4) for each of {n} trials")

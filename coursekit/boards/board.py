@@ -18,17 +18,10 @@ from typing import Any, Literal, get_args
 import cv2
 import numpy as np
 
+from coursekit import geometry
 from coursekit.arrays import AnyArray, Bools, Floats, Grey, NDArray
 from coursekit.checks import array, choice, instance, number, want, whole
-from coursekit.geometry import (
-    Intrinsics,
-    deproject,
-    fold_radius,
-    invert_transform,
-    make_transform,
-    project,
-    transform_points,
-)
+from coursekit.geometry import Intrinsics
 from coursekit.words import Listed, counted
 
 BoardKind = Literal["checkerboard", "charuco"]
@@ -85,12 +78,9 @@ class Board:
     def __post_init__(self) -> None:
         fewest = FEWEST_SQUARES[choice("kind", self.kind, get_args(BoardKind))]
         squares = np.asarray(self.squares)
-        want(
-            squares.dtype.kind in "iu" and squares.shape == (2,) and squares.min() >= fewest,
-            "squares",
-            self.squares,
-            f"(columns, rows) of squares, at least {fewest} each (inner corners are one fewer)",
-        )
+        fits = squares.dtype.kind in "iu" and squares.shape == (2,) and squares.min() >= fewest
+        wanted = f"(columns, rows) of squares, at least {fewest} each (inner corners are one fewer)"
+        want(fits, "squares", self.squares, wanted)
         object.__setattr__(self, "squares", tuple(squares.tolist()))
         object.__setattr__(self, "square_m", _side("square_m", self.square_m))
         if self.kind == "checkerboard":
@@ -104,12 +94,8 @@ class Board:
         want(marker_m < self.square_m, "marker_m", marker_m, f"less than {self.square_m} m")
         first = whole("first_marker", self.first_marker, "a whole number from 0 on", least=0)
         held, needed = len(_dictionary(self.dictionary).bytesList), first + int(self.white.sum())
-        want(
-            needed <= held,
-            "dictionary",
-            self.dictionary,
-            f"one of {needed} markers or more for {self.text}, this one holds {held}",
-        )
+        wanted = f"one of {needed} markers or more for {self.text}, this one holds {held}"
+        want(needed <= held, "dictionary", self.dictionary, wanted)
 
     @property
     def corners(self) -> tuple[int, int]:
@@ -154,14 +140,14 @@ class Board:
         right, down = np.sign(np.diag(image_from_board)[:2])
         offset = self.square_m * (image_from_board[:2, 2] + 0.5)
         turn = np.diag([right, down, right * down])
-        return invert_transform(make_transform(turn, (*offset, 0.0)))
+        return geometry.invert_transform(geometry.make_transform(turn, (*offset, 0.0)))
 
     @property
     def outline(self) -> Floats:
         """The pattern's outer corners in the board frame, (4, 3) m, clockwise from its top left."""
         wide, high = self.size_m
         sheet = [[0.0, 0.0, 0.0], [wide, 0.0, 0.0], [wide, high, 0.0], [0.0, high, 0.0]]
-        return transform_points(self.T_board_sheet, sheet)
+        return geometry.transform_points(self.T_board_sheet, sheet)
 
     @property
     def text(self) -> str:
@@ -211,11 +197,6 @@ class Board:
             image = cv2.aruco.generateImageMarker(dictionary, number, n, borderBits=1)
             markers.append((column + margin, row + margin, (image > 0).astype(float)))
         return tuple(markers)
-
-    @cached_property
-    def marker_centres(self) -> Floats:
-        """(M, 2): the markers' centres in squares, right and down from the top-left corner."""
-        return np.argwhere(self.white)[:, ::-1] + np.float64(0.5)
 
     def opencv(self) -> Any:
         """The `cv2.aruco.CharucoBoard` of this board; ValueError for a checkerboard."""
@@ -483,13 +464,13 @@ def seen(
     """
     R, t = T_camera_board[..., :3, :3], T_camera_board[..., None, :3, 3]
     inside = points @ np.swapaxes(R, -1, -2) + t
-    pixels = project(inside, lens.K, lens.dist)
+    pixels = geometry.project(inside, lens.K, lens.dist)
     last = np.array(lens.size) - 1 - border_px
     found = np.asarray(((pixels >= border_px) & (pixels <= last)).all(axis=-1))
     if lens.dist is not None:
         with np.errstate(divide="ignore", invalid="ignore"):
             slope = np.hypot(inside[..., 0], inside[..., 1]) / inside[..., 2]
-        found &= slope < fold_radius(lens.dist)
+        found &= slope < geometry.fold_radius(lens.dist)
     return found
 
 
@@ -512,12 +493,13 @@ def slide_into_view(
     >>> corner = np.zeros((1, 3))
     >>> whole = lambda T: bool(seen(corner, T, lens, border_px=100).all())
     >>> T = slide_into_view(np.array([0.0, 240.0]), 0.5, np.eye(3), np.zeros(3), lens, whole)
-    >>> project(T[:3, 3], lens.K).round().tolist()
+    >>> geometry.project(T[:3, 3], lens.K).round().tolist()
     [112.0, 240.0]
     """
     centre = (np.array(lens.size) - 1) / 2
     shares = np.linspace(1.0, 0.0, steps)[:, None]
-    rays = deproject(centre + shares * (aim_px - centre), np.ones(steps), lens.K, lens.dist)
+    pixels = centre + shares * (aim_px - centre)
+    rays = geometry.deproject(pixels, np.ones(steps), lens.K, lens.dist)
     T = np.eye(4)
     T[:3, :3] = R
     for ray in rays[np.isfinite(rays).all(axis=1)]:

@@ -33,6 +33,7 @@ from coursekit.arrays import Bools, Floats, Grey, NDArray
 from coursekit.boards.board import Board
 
 Patch = NDArray[np.float32]
+FourArrays = tuple[Floats, Floats, Floats, Floats]
 
 # --- corners ---
 
@@ -334,30 +335,6 @@ FEWEST_EDGES = 4  # edges in each direction
 BILINEAR = 1.0 / 6.0  # px^2: the mean variance that bilinear interpolation adds
 
 
-@dataclass(frozen=True)
-class _Edges:
-    """Edges in one direction of the board, sampled.
-
-    normal (E, 2): towards the white side. distance, grey (E, M): samples, px along the normal and
-    grey levels. marker (E,): px from the edge to the marker, infinite on a checkerboard.
-    """
-
-    normal: Floats
-    distance: Floats
-    grey: Floats
-    marker: Floats
-
-
-@dataclass(frozen=True)
-class _Profiles:
-    """What was fitted to each edge: normal (E, 2), width (E,) px, black and white (E,)."""
-
-    normal: Floats
-    width: Floats
-    black: Floats
-    white: Floats
-
-
 def blur_covariance(
     grey: Grey, pixels: Floats, ids: NDArray[np.intp], steps: Floats, board: Board
 ) -> Floats | None:
@@ -366,14 +343,14 @@ def blur_covariance(
     pixels (N, 2): corners, px. steps (N, 2, 2): px per square, as `steps` gives them. None
     where fewer than four edges in either direction can be measured.
     """
-    sets = [_fit(_edges(grey, pixels, ids, steps, board, axis)) for axis in (0, 1)]
-    if min(len(profiles.width) for profiles in sets) < FEWEST_EDGES:
+    sets = [_fit(*_edges(grey, pixels, ids, steps, board, axis)) for axis in (0, 1)]
+    normals, widths, blacks, whites = zip(*sets, strict=True)
+    if min(map(len, widths)) < FEWEST_EDGES:
         return None
-    rows = [_products(p.normal, p.normal) / p.width[:, None] ** 2 for p in sets]
-    values = [np.ones(len(p.width)) for p in sets]
-    w1, w2 = (float(np.median(p.width)) for p in sets)
-    black = np.median(np.concatenate([p.black for p in sets]))
-    white = np.median(np.concatenate([p.white for p in sets]))
+    rows = [_products(n, n) / w[:, None] ** 2 for n, w in zip(normals, widths, strict=True)]
+    values = [np.ones(len(w)) for w in widths]
+    w1, w2 = (float(np.median(w)) for w in widths)
+    black, white = (np.median(np.concatenate(levels)) for levels in (blacks, whites))
     shifts = 2.0 * (_at(grey, pixels) - black) / (white - black) - 1.0
     rho = _correlation(shifts, board.falling[ids])
     rho *= np.sqrt((1.0 + BILINEAR / w1**2) * (1.0 + BILINEAR / w2**2))
@@ -421,9 +398,11 @@ def _at(grey: Grey, pixels: Floats) -> Floats:
 
 def _edges(
     grey: Grey, pixels: Floats, ids: NDArray[np.intp], steps: Floats, board: Board, axis: int
-) -> _Edges:
+) -> FourArrays:
     """Samples of the edges between neighbours along the board's x (axis 0) or y (axis 1).
 
+    Returns normal (E, 2): towards the white side; distance, grey (E, M): samples, px along the
+    normal and grey levels; marker (E,): px from the edge to the marker, infinite on a checkerboard.
     Whole pixels are taken, each with its own distance from the straight line between the two
     corners: interpolating would blur.
     """
@@ -446,7 +425,7 @@ def _edges(
     spots, normal = spots[inside], normal[inside]
     distance = np.einsum("emi,ei->em", spots - start[inside, None], normal)
     levels = grey[spots[..., 1], spots[..., 0]].astype(np.float64)
-    return _Edges(normal, distance, levels, marker[inside])
+    return normal, distance, levels, marker[inside]
 
 
 def _marker_and_reach(square: Floats, board: Board) -> tuple[Floats, Floats]:
@@ -459,23 +438,24 @@ def _marker_and_reach(square: Floats, board: Board) -> tuple[Floats, Floats]:
     return gap * square, np.minimum(reach, (gap + REACH_CELLS * cell) * square)
 
 
-def _fit(edges: _Edges) -> _Profiles:
+def _fit(normal: Floats, distance: Floats, grey: Floats, marker: Floats) -> FourArrays:
     """Width of each edge: black + contrast (Phi(z) - Phi(z - marker / width)), z = (d - m) / width.
 
-    Levenberg-Marquardt with fixed damping on all edges at once.
+    Levenberg-Marquardt with fixed damping on all edges, of `_edges`, at once. Returns of those that
+    could be fitted: normal (E, 2), width (E,) px, black and white (E,).
     """
-    if len(edges.grey) == 0:
-        return _Profiles(edges.normal, *np.empty((3, 0)))
-    bright = edges.distance > 0
-    black = np.average(edges.grey, axis=1, weights=~bright)
-    white = np.average(edges.grey, axis=1, weights=bright)
+    if len(grey) == 0:
+        return normal, *np.empty((3, 0))
+    bright = distance > 0
+    black = np.average(grey, axis=1, weights=~bright)
+    white = np.average(grey, axis=1, weights=bright)
     zero = np.zeros_like(black)
     p = np.stack([black, white - black, zero, zero + np.log(FIRST_PX)])
     for _ in range(FIT_STEPS):
-        model, J = _profile(edges, *p)
-        normal = np.einsum("iem,jem->eij", J, J)
-        normal += FIT_DAMPING * normal * np.eye(4) + 1e-9 * np.eye(4)
-        step = np.linalg.solve(normal, np.einsum("iem,em->ei", J, edges.grey - model)[..., None])
+        model, J = _profile(distance, marker, p)
+        A = np.einsum("iem,jem->eij", J, J)
+        A += FIT_DAMPING * A * np.eye(4) + 1e-9 * np.eye(4)
+        step = np.linalg.solve(A, np.einsum("iem,em->ei", J, grey - model)[..., None])
         step = step[..., 0].T
         step[2:] = np.clip(step[2:], -LONGEST_STEP, LONGEST_STEP)
         p = p + step
@@ -483,20 +463,18 @@ def _fit(edges: _Edges) -> _Profiles:
     black, contrast, offset, width = *p[:3], np.exp(p[3])
     good = (width > 1.01 * WIDTHS_PX[0]) & (width < 0.99 * WIDTHS_PX[1])
     good &= (np.abs(contrast) > LEAST_CONTRAST) & (np.abs(offset) < 1.0 + width)
-    return _Profiles(edges.normal[good], width[good], black[good], (black + contrast)[good])
+    return normal[good], width[good], black[good], (black + contrast)[good]
 
 
-def _profile(
-    edges: _Edges, black: Floats, contrast: Floats, offset: Floats, log_width: Floats
-) -> tuple[Floats, Floats]:
-    """The model (E, M) and its derivatives by the four parameters (4, E, M)."""
-    width = np.exp(log_width)[:, None]
-    z = (edges.distance - offset[:, None]) / width
+def _profile(distance: Floats, marker: Floats, p: Floats) -> tuple[Floats, Floats]:
+    """The model (E, M) and its derivatives (4, E, M) by the parameters p (4, E) of `_fit`."""
+    black, c, offset, log_width = p[..., None]
+    width = np.exp(log_width)
+    z = (distance - offset) / width
     up, bump = ndtr(z), np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi)
     zbump = z * bump
-    if np.isfinite(edges.marker).all():
-        y = z - edges.marker[:, None] / width
+    if np.isfinite(marker).all():
+        y = z - marker[:, None] / width
         fall = np.exp(-0.5 * y * y) / np.sqrt(2 * np.pi)
         up, bump, zbump = up - ndtr(y), bump - fall, zbump - y * fall
-    c = contrast[:, None]
-    return black[:, None] + c * up, np.stack([np.ones_like(up), up, -c * bump / width, -c * zbump])
+    return black + c * up, np.stack([np.ones_like(up), up, -c * bump / width, -c * zbump])

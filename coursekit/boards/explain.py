@@ -18,15 +18,10 @@ from scipy.spatial import cKDTree
 
 from coursekit.arrays import Floats, Grey, NDArray
 from coursekit.boards.board import DICTIONARIES, FEWEST_SQUARES, Board, OtherBoard
-from coursekit.boards.find import (
-    ANY_SIZE_PX,
-    checkerboard_seen,
-    off_homography,
-    real_beyond,
-    shrunk,
-)
+from coursekit.boards.find import checkerboard_seen, off_homography, real_beyond, shrunk
 
 LONGEST_PX = 1600  # an image is looked at no larger than this
+ANY_SIZE_PX = 800  # ... and where checkerboards of any size are looked for than this
 BLANK_GREY = 15.0  # levels between the darkest and the brightest hundredth
 BLURRED_PX = 5.0  # the sharpest edges of a picture that shows a board are steeper than this
 FAMILIES = tuple(  # the largest dictionary of each; the smaller ones are their beginnings
@@ -290,13 +285,9 @@ def _plans(board: Board, dictionary: str, ids: NDArray[np.intp]) -> Iterator[Boa
         sizes = [(n, m) for n, m in sizes if ids.max() - start < (n * m + 1) // 2 and m in counts]
         tries += [(start, *size) for size in sorted(sizes, key=lambda size: size[0] * size[1])]
     tries += [(start, columns, rows) for start in range(ids.min(), -1, -1)[1:columns]]
-    for start, *size in tries:
-        for old_origin in (board.old_origin, not board.old_origin)[: 1 + (size[1] + 1) % 2]:
-            plan: dict[str, Any] = {
-                "squares": (size[0], size[1]),
-                "first_marker": start,
-                "old_origin": old_origin,
-            }
+    for start, n, m in tries:
+        for old in (board.old_origin, not board.old_origin)[: 1 + (m + 1) % 2]:
+            plan: dict[str, Any] = {"squares": (n, m), "first_marker": start, "old_origin": old}
             try:
                 yield replace(board, dictionary=dictionary, **plan)
             except ValueError:  # more squares than the dictionary has markers
@@ -305,7 +296,8 @@ def _plans(board: Board, dictionary: str, ids: NDArray[np.intp]) -> Iterator[Boa
 
 def _on_plan(markers: _Markers, board: Board) -> bool:
     """Whether the markers lie where the board has them, up to a homography."""
-    plan, numbers = board.marker_centres, markers.ids - board.first_marker
+    plan = np.argwhere(board.white)[:, ::-1] + np.float64(0.5)  # their centres, in squares
+    numbers = markers.ids - board.first_marker
     known = (numbers >= 0) & (numbers < len(plan))
     if known.sum() < max(FEWEST_MARKERS, SHARE_ON_PLAN * len(known)):
         return False

@@ -6,6 +6,7 @@ tells which corner is the first. `refine_corners` makes fractions of a pixel of 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import cv2
@@ -16,7 +17,6 @@ from coursekit.boards.board import Board
 
 Corners = tuple[NDArray[np.intp], Floats]  # ids (N,) and pixels (N, 2)
 
-ANY_SIZE_PX = 800  # longest side in px at which checkerboards of any size are looked for
 LOOK_AT = ((0.25, 0.25), (0.3, 0.12), (0.12, 0.3))  # squares from a corner along x and y
 LEAST_REAL = 0.7  # of the corners in each row and column of a checkerboard are real,
 MOST_BEYOND = 0.5  # and in the lines beyond them no more
@@ -227,9 +227,7 @@ def _oriented(grey: Grey, grid: Floats, board: Board) -> Floats:
     return max(turns, key=lambda turn: float(np.gradient(turn, axis=1)[..., 0].mean()))
 
 
-def _around(
-    grey: Grey, grid: Floats, share: tuple[float, float]
-) -> tuple[Floats, Floats, Floats, Floats]:
+def _around(grey: Grey, grid: Floats, share: tuple[float, float]) -> Iterator[Floats]:
     """Grey of the squares towards (-x, -y), (+x, +y), (-x, +y), (+x, -y), (rows, columns) each.
 
     share: how far away, in squares along x and y.
@@ -241,9 +239,4 @@ def _around(
         u, v = np.rint(pixels).astype(int).transpose(2, 0, 1)
         return grey[v.clip(0, height - 1), u.clip(0, width - 1)].astype(np.float64)
 
-    return (
-        nearest(grid - x - y),
-        nearest(grid + x + y),
-        nearest(grid - x + y),
-        nearest(grid + x - y),
-    )
+    return (nearest(grid + a * x + b * y) for a, b in ((-1, -1), (1, 1), (-1, 1), (1, -1)))

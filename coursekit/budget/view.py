@@ -12,7 +12,7 @@ import numpy as np
 from coursekit import checks
 from coursekit.arrays import Floats
 from coursekit.checks import want
-from coursekit.geometry import Intrinsics, undistort
+from coursekit.geometry import Intrinsics, make_transform, undistort
 from coursekit.intrinsics.derivatives import project_with_derivatives
 
 AXES = ("closing", "approach", "lateral")
@@ -33,9 +33,7 @@ def looking_down(tilt_deg: float = 0.0) -> Floats:
     """
     checks.number("tilt_deg", tilt_deg, "an angle in degrees", least=-180, most=180)
     c, s = math.cos(math.radians(tilt_deg)), math.sin(math.radians(tilt_deg))
-    T = np.eye(4)
-    T[:3, :3] = np.array([[0, -1, 0], [-c, 0, s], [-s, 0, -c]])
-    return T
+    return make_transform([[0, -1, 0], [-c, 0, s], [-s, 0, -c]], np.zeros(3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,9 +63,8 @@ class View:
         for name, value in zip("uv", self.pixel, strict=True):
             checks.number(name, value, "a pixel coordinate")
             object.__setattr__(self, name, float(value))
-        object.__setattr__(
-            self, "T_base_camera", checks.transform("T_base_camera", self.T_base_camera)
-        )
+        T_base_camera = checks.transform("T_base_camera", self.T_base_camera)
+        object.__setattr__(self, "T_base_camera", T_base_camera)
         _ = self.ray  # says so now if there is none
 
     @property

@@ -16,23 +16,9 @@ import numpy as np
 from coursekit.arrays import AnyArray, Bools, Floats, Interval, Window
 from coursekit.checks import instance, positive, want
 from coursekit.geometry import Intrinsics, deproject
+from coursekit.stereo import windows
 from coursekit.stereo.law import rounded_variance, unrounded_std
-from coursekit.stereo.windows import (
-    CORRELATION_PX,
-    WindowStats,
-    clip_window,
-    cut,
-    depth_stack,
-    effective_frames,
-    first_frame,
-    plane_design,
-    plane_image,
-    series_std,
-    std_error,
-    valid_mean,
-    valid_median,
-    window_stats,
-)
+from coursekit.stereo.windows import WindowStats
 from coursekit.words import wrapped
 
 HALF_WINDOW_PX = 5.5  # of the matching window; edges are pushed out by up to that
@@ -86,7 +72,7 @@ class BlockFace:
     @property
     def width_std_error_m(self) -> float:
         """Standard error of `width_std_m`, frames taken as `averaging_curve` finds them."""
-        return std_error(*series_std(self.widths_m - self.widths_m.mean()))
+        return windows.std_error(*windows.series_std(self.widths_m - self.widths_m.mean()))
 
     def __repr__(self) -> str:
         text = (
@@ -166,8 +152,8 @@ def block_face(
     >>> print(f"{1e3 * block_face(image, camera, width_m=0.054).width_m:.1f} mm")
     54.0 mm
     """
-    stack, step = depth_stack(depth, depth_scale_m)
-    intrinsics = intrinsics or getattr(first_frame(depth), "depth_intrinsics", None)
+    stack, step = windows.depth_stack(depth, depth_scale_m)
+    intrinsics = intrinsics or getattr(windows.first_frame(depth), "depth_intrinsics", None)
     camera = instance("intrinsics", intrinsics, Intrinsics)
     size = (camera.height, camera.width)
     want(stack.shape[1:] == size, "depth", stack.shape[1:], f"images of {size} as the intrinsics")
@@ -178,7 +164,7 @@ def block_face(
     edges = _edges(patch)
     line, edge_error = _edge_lines(edges)
     window = _face_window(patch)
-    stats = window_stats(stack, window, step)
+    stats = windows.window_stats(stack, window, step)
     width, level, tilt = patch.measure(line, patch.plane)
     held = [patch.measure(line, plane)[0] for plane in planes]
     anew = (_edge_lines(edges[:, i : i + 1])[0] for i in range(len(planes)))
@@ -221,8 +207,8 @@ def _find_face(
     """The face around the pixel `near`: pixels about as far away, hanging together."""
     u, v = near or ((intrinsics.width - 1) / 2, (intrinsics.height - 1) / 2)
     few = stack[:: max(1, len(stack) // 8)]
-    around = clip_window((round(u) - 10, round(v) - 10, 21, 21), few)
-    seen = cut(few, around, step)
+    around = windows.clip_window((round(u) - 10, round(v) - 10, 21, 21), few)
+    seen = windows.cut(few, around, step)
     seen = seen[np.isfinite(seen)]
     if seen.size == 0:
         raise ValueError(f"depth: no valid pixel near ({u:.0f}, {v:.0f}), so no face there")
@@ -230,15 +216,17 @@ def _find_face(
     z0 = float(np.percentile(seen, 25))  # the block, even where it fills only part of the window
     z0 = float(np.median(seen[np.abs(seen - z0) < NEAR_FACE * size]))
     half = round(1.2 * intrinsics.fx * size / z0) + 30
-    window = clip_window((round(u) - half, round(v) - half, 2 * half + 1, 2 * half + 1), few)
-    image = valid_median(cut(few, window, step))
+    wide = (round(u) - half, round(v) - half, 2 * half + 1, 2 * half + 1)
+    window = windows.clip_window(wide, few)
+    image = windows.valid_median(windows.cut(few, window, step))
     left, top = window[:2]
     near_mask = np.abs(image - z0) < NEAR_FACE * size
     rows, columns = _rows_and_columns(
         near_mask, round(v) - top, round(u) - left, intrinsics.fx * size / z0, width_m is not None
     )
     plane, tolerance = _face_plane(image, rows, columns, step)
-    return _Patch(intrinsics, cut(stack, window, step), left, top, rows, columns, plane, tolerance)
+    z = windows.cut(stack, window, step)
+    return _Patch(intrinsics, z, left, top, rows, columns, plane, tolerance)
 
 
 def _rows_and_columns(
@@ -297,9 +285,9 @@ def _face_plane(
         v, u = np.nonzero(use)
         if len(u) < 12:
             raise ValueError(f"depth: only {len(u)} valid pixels on the face, want at least 12")
-        design = plane_design(u, v, image.shape)
+        design = windows.plane_design(u, v, image.shape)
         plane = np.asarray(np.linalg.lstsq(design, 1 / image[use], rcond=None)[0], float)
-        off = image - 1 / plane_image(plane, image.shape)
+        off = image - 1 / windows.plane_image(plane, image.shape)
         spread = 1.4826 * float(np.median(np.abs(off[use])))
         tolerance = max(6 * spread, 3 * (step or 0.0), 0.001)
         use = box & (np.abs(off) < tolerance)
@@ -313,7 +301,7 @@ def _frame_planes(patch: _Patch) -> Floats:
     """The face's plane in each frame, (N, 3); the stack's where a frame has too few pixels."""
     inner = _inner(patch.z.shape[1:], patch.rows, patch.columns)
     v, u = np.nonzero(inner)
-    design = plane_design(u, v, inner.shape)
+    design = windows.plane_design(u, v, inner.shape)
     base = 1 / (design @ patch.plane)
     planes = np.tile(patch.plane, (len(patch.z), 1))
     for plane, values in zip(planes, patch.z[:, inner], strict=True):
@@ -329,7 +317,7 @@ def _edges(patch: _Patch) -> Floats:
     Half a pixel beyond the last pixel on the face's plane, reached from the middle without a gap
     of more than GAP_PX.
     """
-    plane = 1 / plane_image(patch.plane, patch.z.shape[1:])
+    plane = 1 / windows.plane_image(patch.plane, patch.z.shape[1:])
     on_face = np.abs(patch.z[:, patch.rows] - plane[patch.rows]) < patch.tolerance
     middle = (patch.columns.start + patch.columns.stop) // 2
     right = _reach(on_face[..., middle:])
@@ -359,7 +347,7 @@ def _edge_line(edges: Floats) -> tuple[float, float, float]:
     """u at the middle row, du/dv and standard error (px) of one edge (N, rows)."""
     off_median = np.abs(edges - np.nanmedian(edges))
     good = np.where(off_median <= 2 * HALF_WINDOW_PX, edges, np.nan)  # no matching pushes farther
-    mean = valid_mean(good, axis=0)
+    mean = windows.valid_mean(good, axis=0)
     known = np.isfinite(mean)
     if known.sum() < 3:
         return (math.nan,) * 3
@@ -370,7 +358,7 @@ def _edge_line(edges: Floats) -> tuple[float, float, float]:
     # The pixel grid: what jitter and lean leave of the rounding to whole pixels.
     dither = math.hypot(unrounded_std(jitter, 1.0), slope * len(mean) / math.sqrt(12))
     grid = dither**2 + 1 / 12 - float(rounded_variance(dither, 1.0))
-    patches = min(effective_frames(off[:, None])[0], len(off) / CORRELATION_PX)
+    patches = min(windows.effective_frames(off[:, None])[0], len(off) / windows.CORRELATION_PX)
     error = math.sqrt(max(grid, 0.0) + float(np.var(off)) / max(patches, 1.0))
     return float(at), float(slope), error
 
@@ -392,7 +380,7 @@ def _flying(patch: _Patch, edges: Floats) -> float:
 
     What is behind is taken row by row from the pixels next to the band.
     """
-    plane = 1 / plane_image(patch.plane, patch.z.shape[1:])[patch.rows]
+    plane = 1 / windows.plane_image(patch.plane, patch.z.shape[1:])[patch.rows]
     z = patch.z[:, patch.rows]
     flying = valid = 0
     for side, outwards in ((0, -1), (1, 1)):
@@ -401,7 +389,7 @@ def _flying(patch: _Patch, edges: Floats) -> float:
         start, stop = sorted((at + outwards * EDGE_BAND_PX, at + outwards * 2 * EDGE_BAND_PX))
         behind = z[..., max(start, 0) : max(stop, 0)]
         rows = np.moveaxis(behind, 1, 2).reshape(-1, behind.shape[1])
-        far = np.nan_to_num(valid_median(rows), nan=np.inf)[:, None]
+        far = np.nan_to_num(windows.valid_median(rows), nan=np.inf)[:, None]
         part, face = z[..., band], plane[:, band]
         slack = patch.tolerance * np.maximum((far / face) ** 2, 1.0)
         with np.errstate(invalid="ignore"):

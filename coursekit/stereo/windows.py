@@ -219,7 +219,7 @@ def window_stats(depth: Any, window: Window, depth_scale_m: float | None = None)
         pixel_std_unrounded_m=unrounded_std(pixel_std, step),
         mean_std_m=mean_std,
         mean_dof=mean_dof,
-        spatial_std_m=_spatial_std(z),
+        spatial_std_m=rms([about_plane(frame)[0] for frame in z]),
         means_m=level + drift,
         depth_scale_m=step,
         not_gaussian=not_gaussian,
@@ -340,25 +340,6 @@ def _temporal(deviation: Floats) -> tuple[float, float, Floats]:
     common = min(float(drift @ drift) / (n - 1), variance)
     shares = (variance - common) ** 2 / _pixel_dof(own) + common**2 / series_std(drift)[1]
     return math.sqrt(variance), variance**2 / shares, drift
-
-
-def _spatial_std(z: Floats) -> float:
-    """RMS of a stack (N, h, w) about each frame's own plane in 1/Z; see `about_plane`.
-
-    All frames at once, by normal equations: the design has three columns and is centred.
-    """
-    rows, columns = np.indices(z.shape[1:]).reshape(2, -1)
-    design = plane_design(columns, rows, z.shape[1:])
-    flat = z.reshape(len(z), -1)
-    known = np.isfinite(flat)
-    squares = (design[:, :, None] * design[:, None, :]).reshape(-1, 9)
-    normal = (known.astype(np.float64) @ squares).reshape(-1, 3, 3)
-    sure = np.linalg.det(normal) > 1e-3 * np.prod(np.diagonal(normal, axis1=1, axis2=2), axis=1)
-    sure &= known.sum(axis=1) > 3
-    right = np.where(known, 1 / np.where(known, flat, 1.0), 0.0) @ design
-    plane = np.linalg.solve(normal[sure], right[sure, :, None])[..., 0]
-    others = (about_plane(frame)[0] for frame in z[~sure])
-    return rms([flat[sure] - 1 / (plane @ design.T), *others])
 
 
 def _patch_error(residual: Floats) -> float:
