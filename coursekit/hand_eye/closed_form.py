@@ -41,7 +41,7 @@ CLOSED_FORMS = ("closed_form", *HAND_EYE, *ROBOT_WORLD)
 FEWEST_POSES = 3
 HALF_TURN_DEG = 170.0  # beyond it noise can turn an axis round
 LEAST_TURN_RAD = np.radians(0.1)  # less than any arm's own wobble
-SINGULAR = 1e-13  # of the normal matrix' largest eigenvalue: rounding errors are as large
+NO_INVERSE = 1e-13  # of the normal matrix' largest eigenvalue: rounding errors are as large
 NO_CAMERA_M = 1e5  # farther away is no camera, not even in millimetres that pass for metres
 NONSENSE_ROTATION = 1e-2  # R R^T - 1 of a solver's output: below it rounding, above it nonsense
 
@@ -107,7 +107,7 @@ def translation_half(A: Floats, B: Floats, R_X: Floats) -> Floats:
     rows = A[..., :3, :3] - np.eye(3)
     right = B[..., :3, 3] @ np.swapaxes(R_X, -1, -2) - A[..., :3, 3]
     normal = np.einsum("...pki,...pkj->...ij", rows, rows)
-    inverse = np.linalg.pinv(normal, rcond=SINGULAR, hermitian=True)
+    inverse = np.linalg.pinv(normal, rcond=NO_INVERSE, hermitian=True)
     return np.einsum("...ij,...pkj,...pk->...i", inverse, rows, right, optimize=True)
 
 

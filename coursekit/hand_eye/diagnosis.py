@@ -21,7 +21,7 @@ from coursekit.hand_eye import causes, misread
 from coursekit.hand_eye.causes import Arms, Fit, MendedPairs, PosePairs
 from coursekit.hand_eye.closed_form import FEWEST_POSES
 from coursekit.hand_eye.poses import camera_board, observability
-from coursekit.hand_eye.session import TEXTS, HandEyeSession
+from coursekit.hand_eye.session import SENTENCES, HandEyeSession
 from coursekit.hand_eye.views import nearer
 from coursekit.words import Finding, Findings
 
@@ -84,13 +84,13 @@ class _Case:
 
     def add(self, key: str, **figures: Any) -> None:
         """A finding."""
-        self.found.append(TEXTS.finding(key, **figures))
+        self.found.append(SENTENCES.finding(key, **figures))
 
     def findings(self, *unseen: str) -> Findings:
         """What was found, with what could not be tested."""
         figures = {"pairs": causes.FEWEST_PAIRS, "repeated": self.session.repeated}
-        reasons = [TEXTS.not_tested[key].format(**figures) for key in unseen]
-        return Findings(self.found, TEXTS.looked_for, reasons)
+        reasons = [SENTENCES.not_tested[key].format(**figures) for key in unseen]
+        return Findings(self.found, SENTENCES.looked_for, reasons)
 
     # --- units ---
 
@@ -178,7 +178,7 @@ class _Case:
             self.pairs = pairing.mended
             self.add(pairing.name, reading=pairing.says, **_change(given, self.pairs.fit))
             return
-        either = misread.inverted(self.pairs)
+        either = [misread.inverted(self.pairs)]
         better = misread.better_reading(given, either, misread.PAIRING_SHIFT_LEFT)
         if better:
             self.pairs = better.fit.pairs
@@ -205,7 +205,7 @@ class _Case:
         """Board poses in a camera frame whose z does not look forward; X absorbs that."""
         axis, share, ahead = misread.looking_along(self.pairs.T_camera_board)
         if axis != "z" and ahead < 1 - misread.SHARE_IN_VIEW < misread.SHARE_IN_VIEW < share:
-            known = TEXTS.words["camera_axes"]
+            known = SENTENCES.words["camera_axes"]
             what, cure = known.get(axis, known["other"])
             self.add("camera_axes", axis=axis, share=100 * share, what=what, cure=cure)
 
@@ -346,7 +346,7 @@ def _from_residuals(search: CauseSearch[MendedPairs], session: HandEyeSession) -
         figures = _figures(step, search.model, session) | _change(step.before.fit, step.after.fit)
         if odd:
             figures |= {"names": ", ".join(names), "left": odd[-1].after.fit.says()}
-        found.append(TEXTS.finding(step.test.cause, step.test.p_value, **figures))
+        found.append(SENTENCES.finding(step.test.cause, step.test.p_value, **figures))
     return found
 
 

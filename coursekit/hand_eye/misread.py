@@ -22,7 +22,7 @@ from coursekit.causes import log_chi2_tail
 from coursekit.geometry import invert_transform, pose_difference
 from coursekit.hand_eye.causes import LEAST_M, LEAST_RAD, Fit, PosePairs
 from coursekit.hand_eye.poses import Mount, base_gripper, camera_board, nearest_rotation
-from coursekit.hand_eye.session import TEXTS, HandEyeSession
+from coursekit.hand_eye.session import SENTENCES, HandEyeSession
 
 PER_RADIAN = 180.0 / np.pi
 # The most displacement that a reading may leave over, in units of that as given. Pairs put right
@@ -65,19 +65,16 @@ class Reading:
     fit: Fit
 
 
-def better_reading(
-    given: Fit, readings: Iterator[tuple[str, str, PosePairs]], most_shift: float
-) -> Reading | None:
+def better_reading(given: Fit, readings: Iterable[Reading], most_shift: float) -> Reading | None:
     """The reading that makes residuals smallest, if clearly smaller, both turns and displacements.
 
     most_shift: how large the displacements left over may be, in units of those as given; a wrong
     reading may mend the rotations alone.
     """
-    fits = [Reading(name, says, pairs.fit) for name, says, pairs in readings]
     left = most_shift * given.shift_m + LEAST_M
     return best(
         r
-        for r in fits
+        for r in readings
         if r.fit.better_than(given) > CLEARLY_BETTER
         and r.fit.shift_m < left
         and r.fit.turn_rad < given.turn_rad / 2
@@ -89,27 +86,19 @@ def best(readings: Iterable[Reading]) -> Reading | None:
     return min(readings, key=lambda reading: float(f"{reading.fit.size:.4g}"), default=None)
 
 
-def inverted(pairs: PosePairs) -> Iterator[tuple[str, str, PosePairs]]:
+def inverted(pairs: PosePairs) -> Reading:
     """Either side inverted."""
     T = invert_transform(pairs.T_base_gripper)
-    yield "inverted", "one side inverted", replace(pairs, T_base_gripper=T)
+    return Reading("inverted", "one side inverted", replace(pairs, T_base_gripper=T).fit)
 
 
-def other_rotations(pairs: PosePairs) -> Iterator[tuple[str, str, PosePairs]]:
+def other_rotations(pairs: PosePairs) -> Iterator[Reading]:
     """The arm's rotations with a slip of their nine or four numbers; the positions stay."""
     R = Rotation.from_matrix(pairs.T_base_gripper[:, :3, :3])
-    quaternions = R.as_quat()
-    for words, places in (
-        (
-            "(w, x, y, z) read as (x, y, z, w); the data fit from_quat(q[[1, 2, 3, 0]])",
-            [1, 2, 3, 0],
-        ),
-        ("(x, y, z, w) read as (w, x, y, z); the data fit Rotation.from_quat(q)", [3, 0, 1, 2]),
-    ):
-        other = Rotation.from_quat(quaternions[:, places]).as_matrix()
-        yield "notation", f"quaternions {words}", with_rotations(pairs, other)
-    words = "rotations transposed, the positions left; the data fit R.T"
-    yield "notation", words, with_rotations(pairs, R.inv().as_matrix())
+    orders = ([1, 2, 3, 0], [3, 0, 1, 2])
+    slips = [*(Rotation.from_quat(R.as_quat()[:, order]) for order in orders), R.inv()]
+    for words, turns in zip(SENTENCES.words["other_rotations"], slips, strict=True):
+        yield Reading("notation", words, with_rotations(pairs, turns.as_matrix()).fit)
 
 
 def with_rotations(pairs: PosePairs, R: Floats) -> PosePairs:
@@ -539,10 +528,8 @@ def candidates(fit: Fit, session: HandEyeSession, kind: str) -> list[Candidate]:
     pairs, X, Y = fit.pairs, fit.X, fit.Y[0]
     seen, other = pairs.T_camera_board, other_mount(pairs.mount)
     rows = ((pairs.mount, X, Y, seen), (pairs.mount, Y, X, invert_transform(seen)))
-    found = []
-    for name, (mount, X_, Y_, C) in zip(
-        TEXTS.words[kind], (*rows, (other, X, Y, seen)), strict=True
-    ):
+    found, names = [], SENTENCES.words[kind]
+    for name, (mount, X_, Y_, C) in zip(names, (*rows, (other, X, Y, seen)), strict=True):
         against = list(_implausible(mount, X_, Y_, C, session))
         if session.detections is not None and C is not seen:
             against.append("the board's poses were computed here from the images")

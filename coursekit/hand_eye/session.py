@@ -60,7 +60,7 @@ from coursekit.hand_eye.poses import (
 from coursekit.results import write_bytes
 from coursekit.words import Estimate, wrapped
 
-TEXTS = DiagnosisTexts.of("hand_eye")
+SENTENCES = DiagnosisTexts.of("hand_eye")
 METHODS = ("refine", *CLOSED_FORMS)
 POSES = "poses.csv"
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
@@ -741,7 +741,7 @@ class HandEyeResult(Estimate):
     @cached_property
     def judgement(self) -> Trust:
         """How far to trust X, and why; of a closed form only what its poses and residuals say."""
-        known, says = observability(self.session.T_base_gripper, self.mount), TEXTS.words
+        known, says = observability(self.session.T_base_gripper, self.mount), SENTENCES.words
         weak = [f"{direction}: the poses do not determine it." for direction in known.free]
         weak += [f"{self.session.repeated}."] * bool(self.session.repeated)
         if known.poses < GOOD_POSES:
@@ -757,21 +757,21 @@ class HandEyeResult(Estimate):
         """That arm and images disagree by more than arms that stand still do, or ""."""
         mm, deg = self.spread_gripper_mm, self.spread_gripper_deg
         large = mm > LARGE_MM or deg > LARGE_DEG
-        return TEXTS.words["large"].format(mm=mm, deg=deg) if large else ""
+        return SENTENCES.words["large"].format(mm=mm, deg=deg) if large else ""
 
     def _broken(self) -> Iterator[str]:
         """Why the intervals are not to be trusted."""
         if self.refined is None:
             return
         if not self.refined.converged:
-            yield TEXTS.words["not_converged"]
+            yield SENTENCES.words["not_converged"]
         if self.spread_gripper_mm > BROKEN_MM or self.spread_gripper_deg > BROKEN_DEG:
-            yield TEXTS.words["broken"]
+            yield SENTENCES.words["broken"]
         far = self.refined.far
         odd = np.flatnonzero(far > FAR_OUT * np.median(far))
         if len(odd):
             names = ", ".join(self.session.names[i] for i in odd)
-            yield TEXTS.words["odd"].format(names=names, times=FAR_OUT)
+            yield SENTENCES.words["odd"].format(names=names, times=FAR_OUT)
 
     def __repr__(self) -> str:
         name_X, name_Y = FRAMES[self.mount]
@@ -841,13 +841,13 @@ class HandEyeResult(Estimate):
     def _head(self) -> str:
         """The finding in a sentence or two."""
         if self.refined is None:
-            return str(TEXTS.words["closed_form"].format(method=self.method))
+            return str(SENTENCES.words["closed_form"].format(method=self.method))
         judged = self.judgement
         if not judged.trusted:
             return f"{judged.grade}: the intervals hold for sessions without such faults only."
         if math.isinf(judged.worst_mm):
             return f"{judged.grade} how good it is: {self._untold}."
-        reaches = TEXTS.words["reaches"].format(ahead=1e3 * LEVER_M, worst=judged.worst_mm)
+        reaches = SENTENCES.words["reaches"].format(ahead=1e3 * LEVER_M, worst=judged.worst_mm)
         return f"{judged.grade}: {reaches}"
 
     @property

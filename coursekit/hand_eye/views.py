@@ -213,12 +213,9 @@ def nearer(boards: Sequence[BoardPose], expected: Floats) -> Floats:
 
     expected (n, 4, 4): T_camera_board, as is what is returned.
     """
-    both = np.array(
-        [
-            [pose.T_camera_board, pose.T_camera_board if pose.other is None else pose.other]
-            for pose in boards
-        ]
-    )
+    best = [pose.T_camera_board for pose in boards]
+    other = [pose.T_camera_board if pose.other is None else pose.other for pose in boards]
+    both = np.stack([best, other], axis=1)
     turns = np.linalg.norm(pose_difference(expected[:, None], both)[..., :3], axis=-1)
     return both[np.arange(len(both)), turns.argmin(axis=1)]
 
