@@ -25,7 +25,7 @@ from coursekit import cli
 from coursekit.specifications import DATA
 from coursekit.submission import batch
 from coursekit.submission.batch import Bundle, Limits
-from coursekit.submission.format import bundle_bytes, write_bundle
+from coursekit.submission.format import bundle_bytes
 from coursekit.submission.report import ReportLine, grade_file, not_graded
 from coursekit.submission.rubric import grade
 
@@ -48,7 +48,7 @@ def quick(folder: Path, names: Iterable[str]) -> Path:
     """A folder of small valid bundles."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in names:
-        write_bundle(folder / f"{name}.zip", replace(ZOE, student=name))
+        (folder / f"{name}.zip").write_bytes(bundle_bytes(replace(ZOE, student=name)))
     return folder
 
 
@@ -135,7 +135,8 @@ def test_the_same_bytes_come_out_however_many_processes_there_are(in_process, re
 
 def test_a_batch_grades_as_the_rubric_does(tmp_path):
     whole = honest(seed=5)
-    path = write_bundle(tmp_path / "a.zip", whole)
+    path = tmp_path / "a.zip"
+    path.write_bytes(bundle_bytes(whole))
     line, page = grade_file(str(path), "a.zip", "students/a.html")
     found = grade(whole)
     brief = {"says": "", "tolerance": None}
@@ -271,7 +272,7 @@ def test_what_is_graded_is_not_graded_again(in_process, tmp_path, monkeypatch):
     assert graded(folder, out, overwrite=True).kept == 4
     assert (out / "grades.csv").read_bytes() == before
 
-    write_bundle(folder / "b.zip", replace(ZOE, student="New"), overwrite=True)
+    (folder / "b.zip").write_bytes(bundle_bytes(replace(ZOE, student="New")))
     (folder / "d.zip").rename(folder / "e.zip")
     (next((out / ".rows").glob("*.json"))).write_bytes(b"{")
     assert graded(folder, out, overwrite=True).kept in (1, 2)

@@ -18,7 +18,7 @@ from coursekit.cameras.simulated import SimulatedCamera
 from coursekit.lessons import questions
 from coursekit.results import Quantity
 from coursekit.submission import submit as handing_in
-from coursekit.submission.format import Conclusion, Plot, TableRow, read_bundle, slug, write_bundle
+from coursekit.submission.format import Conclusion, Plot, TableRow, bundle_bytes, read_bundle, slug
 from coursekit.submission.recompute import grading_rules
 from coursekit.submission.rubric import grade, shortcomings
 from coursekit.submission.submit import MEASURED, keep, load_measured, relative, submit
@@ -40,7 +40,7 @@ def kept(own_results):
     """An honest measurement, as the notebook keeps it."""
     nameless = {"student": handing_in.NOBODY, "conclusion": Conclusion(), "outcomes": {}}
     whole = honest(seed=3, **nameless)
-    write_bundle(own_results / MEASURED, whole)
+    results.write_bytes(own_results / MEASURED, bundle_bytes(whole))
     return whole
 
 
@@ -195,7 +195,8 @@ def test_an_honest_student_gets_full_points_for_what_passes_here(kept, own_resul
 def test_what_is_weak_is_said_in_the_graders_words_and_packed_all_the_same(kept, own_results):
     *others, last = kept.stacks
     short = replace(last, counts=last.counts[:84], times_s=last.times_s[:84])
-    write_bundle(own_results / MEASURED, replace(kept, stacks=(*others, short)), overwrite=True)
+    short_one = replace(kept, stacks=(*others, short))
+    results.write_bytes(own_results / MEASURED, bundle_bytes(short_one))
     handed = submit("Ben")
     assert handed.path is not None
     assert any(says.startswith("0.60 m has 84 frames, 100 are needed") for says in handed.says)

@@ -31,7 +31,7 @@ from coursekit.results import Quantity, write_bytes, write_json
 from coursekit.simulation.arm_sessions import SIMULATED, rendered_session
 from coursekit.simulation.corner_sessions import Effects, corner_session, view_poses
 from coursekit.specifications import DATA
-from coursekit.submission.format import Conclusion, Stack, Submission, bundle_bytes, write_bundle
+from coursekit.submission.format import Conclusion, Stack, Submission, bundle_bytes
 from coursekit.submission.submit import measured
 from tools import build_notebooks, degenerate_poses
 
@@ -198,7 +198,7 @@ def sample_bundles() -> None:
         ("dan_copied", _copied(ada, "Dan Copied")),
         ("eve_formula", replace(ada, student='=HYPERLINK("x")<script>alert(1)</script>')),
     ):
-        write_bundle(SAMPLES / f"{name}.zip", submission)
+        write_bytes(SAMPLES / f"{name}.zip", bundle_bytes(submission))
     whole = bundle_bytes(ada)
     write_bytes(SAMPLES / "hostile_truncated.zip", whole[: len(whole) // 2])
     write_bytes(SAMPLES / "hostile_bomb.zip", _zip({"depth_0.npy": bytes(30_000_000)}))

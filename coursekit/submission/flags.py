@@ -21,7 +21,7 @@ import numpy as np
 from coursekit import specifications
 from coursekit.arrays import Bools, Floats, NDArray
 from coursekit.submission.format import CameraFacts, Stack, Submission
-from coursekit.submission.recompute import Recomputed, grading_rules
+from coursekit.submission.recompute import SEEN, Recomputed, grading_rules
 
 TILES = 6  # a side of the grid on which the noise of a frame is remembered
 PATTERN_LIKENESS = 0.8  # correlation of two time means on that grid
@@ -41,6 +41,11 @@ class Flag:
     code: str
     says: str
     note: bool = False
+
+
+def _flag(code: str, **facts: Any) -> Flag:
+    """The flag of this code; facts: what its sentence in words.toml has to be filled with."""
+    return Flag(code, SEEN[code].format(**facts))
 
 
 def data_flags(submission: Submission, found: Recomputed, prints: Fingerprint) -> tuple[Flag, ...]:
@@ -66,18 +71,12 @@ def _too_clean(camera: CameraFacts, found: Recomputed, limits: dict[str, float])
     for m in several:
         different, n = len({frame.tobytes() for frame in m.stack.counts}), m.stats.n_frames
         if different < n and not m.stats.frozen_fraction > 0.5:
-            says = f"At {m.distance_m:.2f} m only {different} of {n} frames differ;"
-            yield Flag("repeated_frames", f"{says} noise makes every frame different.")
+            yield _flag("repeated_frames", z=m.distance_m, different=different, n=n)
     product = camera.fx * (camera.baseline_m or 0.05)
     known = [m for m in several if m.std is not None]
     sigma_d = [m.stats.pixel_std_unrounded_m * product / m.distance_m**2 for m in known]
     if sigma_d and max(sigma_d) < limits["least_sigma_d_px"]:
-        says = (
-            f"The noise is that of a disparity good to {max(sigma_d):.4f} px or better, under "
-            f"{limits['least_sigma_d_px']:g} px at every distance: filtered in time, or not "
-            "measured by stereo."
-        )
-        yield Flag("too_clean", says)
+        yield _flag("too_clean", most=max(sigma_d), least=limits["least_sigma_d_px"])
 
 
 def _flat(found: Recomputed, limits: dict[str, float]) -> Iterator[Flag]:
@@ -87,11 +86,7 @@ def _flat(found: Recomputed, limits: dict[str, float]) -> Iterator[Flag]:
         return
     most = free.exponent + 2 * math.sqrt(free.covariance[1, 1])
     if most < limits["flat_exponent"]:
-        says = (
-            f"The noise grows as distance to the power {free.exponent:.2f} (at most {most:.2f}); "
-            "stereo noise grows with its square."
-        )
-        yield Flag("not_distance_dependent", says)
+        yield _flag("not_distance_dependent", exponent=free.exponent, most=most)
 
 
 def _random_numbers(found: Recomputed, limits: dict[str, float]) -> Iterator[Flag]:
@@ -110,18 +105,9 @@ def _random_numbers(found: Recomputed, limits: dict[str, float]) -> Iterator[Fla
     likeness = max((pair[0] for pair in pairs if pair), default=math.inf)
     pattern = max((pair[1] for pair in pairs if pair), default=math.inf)
     if likeness < limits["white"]:
-        says = (
-            f"Neighbouring pixels share nothing of their noise (correlation {likeness:+.2f} at "
-            "most); those of a stereo camera share their matching window. Random numbers look "
-            "like this."
-        )
-        yield Flag("white_in_space", says)
+        yield _flag("white_in_space", likeness=likeness)
     if pattern < limits["pattern"]:
-        says = (
-            "The mean of all frames is as flat as independent noise leaves it "
-            f"({pattern:.1f} times); a stereo camera repeats a pattern in every frame."
-        )
-        yield Flag("no_pattern", says)
+        yield _flag("no_pattern", times=pattern)
 
 
 def _space(counts: NDArray[np.uint16]) -> tuple[float, float] | None:
@@ -167,8 +153,7 @@ def _simulated(submission: Submission) -> Iterator[Flag]:
     if camera.source == "live" and any(_perfect_clock(s.times_s) for s in submission.stacks):
         reasons.append("its clock has no jitter")
     if reasons and camera.source != "simulated":
-        says = f"Declared as {camera.source}, but {'; '.join(reasons)}."
-        yield Flag("simulated_as_live", says)
+        yield _flag("simulated_as_live", source=camera.source, reasons="; ".join(reasons))
 
 
 @lru_cache(maxsize=1)
@@ -198,7 +183,7 @@ def _times(submission: Submission, limits: dict[str, float]) -> Iterator[Flag]:
             reasons.append(f"{where} say {1 / float(np.median(steps)):.3g} frames a second")
     reasons += _times_together(submission)
     if reasons:
-        yield Flag("impossible_times", f"Time stamps that cannot be: {'; '.join(reasons)}.")
+        yield _flag("impossible_times", reasons="; ".join(reasons))
 
 
 def _times_together(submission: Submission) -> Iterator[str]:
@@ -225,8 +210,7 @@ def _one_stack_twice(prints: Sequence[StackPrint]) -> Iterator[Flag]:
         for two in prints[:i]:
             alike = max(_shared(one, two)[0], _shared(two, one)[0])
             if one.digest == two.digest or alike >= FRAMES_FOUND:
-                both = f"{two.distance_m:.2f} m and {one.distance_m:.2f} m"
-                yield Flag("one_stack_twice", f"The noise at {both} is the same, frame by frame.")
+                yield _flag("one_stack_twice", one=two.distance_m, two=one.distance_m)
 
 
 # --- fingerprints, and who shares what ------------------------------------------------------

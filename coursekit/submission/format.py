@@ -28,7 +28,6 @@ from typing import Any, Literal
 import fastjsonschema
 import numpy as np
 
-from coursekit import results
 from coursekit.arrays import AnyArray, Floats, Interval, NDArray
 from coursekit.checks import shown
 
@@ -202,18 +201,6 @@ class Refused(ValueError):
 
 
 # --- packing --------------------------------------------------------------------------------------
-
-
-def write_bundle(path: Path, submission: Submission, overwrite: bool = False) -> Path:
-    """Write the bundle in one step, and return its path.
-
-    Raises FileExistsError when there is one already and `overwrite` is False, and Refused for a
-    submission that no bundle can hold.
-    """
-    if path.exists() and not overwrite:
-        raise FileExistsError(f"{path}: is there already; overwrite=True replaces it")
-    results.write_bytes(path, bundle_bytes(submission))
-    return path
 
 
 def bundle_bytes(submission: Submission) -> bytes:
