@@ -282,11 +282,9 @@ def _face_plane(
     box = _inner(image.shape, rows, columns)
     use = box & np.isfinite(image)
     for _ in range(4):
-        v, u = np.nonzero(use)
-        if len(u) < 12:
-            raise ValueError(f"depth: only {len(u)} valid pixels on the face, want at least 12")
-        design = windows.plane_design(u, v, image.shape)
-        plane = np.asarray(np.linalg.lstsq(design, 1 / image[use], rcond=None)[0], float)
+        if use.sum() < 12:
+            raise ValueError(f"depth: only {use.sum()} valid pixels on the face, want at least 12")
+        plane = windows.fit_plane(np.where(use, image, np.nan))
         off = image - 1 / windows.plane_image(plane, image.shape)
         spread = 1.4826 * float(np.median(np.abs(off[use])))
         tolerance = max(6 * spread, 3 * (step or 0.0), 0.001)
@@ -300,15 +298,11 @@ def _face_plane(
 def _frame_planes(patch: _Patch) -> Floats:
     """The face's plane in each frame, (N, 3); the stack's where a frame has too few pixels."""
     inner = _inner(patch.z.shape[1:], patch.rows, patch.columns)
-    v, u = np.nonzero(inner)
-    design = windows.plane_design(u, v, inner.shape)
-    base = 1 / (design @ patch.plane)
-    planes = np.tile(patch.plane, (len(patch.z), 1))
-    for plane, values in zip(planes, patch.z[:, inner], strict=True):
-        use = np.abs(values - base) < 2 * patch.tolerance
-        if use.sum() >= 12:
-            plane[:] = np.linalg.lstsq(design[use], 1 / values[use], rcond=None)[0]
-    return planes
+    off = patch.z - 1 / windows.plane_image(patch.plane, inner.shape)
+    use = inner & (np.abs(off) < 2 * patch.tolerance)
+    enough = use.sum(axis=(1, 2)) >= 12
+    frames = zip(np.where(use, patch.z, np.nan), enough, strict=True)
+    return np.array([windows.fit_plane(frame) if fits else patch.plane for frame, fits in frames])
 
 
 def _edges(patch: _Patch) -> Floats:

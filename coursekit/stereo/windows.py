@@ -219,7 +219,7 @@ def window_stats(depth: Any, window: Window, depth_scale_m: float | None = None)
         pixel_std_unrounded_m=unrounded_std(pixel_std, step),
         mean_std_m=mean_std,
         mean_dof=mean_dof,
-        spatial_std_m=rms([about_plane(frame)[0] for frame in z]),
+        spatial_std_m=off_plane(z),
         means_m=level + drift,
         depth_scale_m=step,
         not_gaussian=not_gaussian,
@@ -270,14 +270,12 @@ def _not_gaussian(
     elif excess < -FAR_FROM_GAUSS - unsure:
         words.append("pixels jump between two depths")
         left.append(min(dof, n - 1.0))
-    rows = [np.array_split(third, 3, axis=1) for third in np.array_split(own, 3)]
-    parts = [rms([np.sqrt(part)]) for row in rows for part in row]
-    times = [rms([np.sqrt(part)]) for part in np.array_split(square, 5)]
-    for stds, most, where in (
+    parts = [p for row in np.array_split(own, 3) for p in np.array_split(row, 3, axis=1)]
+    for pieces, most, where in (
         (parts, PARTS_APART, "parts of the window"),
-        (times, TIMES_APART, "times in the stack"),
+        (np.array_split(square, 5), TIMES_APART, "times in the stack"),
     ):
-        v = np.square([s for s in stds if np.isfinite(s)])
+        v = np.array([np.nanmean(piece) for piece in pieces if np.isfinite(piece).any()])
         v = np.maximum(v / v.mean(), 1e-4)
         apart = math.sqrt(v.max() / v.min())
         if apart > most * math.exp(3 / math.sqrt(2 * dof / len(v))):
@@ -485,8 +483,8 @@ class AveragingCurve:
     their standard errors. ideal_m (K,): std_m[0] / sqrt(N), for independent frames. n_frames: all
     there are. effective_frames: how many independent ones they are worth, and its interval.
     gain: how much quieter the mean of all frames is than one; sqrt(n_frames) at best.
-    spatial_m (K,): RMS over the pixels about a plane of a mean of N frames, and floor_m, where it
-    ends: the pattern that every frame repeats. Both None for a series without pixels.
+    floor_m: the pattern that every frame repeats, RMS over the pixels about a plane; None for a
+    series without pixels.
     """
 
     counts: Integers
@@ -497,7 +495,6 @@ class AveragingCurve:
     effective_frames: float
     effective_frames_interval: Interval
     gain: float
-    spatial_m: Floats | None
     floor_m: float | None
 
     def __repr__(self) -> str:
@@ -532,7 +529,7 @@ def averaging_curve(series_m: ArrayLike) -> AveragingCurve:
     want(long, "series_m", values.shape, "(N,) or (N, h, w) with N >= 8")
     n = len(values)
     if values.ndim == 3:
-        values = np.where(values > 0, values, np.nan)
+        values = np.where((values > 0) & (values < np.inf), values, np.nan)
     pixels = values.reshape(n, -1)
     pixels = pixels[:, np.isfinite(pixels).all(axis=0)]
     if pixels.shape[1] == 0:
@@ -541,12 +538,11 @@ def averaging_curve(series_m: ArrayLike) -> AveragingCurve:
     counts = 2 ** np.arange(int(math.log2(n // 4)) + 1)
     std = np.sqrt([_means(deviation, c).var(axis=0, ddof=1).mean() for c in counts])
     effective, interval = effective_frames(deviation)
-    spatial, floor = None, None
+    floor = None
     if values.ndim == 3:
-        spatial = np.array([rms([about_plane(m)[0] for m in _means(values, c)]) for c in counts])
         own = deviation - deviation.mean(axis=1, keepdims=True)  # without the drift all share
         noise = np.square(own).sum() / own.shape[1] / (n - 1) / (n / _correlation_time(own))
-        floor = math.sqrt(max(rms([about_plane(values.mean(axis=0))[0]]) ** 2 - noise, 0.0))
+        floor = math.sqrt(max(off_plane(values.mean(axis=0)[None]) ** 2 - noise, 0.0))
     return AveragingCurve(
         counts=counts,
         std_m=std,
@@ -556,7 +552,6 @@ def averaging_curve(series_m: ArrayLike) -> AveragingCurve:
         effective_frames=effective,
         effective_frames_interval=interval,
         gain=math.sqrt(effective),
-        spatial_m=spatial,
         floor_m=floor,
     )
 
@@ -572,52 +567,46 @@ def _means(values: Floats, count: Any) -> Floats:
 
 def valid_mean(values: Floats, axis: int) -> Floats:
     """The mean without NaN, NaN where there is nothing else."""
-    known = np.isfinite(values)
-    counts = known.sum(axis=axis)
-    total = np.where(known, values, 0.0).sum(axis=axis)
-    return np.where(counts > 0, total / np.maximum(counts, 1), np.nan)
+    return np.asarray(np.ma.masked_invalid(values).mean(axis=axis).filled(np.nan))
 
 
 def valid_median(stack: Floats) -> Floats:
     """The median over frames (N, ...) without NaN, NaN where there is nothing else."""
-    ordered = np.sort(stack, axis=0)  # NaN last
-    counts = np.isfinite(stack).sum(axis=0)
-    low, high = np.maximum((counts - 1) // 2, 0), np.minimum(counts // 2, len(stack) - 1)
-    pick = [np.take_along_axis(ordered, i[None], axis=0)[0] for i in (low, high)]
-    return np.where(counts > 0, (pick[0] + pick[1]) / 2, np.nan)
+    return np.asarray(np.ma.median(np.ma.masked_invalid(stack), axis=0).filled(np.nan))
 
 
-def rms(parts: list[Floats]) -> float:
-    values = np.concatenate([p[np.isfinite(p)] for p in parts])
-    return float(np.sqrt(np.square(values).mean())) if values.size else math.nan
+def off_plane(images: Floats) -> float:
+    """RMS over the pixels of images (N, h, w), each about its own plane, see `about_plane`."""
+    off = np.array([about_plane(image)[0] for image in images])
+    return math.sqrt(np.nanmean(np.square(off))) if np.isfinite(off).any() else math.nan
 
 
 def about_plane(image: Floats) -> tuple[Floats, float]:
-    """What an image (h, w) of depths is off its plane, and the plane's depth at the centre.
+    """What an image (h, w) of depths is off its plane, and the plane's depth at the centre."""
+    plane = fit_plane(image)
+    return image - 1 / plane_image(plane, image.shape), float(1 / plane[0])
 
-    A plane in space is linear in 1/Z, so that is fitted. NaN is invalid; fewer than three valid
-    pixels leave NaN.
+
+def fit_plane(image: Floats) -> Floats:
+    """A plane in space through an image (h, w) of depths: 1/Z = plane (3,) . (1, u - u0, v - v0).
+
+    Linear in 1/Z, and u0, v0 the middle. NaN is invalid; fewer than three valid pixels leave NaN.
     """
     known = np.isfinite(image)
-    rows, columns = np.nonzero(known)
-    if len(rows) < 3:
-        return np.full(image.shape, np.nan), math.nan
-    design = plane_design(columns, rows, image.shape)
-    coefficients, *_ = np.linalg.lstsq(design, 1 / image[known], rcond=None)
-    residual = np.full(image.shape, np.nan)
-    residual[known] = image[known] - 1 / (design @ coefficients)
-    return residual, float(1 / coefficients[0])
+    if known.sum() < 3:
+        return np.full(3, np.nan)
+    design = _plane_design(image.shape)[known]
+    return np.asarray(np.linalg.lstsq(design, 1 / image[known], rcond=None)[0])
 
 
-def plane_design(columns: Any, rows: Any, shape: tuple[int, ...]) -> Floats:
-    u, v = columns - (shape[1] - 1) / 2, rows - (shape[0] - 1) / 2
-    return np.stack([np.ones(len(u)), u, v], axis=-1)
-
-
-def plane_image(plane: Any, shape: tuple[int, ...]) -> Floats:
+def plane_image(plane: Floats, shape: tuple[int, ...]) -> Floats:
     """1/Z of a plane at the pixels of a patch (h, w)."""
+    return np.asarray(_plane_design(shape) @ plane)
+
+
+def _plane_design(shape: tuple[int, ...]) -> Floats:
     v, u = np.indices(shape)
-    return (plane_design(u.ravel(), v.ravel(), shape) @ plane).reshape(shape)
+    return np.stack([np.ones(shape), u - (shape[1] - 1) / 2, v - (shape[0] - 1) / 2], axis=-1)
 
 
 def std_error(std: float, dof: float) -> float:
