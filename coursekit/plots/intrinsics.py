@@ -19,7 +19,6 @@ from coursekit.plots.style import (
     COLORS,
     LessonFigure,
     cross,
-    figure,
     image_axes,
     panels,
     plain_ticks,
@@ -210,10 +209,10 @@ def uncertainty(results: Mapping[str, IntrinsicsResult], range_m: float) -> Less
 
 def two_sessions(results: Mapping[str, IntrinsicsResult]) -> LessonFigure:
     """RMS of each view, and the outlines of the boards, of some sessions side by side."""
-    fig = figure(9.0, 5.6)
-    axes = fig.subplots(2, len(results), height_ratios=(1, 1.5), squeeze=False)
+    n = len(results)
+    fig, axes = panels(2 * n, n, 9.0, 2.8, height_ratios=(1, 1.5))
     top = 1.3 * max(float(r.per_view_rms_px.max()) for r in results.values())
-    for (bars, image), (name, result) in zip(axes.T, results.items(), strict=True):
+    for bars, image, (name, result) in zip(axes[:n], axes[n:], results.items(), strict=True):
         numbers = np.arange(1, len(result.detections) + 1)
         bars.bar(numbers, result.per_view_rms_px, color=COLORS["measured"])
         bars.axhline(result.rms_px, color=COLORS["model"])
