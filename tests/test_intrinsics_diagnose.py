@@ -11,6 +11,7 @@ import re
 from collections import Counter
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
@@ -22,6 +23,11 @@ from coursekit.causes import CauseSearch
 from coursekit.geometry import Intrinsics
 from coursekit.intrinsics import causes
 from coursekit.intrinsics.causes import Calibration, CornerTable, Linear
+from coursekit.intrinsics.derivatives import (
+    fisheye_with_derivatives,
+    parameter_vector,
+    with_parameters,
+)
 from coursekit.intrinsics.diagnosis import blur_lengths_px, depth_scale, diagnose, stored_power
 from coursekit.intrinsics.fit import calibrate
 from coursekit.simulation.corner_sessions import Effects, Truth, corner_session, ordinary
@@ -182,6 +188,32 @@ def test_the_derivatives_are_those_of_the_model() -> None:
             )
             by_cause = (back.linear.residuals - ahead.linear.residuals) / 2e-6
             assert np.abs(by_cause - columns[cause][..., k]).max() < tolerance  # of 1e3 px/m
+
+
+def test_the_fisheye_is_opencvs_with_its_derivatives() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(20, 3)) * [1.0, 1.0, 0.3] + [0.0, 0.0, 1.5]
+    lens = Intrinsics(640, 480, 300, 310, 320, 240, "brown_conrady", (0.03, -0.02, 0, 0, 0.004))
+    coeffs = np.array([0.03, -0.02, 0.004, 0.0])
+    pixels, by_parameter, by_point = fisheye_with_derivatives(points, lens)
+    theirs, _ = cv2.fisheye.projectPoints(points[None], np.zeros(3), np.zeros(3), lens.K, coeffs)
+    np.testing.assert_allclose(pixels, theirs[0], atol=1e-9)
+    for k, step in enumerate(1e-6 * np.eye(3)):
+        ahead, back = (fisheye_with_derivatives(points + d, lens)[0] for d in (step, -step))
+        np.testing.assert_allclose((ahead - back) / 2e-6, by_point[:, :, k], atol=1e-4)
+    for k, step in enumerate(1e-6 * np.eye(9)):
+        lenses = (with_parameters(lens, parameter_vector(lens) + d) for d in (step, -step))
+        ahead, back = (fisheye_with_derivatives(points, moved)[0] for moved in lenses)
+        np.testing.assert_allclose((ahead - back) / 2e-6, by_parameter[:, :, k], atol=1e-3)
+
+
+@pytest.mark.parametrize("seed", [FIRST_SEED, FIRST_SEED + 1])
+def test_a_lens_of_the_model_is_not_beaten_by_a_fisheye(seed: int) -> None:
+    """With a bow, a drifting focus or a shutter on top; lenses with tangential coefficients."""
+    for effects in (Effects(bow_m=1e-3), Effects(focus_drift=0.02), ordinary(seed)):
+        detections, _, board = session(seed, effects)
+        start = causes.refit(Calibration.of(calibrate(detections, board)))
+        assert causes.as_fisheye(start)[1] > 0.01
 
 
 def test_the_size_of_a_cause_is_the_restricted_maximum_likelihood() -> None:

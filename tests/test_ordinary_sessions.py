@@ -46,6 +46,15 @@ def test_a_lens_beyond_the_model_is_named_alone() -> None:
     assert found[("lens_model",)] >= 95
 
 
+@pytest.mark.parametrize("seed", [FIRST_SEED, FIRST_SEED + 8])
+def test_a_fisheye_and_a_quotient_are_wrong_lenses_and_nothing_else(seed: int) -> None:
+    """One fisheye, one rational lens; paper, print and noise as everywhere."""
+    detections, _, board = beyond_session(seed)
+    findings = intrinsics.diagnose(detections, board)
+    assert findings.names == ("lens_model",)
+    assert "CALIB_RATIONAL_MODEL" in findings[0].remedy
+
+
 @pytest.mark.parametrize("tails", [False, True])
 def test_arms_that_err_from_pose_to_pose_are_accused_of_nothing(tails: bool) -> None:
     """Of 200, at most 4 with a finding (nightly); of 6 none: a rate of 25 % passes with 18 %.

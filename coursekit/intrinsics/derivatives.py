@@ -18,6 +18,8 @@ from coursekit.arrays import Floats
 from coursekit.geometry import Intrinsics, distort, distortion_jacobian
 
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+RADIAL = [4, 5, 8]  # of them; a fisheye has these and no others
+FISHEYE_POWERS = np.array([1, 3, 5, 7])  # of the angle from the axis, of 1 and those
 
 
 # --- a camera as a vector ---
@@ -83,6 +85,34 @@ def project_with_derivatives(
     by_point[..., :2] = by_xy / z[:, None, None]
     by_point[..., 2] = -np.einsum("nij,nj->ni", by_point[..., :2], xy)
     return pixels, by_parameter, by_point
+
+
+def fisheye_with_derivatives(
+    points: Floats, intrinsics: Intrinsics
+) -> tuple[Floats, Floats, Floats]:
+    """As `project_with_derivatives`, through a fisheye: the image grows with the angle.
+
+    k1, k2 and k3 are those of the 3rd, 5th and 7th power of the angle from the axis; p1 and p2 do
+    nothing. Source: the model of OpenCV's `cv2.fisheye`, with one power less.
+    """
+    focal = np.array([intrinsics.fx, intrinsics.fy])
+    out = np.maximum(np.linalg.norm(points[:, :2], axis=1), 1e-12)
+    angle, along = np.arctan2(out, points[:, 2]), points[:, :2] / out[:, None]
+    powers = angle[:, None] ** FISHEYE_POWERS
+    series = np.concatenate([[1.0], parameter_vector(intrinsics)[RADIAL]])
+    radius, slope = powers @ series, powers / angle[:, None] * FISHEYE_POWERS @ series
+    distorted = along * radius[:, None]
+    by_parameter = np.zeros((len(points), 2, 9))
+    by_parameter[:, [0, 1], [0, 1]] = distorted
+    by_parameter[:, [0, 1], [2, 3]] = 1.0
+    by_parameter[:, :, RADIAL] = along[..., None] * powers[:, None, 1:] * focal[:, None]
+    squares = (points**2).sum(axis=1)
+    by_angle = np.column_stack([along * points[:, 2:], -out]) / squares[:, None]
+    by_point = along[..., None] * (slope[:, None] * by_angle)[:, None]
+    across = np.eye(2) - along[:, :, None] * along[:, None, :]
+    by_point[..., :2] += (radius / out)[:, None, None] * across
+    pixels = distorted * focal + [intrinsics.cx, intrinsics.cy]
+    return pixels, by_parameter, by_point * focal[:, None]
 
 
 def twist_columns(points: Floats, by_point: Floats) -> Floats:

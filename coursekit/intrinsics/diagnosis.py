@@ -51,6 +51,7 @@ BARE_MARGIN, BARE_SIDES, ONE_BARE_MARGIN = 0.125, 2, 0.25
 # Real and normal: a glass plate is flat to 0.1 mm, a fixed lens breathes 0.1 % with temperature,
 # and a board held "still" moves 5 mm/s for the 20 ms that an image takes.
 NORMAL_BOW_M, NORMAL_DRIFT, NORMAL_MOTION_M = 1e-4, 2e-3, 1e-4
+RIVAL_LEVEL = 1e-3  # of a fisheye with fewer coefficients, which lenses of this model never need
 NORMAL_LENS_PX = 0.05  # no measurement with the camera notices less
 NORMAL_SHIFT_PX = 1.0  # of the centre over a session
 UNEXPLAINED = 0.8  # of the corners' noise: what neighbours share in any JPEG stays below
@@ -258,6 +259,12 @@ def _wrong_lens(start: Calibration) -> Finding | None:
     if out > fold:
         beyond = {"out": math.degrees(math.atan(out)), "fold": math.degrees(math.atan(fold))}
         return _TEXTS.finding("lens_folds", rms=_flat(start.left_px), **beyond)
+    if start.estimated[4:].any(axis=1).all():  # else the model has more coefficients to give
+        rival, p_value = causes.as_fisheye(start)
+        gain = start.left_px**2 - rival.left_px**2
+        if p_value < RIVAL_LEVEL and gain > causes.LEAST_GAIN * start.noise_px**2:
+            figures = {"rival": _flat(rival.left_px), "noise": _flat(rival.noise_px)}
+            return _TEXTS.finding("lens_is_fisheye", p_value, rms=_flat(start.left_px), **figures)
     step = causes.search_lens(start)
     if step is None or _gain_px([step]) < NORMAL_LENS_PX:
         return None
