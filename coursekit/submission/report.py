@@ -387,9 +387,7 @@ def _ticks(low: float, high: float, about: int) -> list[float]:
 
 def _histogram(percents: Sequence[float]) -> dict[str, Any]:
     """How many students got which part of the points, in tens of percent."""
-    bins = [0] * 10
-    for percent in percents:
-        bins[min(max(int(percent // 10), 0), 9)] += 1
+    bins = np.histogram(np.clip(percents, 0, 100), 10, (0, 100))[0].tolist()
     words = ", ".join(f"{n} from {10 * i} to {10 * i + 10} %" for i, n in enumerate(bins) if n)
     return {
         "bins": bins,
