@@ -13,7 +13,7 @@ import io
 import math
 import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import cache
 from pathlib import Path
@@ -66,7 +66,7 @@ class ReportLine:
 
     file: the bundle's name. made, paragraph: as handed in. page: the link to its page. reason,
     says: of a bundle that was not graded. counts: False where the student has a newer one.
-    `to_dict`, `from_dict`: through JSON.
+    `as_json` and `from_dict` take it through JSON.
     """
 
     file: str
@@ -95,14 +95,9 @@ class ReportLine:
         """Whether something is to be looked at."""
         return any(not flag.note for flag in self.flags)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain text, numbers, lists and dictionaries."""
-        prints = None if self.fingerprint is None else self.fingerprint.to_dict()
-        return {**asdict(replace(self, fingerprint=None)), "fingerprint": prints}
-
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> ReportLine:
-        """The inverse of `to_dict`."""
+        """The line whose JSON `as_json` made."""
         prints = data["fingerprint"] and Fingerprint.from_dict(data["fingerprint"])
         items = tuple(Item(**item) for item in data["items"])
         flags = tuple(Flag(**flag) for flag in data["flags"])
