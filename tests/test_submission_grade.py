@@ -19,7 +19,7 @@ from sample_submissions import DISTANCES, honest, with_part, with_row
 from coursekit import cli
 from coursekit.stereo import window_stats
 from coursekit.submission import rubric
-from coursekit.submission.flags import Fingerprint, copies, fingerprint
+from coursekit.submission.flags import Fingerprint, as_json, copies, fingerprint
 from coursekit.submission.format import Claims, Conclusion, Plot, Stack, Submission
 from coursekit.submission.recompute import MISTAKES, RULES, WHY, grading_rules, recompute
 from coursekit.submission.report import student_page
@@ -375,7 +375,7 @@ def test_no_raw_depths_make_the_grader_fail(data, seed, scale, much):
     result = grade(with_part(odd, "camera", depth_scale_m=scale))
     assert 0 <= result.points <= result.of
     assert all(np.isfinite([one.points, one.of]).all() for one in result.items)
-    json.dumps(result.fingerprint.to_dict(), allow_nan=False)
+    json.dumps(json.loads(as_json(result.fingerprint)), allow_nan=False)
 
 
 # --- flags ----------------------------------------------------------------------------------------
@@ -467,7 +467,7 @@ def test_strangers_and_two_measurements_with_one_camera_at_one_place_are_not_cop
 
 
 def test_a_fingerprint_goes_through_json():
-    there = json.dumps(fingerprint(GOOD).to_dict())
+    there = as_json(fingerprint(GOOD))
     assert len(there) < 25_000
     back = Fingerprint.from_dict(json.loads(there))
     found = copies(others() | {"a": fingerprint(GOOD), "b": back})

@@ -16,7 +16,7 @@ import sample_submissions as samples
 from sample_submissions import MADE, PARAGRAPH, honest, with_part, with_row
 
 from coursekit.submission import report
-from coursekit.submission.flags import Flag, same_words
+from coursekit.submission.flags import Flag, as_json, same_words
 from coursekit.submission.format import Stack, Submission
 from coursekit.submission.recompute import LABELS, MISTAKES
 
@@ -406,7 +406,7 @@ def test_an_ordinary_name_stays_as_it_is():
 
 
 def test_a_line_goes_through_json(lines):
-    back = [report.ReportLine.from_dict(json.loads(json.dumps(line.to_dict()))) for line in lines]
+    back = [report.ReportLine.from_dict(json.loads(as_json(line))) for line in lines]
     assert report.class_page(back) == report.class_page(lines)
     assert report.grades_csv(back) == report.grades_csv(lines)
 

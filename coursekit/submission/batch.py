@@ -38,7 +38,8 @@ from tqdm.auto import tqdm
 
 from coursekit import results
 from coursekit.checks import positive, want
-from coursekit.submission.format import slug
+from coursekit.submission.flags import as_json
+from coursekit.submission.format import NO_TEXT, slug
 from coursekit.submission.recompute import grading_rules
 from coursekit.submission.report import (
     ReportLine,
@@ -295,7 +296,7 @@ def grader_version() -> str:
 def printable(text: str) -> str:
     """A file's name as text that can be written anywhere: no control characters, no surrogates."""
     clean = text.encode("utf-8", "replace").decode()
-    return "".join("?" if unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") else c for c in clean)
+    return "".join("?" if unicodedata.category(c) in NO_TEXT else c for c in clean)
 
 
 # ---- the pool -----------------------------------------------------------------------------------
@@ -534,8 +535,7 @@ def _store(out: Path, bundle: Bundle, outcome: Graded) -> None:
     line, page = outcome
     if page:
         results.write_bytes(out / bundle.page, page.encode())
-    content = json.dumps(line.to_dict()).encode()
-    results.write_bytes(out / ROWS / f"{bundle.key}.json", content)
+    results.write_bytes(out / ROWS / f"{bundle.key}.json", as_json(line).encode())
 
 
 def _finish(out: Path, bundles: list[Bundle]) -> list[ReportLine]:

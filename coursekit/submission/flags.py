@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import json
 import math
 import re
 import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import datetime
 from functools import lru_cache
 from typing import Any
@@ -235,7 +236,7 @@ class StackPrint:
 class Fingerprint:
     """What is remembered of a bundle's raw data to tell whether another one shares it: some 12 kB.
 
-    `to_dict` and `from_dict` take it through JSON.
+    `as_json` and `from_dict` take it through JSON.
     """
 
     student: str
@@ -243,29 +244,27 @@ class Fingerprint:
     camera: str
     stacks: tuple[StackPrint, ...]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain text and numbers only."""
-
-        def text(values: NDArray[np.int8]) -> str:
-            return base64.b64encode(values.tobytes()).decode("ascii")
-
-        stacks = [
-            vars(s) | {"pattern": text(s.pattern), "frames": text(s.frames)} for s in self.stacks
-        ]
-        return vars(self) | {"stacks": stacks}
-
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Fingerprint:
-        """The inverse of `to_dict`."""
+        """The fingerprint whose JSON `as_json` made."""
 
-        def array(text: str) -> NDArray[np.int8]:
-            return np.frombuffer(base64.b64decode(text), np.int8)
+        def rows(text: str) -> NDArray[np.int8]:
+            return np.frombuffer(base64.b64decode(text), np.int8).reshape(-1, TILES**2)
 
-        stacks = []
-        for s in data["stacks"]:
-            frames = array(s["frames"]).reshape(-1, TILES**2)
-            stacks.append(StackPrint(**s | {"pattern": array(s["pattern"]), "frames": frames}))
-        return cls(**{**data, "stacks": tuple(stacks)})
+        stacks = tuple(
+            StackPrint(s["distance_m"], s["digest"], rows(s["pattern"])[0], rows(s["frames"]))
+            for s in data["stacks"]
+        )
+        return cls(**{**data, "stacks": stacks})
+
+
+def as_json(record: Any) -> str:
+    """A fingerprint, or a record that has one, as JSON; an array becomes its bytes in base64."""
+
+    def text(values: NDArray[np.int8]) -> str:
+        return base64.b64encode(values.tobytes()).decode("ascii")
+
+    return json.dumps(asdict(record), default=text)
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ WORDS = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding=
 LABELS: dict[str, str] = WORDS["labels"]  # of what is asked for, by topic
 MISTAKES: dict[str, str] = WORDS["mistakes"]
 WHY: dict[str, str] = WORDS["why"]  # a number that a mistake explains is wrong, by its code
+SAYS: dict[str, str] = WORDS["says"]  # longer sentences of the rubric
 SEEN: dict[str, str] = WORDS["seen"]  # what a flag says, by its code
 EXERCISE = ("distances_m", "slack_m", "frames", "window_px", "words", "tape_at_most_m")
 TOLERANCES = ("standard_errors", "error_of_an_error", "prediction", "prediction_factor", "near")

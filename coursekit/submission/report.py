@@ -13,7 +13,7 @@ import io
 import math
 import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import cache
 from pathlib import Path
@@ -66,7 +66,7 @@ class ReportLine:
 
     file: the bundle's name. made, paragraph: as handed in. page: the link to its page. reason,
     says: of a bundle that was not graded. counts: False where the student has a newer one.
-    `to_dict`, `from_dict`: through JSON.
+    `as_json` and `from_dict` take it through JSON.
     """
 
     file: str
@@ -95,14 +95,9 @@ class ReportLine:
         """Whether something is to be looked at."""
         return any(not flag.note for flag in self.flags)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain text, numbers, lists and dictionaries."""
-        prints = None if self.fingerprint is None else self.fingerprint.to_dict()
-        return {**asdict(replace(self, fingerprint=None)), "fingerprint": prints}
-
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> ReportLine:
-        """The inverse of `to_dict`."""
+        """The line whose JSON `as_json` made."""
         prints = data["fingerprint"] and Fingerprint.from_dict(data["fingerprint"])
         items = tuple(Item(**item) for item in data["items"])
         flags = tuple(Flag(**flag) for flag in data["flags"])
@@ -387,9 +382,7 @@ def _ticks(low: float, high: float, about: int) -> list[float]:
 
 def _histogram(percents: Sequence[float]) -> dict[str, Any]:
     """How many students got which part of the points, in tens of percent."""
-    bins = [0] * 10
-    for percent in percents:
-        bins[min(max(int(percent // 10), 0), 9)] += 1
+    bins = np.histogram(np.clip(percents, 0, 100), 10, (0, 100))[0].tolist()
     words = ", ".join(f"{n} from {10 * i} to {10 * i + 10} %" for i, n in enumerate(bins) if n)
     return {
         "bins": bins,

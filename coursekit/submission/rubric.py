@@ -21,6 +21,7 @@ from coursekit.submission.flags import Fingerprint, Flag, data_flags, fingerprin
 from coursekit.submission.format import Plot, Submission, TableRow
 from coursekit.submission.recompute import (
     LABELS,
+    SAYS,
     WHY,
     AtDistance,
     Recomputed,
@@ -279,11 +280,8 @@ def _bias_se(asked: _Question, submission: Submission, m: AtDistance, claim: flo
     tolerance = _error_tolerance("bias_se", apart * apart / near if near else 0.0)
     item = _judge(asked, claim, near, tolerance, mistakes)
     if item.verdict == "right" and submission.camera.source == "live" and tape == 0:
-        says = (
-            f"{asked.name}: {_shown('bias_se', claim)} is the camera's part; but you say "
-            "that the tape has no error, and a tape is read to a millimetre or two."
-        )
-        return _kept(item, "no_tape", says)
+        says = SAYS["no_tape"].format(asked.name, _shown("bias_se", claim))
+        return asked.item("partial", says, "no_tape", tolerance=tolerance)
     return item
 
 
@@ -449,20 +447,12 @@ def _prediction(asked: _Question, plot: Plot, shows: str, found_mm: Sequence[flo
     if not (predicted > 0).all():
         return partial("proportional", "a predicted std must be greater than 0.")
     if len(z) > 1 and np.array_equal(predicted, plot.measured_mm):
-        says = (
-            "Plot: the prediction is the measurement to the last digit; predicted is what your "
-            "sigma_d, fx and baseline say without it."
-        )
-        return asked.item("partial", says, "copied_prediction")
+        return asked.item("partial", SAYS["copied_prediction"], "copied_prediction")
     rule, shape = grading_rules()["tolerance"], predicted / z**2
     off, slack, most = shape.max() / shape.min() - 1, rule["prediction"], rule["prediction_factor"]
     if off > slack:
         law = "Z" if np.ptp(np.log(predicted / z)) < math.log(1 + slack) else "something else"
-        says = (
-            f"the prediction goes as {law}: divided by Z² it differs by {off:.0%} between "
-            "distances, and sigma_Z = Z² sigma_d / (fx B) would not."
-        )
-        return partial("proportional", says)
+        return partial("proportional", SAYS["proportional"].format(law, off))
     ratio = float(np.exp(np.log(predicted / found).mean())) if (found > 0).all() else 1.0
     if 1 / most <= ratio <= most:
         times = f"{ratio:.2f} times what your raw depths say"
@@ -548,17 +538,11 @@ def _with_interval(
     assert free.exponent_interval is not None
     low, high = free.exponent_interval
     if interval is None:
-        says = (
-            f"Exponent: {claim:.2f} fits your raw depths, but without an interval it says more "
-            f"than three distances can: they give {low:.2f} to {high:.2f}; quote that, or none."
-        )
-        return _kept(item, "no_interval", says)
+        says = SAYS["no_interval"].format(claim, low, high)
+        return asked.item("partial", says, "no_interval", tolerance=item.tolerance)
     ends = _judge_interval(asked, interval, (low, high), free, 1)
     if ends.verdict == "right":
-        says = (
-            f"Exponent: you say {claim:.2f} ({interval[0]:.2f} to {interval[1]:.2f}), your raw "
-            f"depths say {free.exponent:.2f} ({low:.2f} to {high:.2f}): right."
-        )
+        says = SAYS["exponent"].format(claim, *interval, free.exponent, low, high)
         return replace(item, says=says)
     if ends.points < 0.5 * asked.of:  # the exponent itself is right
         points = round(0.5 * asked.of, 2)
@@ -577,10 +561,8 @@ def _judge_interval(
     tolerance = rule["standard_errors"] * rule["error_of_an_error"] * half + _half_digit(topic)
     unit = UNIT_OF[topic]
     one, two = (" to ".join(_digits(topic, end) for end in ends) for ends in (claim, found))
-    says = (
-        f"{asked.name}: you say {one}{unit}, your raw depths say {two}{unit} "
-        f"({_accepted(topic, tolerance)} for each end)"
-    )
+    accepted = f"{_accepted(topic, tolerance)} for each end"
+    says = SAYS["compared"].format(asked.name, one + unit, two + unit, accepted)
     off = _apart(claim, found)
     if off <= tolerance:
         return asked.item("right", f"{says}: right.", tolerance=tolerance)
@@ -635,10 +617,7 @@ def _conclusion(asked: _Question, submission: Submission, found: Recomputed) -> 
     z, frames = said.distance_m, said.frames
     bias, bias_se, noise, noise_se = _at_mounting(submission, known, z, frames)
     over = f"{frames} frames" if frames > 1 else "one frame"
-    says = (
-        f"Bias or noise: you say {said.dominates} dominates at {z:.2f} m; your raw depths say a "
-        f"bias of {bias:+.2f} ± {bias_se:.2f} mm and {noise:.2f} mm of noise in a pixel over {over}"
-    )
+    says = SAYS["dominates"].format(said.dominates, z, bias, bias_se, noise, over)
     low, high = known[0].distance_m, known[-1].distance_m
     if not low / 1.5 <= z <= 1.5 * high:
         says += f", but you measured from {low:.2f} to {high:.2f} m only: that is too far to tell."
@@ -699,10 +678,8 @@ def _judge(
     mistakes: Callable[[], Iterator[_Mistake]],
 ) -> Item:
     """A claimed number beside what the raw depths say; the first mistake to explain it counts."""
-    says = (
-        f"{asked.name}: you say {_shown(asked.topic, claim)}, your raw depths say "
-        f"{_shown(asked.topic, found)} ({_accepted(asked.topic, tolerance)})"
-    )
+    shown = [_shown(asked.topic, value) for value in (claim, found)]
+    says = SAYS["compared"].format(asked.name, *shown, _accepted(asked.topic, tolerance))
     answer = partial(asked.item, tolerance=tolerance)
     off = abs(claim - found)
     if off <= tolerance:
@@ -716,12 +693,6 @@ def _judge(
         return answer("partial", f"{says}: close, but not within that.", "close")
     size = "large" if claim > found else "small"
     return answer("wrong", f"{says}: wrong because it is too {size}.")
-
-
-def _kept(item: Item, mistake: str, says: str) -> Item:
-    """A right item with what a mistake leaves of its points."""
-    points = round(item.of * grading_rules()["credit"][mistake], 2)
-    return replace(item, points=points, verdict="partial", says=says, mistake=mistake)
 
 
 def _unknown(asked: _Question, claim: float) -> Item:
