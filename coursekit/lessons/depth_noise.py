@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from functools import cache
+from itertools import compress
 from typing import Any
 
 import numpy as np
 
-from coursekit import specifications
 from coursekit.arrays import Floats
 from coursekit.lessons.exercises import Exercise, Model, Step
+from coursekit.specifications import device
 
 Bounds = tuple[int, int, int, int]  # first row, the one after the last; the same for columns
 
@@ -57,12 +57,6 @@ DEPTH_NOISE = Exercise(
 )
 
 
-@cache
-def _notebooks_baseline() -> float:
-    """The simulated camera's, which the notebook calls B, m."""
-    return specifications.device("D435").unit.baseline_m
-
-
 def _difference(between: Callable[[Any], Any]) -> Step:
     """A difference of depths, which is the law's noise / between(noise / Z)."""
 
@@ -82,7 +76,8 @@ DEPTH_NOISE.add_mistakes(
     ("constant", "baseline_forgotten", lambda fx, baseline: fx),
     ("constant", "fx_forgotten", lambda fx, baseline: baseline),
     ("constant", "constant_forgotten", lambda fx, baseline: 1.0),
-    ("constant", "other_baseline", lambda fx, baseline: fx * _notebooks_baseline()),
+    # The notebook calls the simulated camera's baseline B.
+    ("constant", "other_baseline", lambda fx, baseline: fx * device("D435").unit.baseline_m),
     ("constant", "other_baseline", lambda fx, baseline: fx * 0.050),
     ("divide", "multiplied", lambda power, constant: power * constant),
     ("constant", "baseline_behind_the_fraction", lambda fx, baseline: fx / baseline),
@@ -169,25 +164,17 @@ def _describe_robust_depth(args: tuple[Any, ...]) -> str:
     if len(args) > 4:
         text += f", min_valid = {args[4]}"
     top, bottom, left, right = _window(round(v), round(u), half)
-    cut_at = {
-        "top": top < 0,
-        "bottom": bottom > image.shape[0],
-        "left": left < 0,
-        "right": right > image.shape[1],
-    }
     pixels = _cut(_inside)(image, top, bottom, left, right)
     if pixels.size == 0:
         return f"{text}, all of it off the image"
-    if any(cut_at.values()):
-        borders = " and ".join(name for name, cut in cut_at.items() if cut)
+    beyond = (top < 0, bottom > image.shape[0], left < 0, right > image.shape[1])
+    if any(beyond):
+        borders = " and ".join(compress(("top", "bottom", "left", "right"), beyond))
         text += f", cut off at the {borders} border"
-    kinds = {
-        "valid": int((np.isfinite(pixels) & (pixels != 0)).sum()),
-        "zero": int((pixels == 0).sum()),
-        "NaN": int(np.isnan(pixels).sum()),
-        "infinite": int(np.isinf(pixels).sum()),
-    }
-    inside = ", ".join(f"{n} {kind}" for kind, n in kinds.items() if n)
+    valid = np.isfinite(pixels) & (pixels != 0)
+    kinds = (valid, pixels == 0, np.isnan(pixels), np.isinf(pixels))
+    named = zip(kinds, ("valid", "zero", "NaN", "infinite"), strict=True)
+    inside = ", ".join(f"{kind.sum()} {name}" for kind, name in named if kind.any())
     return f"{text} ({inside})"
 
 

@@ -14,7 +14,6 @@ lesson's module, and in its TOML file, under [mistakes], what the student will r
 from __future__ import annotations
 
 import itertools
-import linecache
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Mapping
@@ -39,10 +38,10 @@ class Mistake:
     """
 
     name: str
-    step: str
     says: str
     ask: str
-    wrong: Step
+    step: str = ""
+    wrong: Step = field(default=lambda: None)
     alone: bool = False
 
 
@@ -105,7 +104,7 @@ class Exercise:
         texts = questions.lesson_texts(self.name.partition(".")[0])["mistakes"]
         for step, name, instead in wrong:
             says, ask = (" ".join(text.split()) for text in texts[name])
-            self.mistakes.append(Mistake(name, step, says, ask, instead, alone))
+            self.mistakes.append(Mistake(name, says, ask, step, instead, alone))
 
     def model(self, *mistakes: Mistake) -> Model:
         """The right function with these mistakes built in."""
@@ -120,7 +119,7 @@ class Exercise:
         if not callable(function):
             return self._say("not attempted", f"got a {type(function).__name__}, not a function.")
         runs = [_run(function, args) for args in self.cases]
-        if self.core and self._leaves_the_rest(function, runs):
+        if self.core and self._leaves_the_rest(self.core, function, runs):
             cases = [args for args in self.cases if self.is_core(args)]
             return replace(self, cases=cases, core=None, part_of=self).judge(function)
         unfinished = self._unfinished(runs)
@@ -132,9 +131,8 @@ class Exercise:
     def is_core(self, args: tuple[Any, ...]) -> bool:
         return self.core is None or len(self.core.of(args)) == len(args)
 
-    def _leaves_the_rest(self, function: Callable[..., Any], runs: list[Run]) -> bool:
+    def _leaves_the_rest(self, core: Core, function: Callable[..., Any], runs: list[Run]) -> bool:
         """Whether every case beyond the core gets nothing, or what it gets without the rest."""
-        assert self.core is not None
         for run, args in zip(runs, self.cases, strict=True):
             if self.is_core(args) or isinstance(run.error, NotImplementedError):
                 continue
@@ -142,10 +140,8 @@ class Exercise:
                 return False
             if run.value is not None:
                 value = _as_numbers(run.value)
-                without = _as_numbers(_run(function, self.core.of(args)).value)
-                if value is None or without is None:
-                    return False
-                if not np.array_equal(value, without, equal_nan=True):
+                bare = _as_numbers(_run(function, core.of(args)).value)
+                if value is None or bare is None or not np.array_equal(value, bare, equal_nan=True):
                     return False
         return True
 
@@ -179,10 +175,7 @@ class Exercise:
                 got, wanted = _shape(value), _shape(want)
                 text = f"wrong shape: it returns {got}, and {wanted} is wanted."
                 return self._say("wrong", text, self._given(args))
-        agree = [self._agrees(v, e) for v, e in zip(values, expected, strict=True)]
-        if all(agree):
-            return self._formal(formal) if formal else self._right()
-        return self._wrong(values, expected, agree, formal)
+        return self._judged(values, expected, formal)
 
     def _right(self) -> Verdict:
         count = len(self.cases)
@@ -193,37 +186,27 @@ class Exercise:
         text = f"right. All {count} cases agree to {self.tolerance:g} {self.unit}."
         return self._say("right", text)
 
-    def _formal(self, formal: list[Mistake]) -> Verdict:
-        if len(formal) > 1:
-            return self._several(formal[0], ())
-        return self._say(
-            "wrong",
-            f"{formal[0].says}. The numbers are right.{self._later}",
-            formal[0].ask,
-            named=formal[0].name,
-        )
-
-    def _wrong(
-        self,
-        values: list[Floats],
-        expected: list[Floats],
-        agree: list[bool],
-        formal: list[Mistake],
+    def _judged(
+        self, values: list[Floats], expected: list[Floats], formal: list[Mistake]
     ) -> Verdict:
+        """The verdict on results of the right shape; formal: what else is wrong with them."""
+        agree = [self._agrees(v, e) for v, e in zip(values, expected, strict=True)]
+        if all(agree) and formal:
+            right = f"The numbers are right.{self._later}"
+            return self._one(formal[0], right) if len(formal) == 1 else self._several(formal[0])
+        if all(agree):
+            return self._right()
         count = f"{sum(agree)} of {self._all_cases} agree.{self._later}"
         first = agree.index(False)
         evidence = self._evidence(first, values[first], expected[first])
         if formal:
-            return self._several(formal[0], (count, evidence))
+            return self._several(formal[0], count, evidence)
         for mistakes in self._combinations():
             if self._explains(mistakes, values):
                 if len(mistakes) > 1:
                     seen = self._seen_in(first, mistakes, expected[first])
-                    return self._several(seen, (count, evidence))
-                (mistake,) = mistakes
-                return self._say(
-                    "wrong", f"{mistake.says}. {count}", evidence, mistake.ask, named=mistake.name
-                )
+                    return self._several(seen, count, evidence)
+                return self._one(mistakes[0], count, evidence)
         return self._say(
             "wrong",
             f"not right yet. {count}",
@@ -254,14 +237,13 @@ class Exercise:
             return f" ({self.part_of.core.rest} can wait.)"
         return ""
 
-    def _several(self, first: Mistake, lines: tuple[str, ...]) -> Verdict:
-        return self._say(
-            "wrong",
-            f"more than one mistake. Look first at this: {first.says}.",
-            *lines,
-            first.ask,
-            named=f"several, first {first.name}",
-        )
+    def _one(self, mistake: Mistake, count: str, *lines: str) -> Verdict:
+        text = f"{mistake.says}. {count}"
+        return self._say("wrong", text, *lines, mistake.ask, named=mistake.name)
+
+    def _several(self, first: Mistake, *lines: str) -> Verdict:
+        text = f"more than one mistake. Look first at this: {first.says}."
+        return self._say("wrong", text, *lines, first.ask, named=f"several, first {first.name}")
 
     def _combinations(self) -> Iterator[tuple[Mistake, ...]]:
         """Each mistake alone, then each pair of different steps, earlier step first."""
@@ -318,9 +300,8 @@ class Exercise:
             row = int(np.nan_to_num(off, nan=np.inf).argmax())
             args = tuple(a[row : row + 1] for a in args[: self.per_row]) + args[self.per_row :]
             value, want = value[row], want[row]
-        return (
-            f"{self._given(args)} expected {self.show(want)}, yours {self.show(value)} {self.unit}."
-        )
+        both = f"expected {self.show(want)}, yours {self.show(value)} {self.unit}."
+        return f"{self._given(args)} {both}"
 
     def _given(self, args: tuple[Any, ...]) -> str:
         return f"The case: {self.describe(args)}."
@@ -331,17 +312,13 @@ class Exercise:
 
 IN_PLACE = Mistake(
     "in_place",
-    "",
     "your function changes the array it is given",
     "Whoever calls it loses the original. Which line writes into an argument?",
-    lambda: None,
 )
 TRANSPOSED = Mistake(
     "transposed",
-    "",
     "your result is transposed: one column a point, and one row a point is wanted",
     "Print the shape of what you return. Which axis counts the points?",
-    lambda: None,
 )
 
 
@@ -373,16 +350,9 @@ def _run(function: Callable[..., Any], args: tuple[Any, ...]) -> Run:
 def _what_was_raised(error: BaseException, function: Callable[..., Any]) -> str:
     """The exception in words, with the learner's own line that it came from."""
     said = f"`{type(error).__name__}: {error}`"
-    code = getattr(function, "__code__", None)
-    own = [
-        f
-        for f in traceback.extract_tb(error.__traceback__)
-        if code is not None and f.filename == code.co_filename
-    ]
-    if not own:
-        return said
-    source = linecache.getline(own[-1].filename, own[-1].lineno or 0).strip()
-    return f"{said} at `{source}`" if source else said
+    file = getattr(getattr(function, "__code__", None), "co_filename", None)
+    lines = [f.line for f in traceback.extract_tb(error.__traceback__) if f.filename == file]
+    return f"{said} at `{lines[-1]}`" if lines and lines[-1] else said
 
 
 def _shape(array: Floats) -> str:

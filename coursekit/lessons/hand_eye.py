@@ -48,6 +48,18 @@ def _session_pair(seed: int, plain: bool = False) -> tuple[Floats, ...]:
     return i, j, *seen
 
 
+def _describe_pair(args: tuple[Floats, ...]) -> str:
+    places = [T[:3, 3].round(3).tolist() for T in args]
+    text = "the gripper at {} and {} m in the base, the board at {} and {} m before the camera"
+    turned = args[1][0, 0] == args[1][1, 1] and abs(args[1][0, 0]) < 1e-9
+    end = ", the second arm pose turned by 90 degrees about z" if turned else ""
+    return text.format(*places) + end
+
+
+def _vector(T: Floats) -> str:
+    return "(" + ", ".join(f"{v:.3f}" for v in T[:3, 3]) + ")"
+
+
 MOTION_PAIR = Exercise(
     name="hand_eye.motion_pair",
     build=_build_pair,
@@ -63,19 +75,8 @@ MOTION_PAIR = Exercise(
     per_row=0,
     unit="m",
     tolerance=1e-9,
-    describe=lambda args: (
-        "the gripper at "
-        + " and ".join(str(T[:3, 3].round(3).tolist()) for T in args[:2])
-        + " m in the base, the board at "
-        + " and ".join(str(T[:3, 3].round(3).tolist()) for T in args[2:])
-        + " m before the camera"
-        + ", the second arm pose turned by 90 degrees about z"
-        * bool(args[1][0, 0] == args[1][1, 1] and abs(args[1][0, 0]) < 1e-9)
-    ),
-    show=lambda row: (
-        "translations of A and B "
-        + " and ".join("(" + ", ".join(f"{v:.3f}" for v in T[:3, 3]) + ")" for T in row)
-    ),
+    describe=_describe_pair,
+    show=lambda row: f"translations of A and B {_vector(row[0])} and {_vector(row[1])}",
 )
 
 

@@ -19,18 +19,10 @@ LESSONS = ("pinhole", "depth_noise", "intrinsics", "hand_eye", "error_budget")  
 _LOADED = {lesson: load_questions(lesson) for lesson in LESSONS}
 CHECKPOINTS: dict[str, Checkpoint] = {c.name: c for asked, _ in _LOADED.values() for c in asked}
 EXERCISES: dict[str, Exercise] = {
-    exercise.name: exercise
-    for exercise in (
-        pinhole.PROJECT,
-        pinhole.DEPROJECT,
-        depth_noise.DEPTH_NOISE,
-        depth_noise.ROBUST_DEPTH,
-        intrinsics.REPROJECTION_RMS,
-        intrinsics.FOCAL_SIGMA,
-        hand_eye.MOTION_PAIR,
-        hand_eye.ROTATION_HALF,
-        error_budget.SENSITIVITIES,
-    )
+    found.name: found
+    for lesson in (pinhole, depth_noise, intrinsics, hand_eye, error_budget)
+    for found in vars(lesson).values()
+    if isinstance(found, Exercise)
 }
 DONE = {"right", "core right"}
 STANDING_WORDS = {"wrong": "not right yet", "raised": "raised an error"}
@@ -141,9 +133,8 @@ class Overview:
         begun = [s for s in self.standings if s.result or s.first_try or s.later or s.exercises[0]]
         for standing in self.standings:
             if not standing.result.startswith("from"):
-                what = (
-                    "Begin with" if not begun else "Next: finish" if standing in begun else "Next:"
-                )
+                again = "Next: finish" if standing in begun else "Next:"
+                what = again if begun else "Begin with"
                 return f"{what} notebook {standing.notebook}; its last section keeps your results."
         for standing in self.standings:
             if standing.open:
@@ -179,9 +170,7 @@ def progress() -> Overview:
     >>> [standing.notebook for standing in progress().standings][:2]
     ['01_pinhole', '02_depth_noise']
     """
-    kinds = {
-        name: [a["kind"] for a in attempts] for name, attempts in record.read_attempts().items()
-    }
+    kinds = {name: [a["kind"] for a in tries] for name, tries in record.read_attempts().items()}
 
     def standing(notebook: str, prefix: str) -> Standing:
         questions = [name for name in CHECKPOINTS if name.startswith(prefix)]

@@ -254,11 +254,9 @@ def _build_deproject(steps: Mapping[str, Step]) -> Model:
 
 def _describe_deproject(args: tuple[Any, ...]) -> str:
     pixels, depth, *camera = args
-    what = ", ".join(
-        f"{_tuple(p, '.1f')} px at {z:.2f} m" for p, z in zip(pixels, depth, strict=True)
-    )
+    what = [f"{_tuple(p, '.1f')} px at {z:.2f} m" for p, z in zip(pixels, depth, strict=True)]
     named = "pixel" if len(pixels) == 1 else "pixels"
-    return f"{_describe_camera(*camera)}, {named} {what}"
+    return f"{_describe_camera(*camera)}, {named} {', '.join(what)}"
 
 
 _PIXEL = np.array([[600.0, 140.0]])
@@ -315,6 +313,10 @@ def _transposed(divided: bool) -> Step:
     return rays
 
 
+def _along_ray(x: Floats, y: Floats, w: Any, depth: Floats) -> Any:
+    return _scale(x, y, w, depth / np.hypot(w, np.hypot(x, y)))
+
+
 DEPROJECT.add_mistakes(
     ("rays", "inverse_missing", lambda u, v, *lens: (*_to_pixels(u, v, 1.0, *lens), 1.0)),
     ("rays", "inverse_transposed", _transposed(divided=False)),
@@ -330,11 +332,7 @@ DEPROJECT.add_mistakes(
     ("rays", "y_up", _rays_by(lambda fx, fy, cx, cy: (fx, -fy, cx, cy))),
     ("rays", "half_pixel", lambda u, v, *lens: _to_normalised(u + 0.5, v + 0.5, *lens)),
     ("rays", "half_pixel", lambda u, v, *lens: _to_normalised(u - 0.5, v - 0.5, *lens)),
-    (
-        "scale",
-        "depth_along_ray",
-        lambda x, y, w, Z: _scale(x, y, w, Z / np.hypot(w, np.hypot(x, y))),
-    ),
+    ("scale", "depth_along_ray", _along_ray),
     ("scale", "millimetres", lambda x, y, w, depth: _scale(x, y, w, 1000 * depth)),
     ("scale", "millimetres", lambda x, y, w, depth: _scale(x, y, w, depth / 1000)),
     ("scale", "not_scaled", lambda x, y, w, depth: (x, y, w * depth)),
@@ -362,8 +360,7 @@ def _divide(rounds: int) -> Step:
         for _ in range(rounds):
             r2 = x * x + y * y
             radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-            dx = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-            dy = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+            dx, dy = _bent(one=0)(x, y, 0.0, 0.0, p1, p2, 0.0)
             x, y = (xd - dx) / radial, (yd - dy) / radial
         return x, y
 

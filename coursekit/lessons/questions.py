@@ -80,15 +80,13 @@ class Checkpoint:
 
     def _repr_mimebundle_(self, **kwargs: Any) -> dict[str, Any]:
         widget: dict[str, Any] = panel(self)._repr_mimebundle_(**kwargs)
-        return widget | {"text/plain": repr(self), "text/html": self._without_kernel()}
-
-    def _without_kernel(self) -> str:
         call = f'ck.checkpoint("{self.name}").answer({self.example})'
-        return (
+        without_kernel = (
             f"<em>Run this cell to answer here, or call <code>{call}</code>.</em>"
             "<details><summary>Reading without a kernel? Decide first, then open the answer."
             f"</summary>{self.explanation()._repr_html_()}</details>"
         )
+        return widget | {"text/plain": repr(self), "text/html": without_kernel}
 
 
 @dataclass(frozen=True, repr=False)
@@ -224,7 +222,10 @@ def panel(checkpoint: Checkpoint) -> Any:
 
     field = checkpoint.input_widget()
     button = ipywidgets.Button(description="Commit", tooltip="Commit this answer")
-    said = ipywidgets.HTML(_earlier(checkpoint.name))
+    # What the student did here before, in the widget only: stored outputs never show it.
+    before = "<em>You have answered this one before ({}).</em>"
+    kinds = [html.escape(a["kind"]) for a in read_attempts().get(checkpoint.name, [])]
+    said = ipywidgets.HTML(before.format(kinds[-1]) if kinds else "")
 
     def commit(_: Any) -> None:
         if field.value in (None, ""):
@@ -234,15 +235,6 @@ def panel(checkpoint: Checkpoint) -> Any:
 
     button.on_click(commit)
     return ipywidgets.VBox([field, button, said])
-
-
-def _earlier(name: str) -> str:
-    """What the student did here before, for the widget only: stored outputs never show it."""
-    attempts = read_attempts().get(name, [])
-    if not attempts:
-        return ""
-    last = attempts[-1]
-    return f"<em>You have answered this one before ({html.escape(last['kind'])}).</em>"
 
 
 @cache

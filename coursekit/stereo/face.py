@@ -321,13 +321,11 @@ def _edges(patch: _Patch) -> Floats:
 
 def _reach(on_face: Bools) -> Floats:
     """The last True of each row (..., n) before a gap of more than GAP_PX; NaN for none."""
-    last = np.full(on_face.shape[:-1], np.nan)
-    gap = np.zeros(on_face.shape[:-1], np.int64)
-    for column in range(on_face.shape[-1]):
-        hit = on_face[..., column] & (gap <= GAP_PX)
-        gap = np.where(hit, 0, gap + 1)
-        last[hit] = column
-    return last
+    column = np.arange(on_face.shape[-1])
+    seen = np.maximum.accumulate(np.where(on_face, column, -1), axis=-1)
+    ends = np.argmax(column - seen > GAP_PX, axis=-1)[..., None]  # 0 where there is no such gap
+    last = np.take_along_axis(seen, ends - 1, axis=-1)[..., 0]
+    return np.where(last < 0, np.nan, last)
 
 
 def _edge_lines(edges: Floats) -> tuple[Floats, float]:
@@ -382,8 +380,7 @@ def _flying(patch: _Patch, edges: Floats) -> float:
         band = slice(max(at - EDGE_BAND_PX, 0), at + EDGE_BAND_PX)
         start, stop = sorted((at + outwards * EDGE_BAND_PX, at + outwards * 2 * EDGE_BAND_PX))
         behind = z[..., max(start, 0) : max(stop, 0)]
-        rows = np.moveaxis(behind, 1, 2).reshape(-1, behind.shape[1])
-        far = np.nan_to_num(windows.valid_median(rows), nan=np.inf)[:, None]
+        far = np.ma.median(np.ma.masked_invalid(behind), axis=(0, 2)).filled(np.inf)[:, None]
         part, face = z[..., band], plane[:, band]
         slack = patch.tolerance * np.maximum((far / face) ** 2, 1.0)
         with np.errstate(invalid="ignore"):

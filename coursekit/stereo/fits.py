@@ -368,12 +368,10 @@ class BiasFit(LawFit):
     def bias_m(self, distances_m: ArrayLike) -> tuple[Floats, Floats, Floats]:
         """Z_m - Z and its 95 % band at true distances (...): (bias, low, high), each (...), m."""
         z = array("distances_m", distances_m, leading=True)
-        product, offset = fx_baseline(self.fx, self.baseline_m), 0.0
-        slopes = [z]
-        if "disparity_offset_px" in self.names:
-            offset, slopes = self.value("disparity_offset_px"), [z, z**2 / product]
+        product, free = fx_baseline(self.fx, self.baseline_m), "disparity_offset_px" in self.names
+        offset = self.value("disparity_offset_px") if free else 0.0
         bias = z / (1 + self.value("baseline_error") + offset * z / product) - z
-        half = self._half_band(slopes)
+        half = self._half_band([z, z**2 / product] if free else [z])
         return bias, bias - half, bias + half
 
     def __repr__(self) -> str:

@@ -297,13 +297,11 @@ def _two_surfaces(mean: Floats, least: float) -> float:
     if len(values) < 20:
         return 0.0
     counts = np.arange(1, len(values))
-    total, squares = np.cumsum(values - values[0]), np.cumsum(np.square(values - values[0]))
-    low = total[:-1] / counts
-    high = (total[-1] - total[:-1]) / counts[::-1]
-    within = squares[-1] - counts * low**2 - counts[::-1] * high**2
-    at = few - 1 + int(np.argmin(within[few - 1 : len(within) - few + 1]))
-    gap = float(high[at] - low[at])
-    spread = math.sqrt(max(float(within[at]), 0.0) / len(values))
+    total = np.cumsum(values - values[0])
+    apart = (total[-1] - total[:-1]) / counts[::-1] - total[:-1] / counts
+    between = counts * counts[::-1] * np.square(apart / len(values))
+    at = few - 1 + int(np.argmax(between[few - 1 : len(between) - few + 1]))
+    gap, spread = float(apart[at]), math.sqrt(max(float(values.var() - between[at]), 0.0))
     return gap if gap > max(least, 0.01 * values[0], TWO_CLUSTERS * spread) else 0.0
 
 
