@@ -163,38 +163,28 @@ def grade_folder(
         positive(name, value)
     _check_out(out, overwrite)
     paths, left_out = find_bundles(folder, out)
+    bundles = list(_bundles(folder, paths))
+    unfinished = [bundle for bundle in bundles if not _is_done(out, bundle)]
+    kept = finished = len(bundles) - len(unfinished)
     for part in (out / STUDENTS, out / ROWS):
         part.mkdir(parents=True, exist_ok=True)
-    bundles = list(_bundles(folder, paths))
-    kept = finished = 0
-    with tqdm(total=len(bundles), unit="bundle", disable=not progress, smoothing=0.1) as bar:
-
-        def unfinished() -> Iterator[Bundle]:
-            nonlocal kept
-            for bundle in bundles:
-                if _is_done(out, bundle):
-                    kept += 1
-                    bar.update()
-                else:
-                    yield bundle
-
-        limits = Limits(workers, timeout_s, memory_bytes)
-        try:
-            with (
-                _noted_interrupts() as interrupted,
-                contextlib.closing(work_through(unfinished(), grade_file, limits)) as outcomes,
-            ):
-                for bundle, outcome in outcomes:
-                    _store(out, bundle, outcome)  # and not here: a class of any size fits
-                    finished += 1
-                    bar.update()
-                    if interrupted:
-                        raise KeyboardInterrupt
-        except KeyboardInterrupt:
-            raise Stopped(
-                f"stopped after {kept + finished} of {counted(len(bundles), 'bundle')}, which are "
-                "kept. The same command goes on from there."
-            ) from None
+    limits = Limits(workers, timeout_s, memory_bytes)
+    try:
+        with (
+            tqdm(total=len(bundles), initial=kept, unit="bundle", disable=not progress) as bar,
+            _noted_interrupts() as interrupted,
+            contextlib.closing(work_through(unfinished, grade_file, limits)) as outcomes,
+        ):
+            for bundle, outcome in outcomes:
+                _store(out, bundle, outcome)  # and not here: a class of any size fits
+                finished += 1
+                bar.update()
+                if interrupted:
+                    raise KeyboardInterrupt
+    except KeyboardInterrupt:
+        many = counted(len(bundles), "bundle")
+        says = f"stopped after {finished} of {many}, which are kept. The same command goes on"
+        raise Stopped(f"{says} from there.") from None
     done = _finish(out, bundles)
     counts = Counter(_kind(line) for line in done)
     return Summary(
@@ -395,7 +385,7 @@ def _ending(code: int) -> str:
 @contextlib.contextmanager
 def _pool(limits: Limits) -> Iterator[ProcessPool]:
     """A started pool; its processes have one thread for linear algebra and never see a Ctrl-C."""
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    before = {name: os.environ[name] for name in ONE_THREAD if name in os.environ}
     os.environ.update(ONE_THREAD)
     pool = ProcessPool(
         max_workers=limits.workers,
@@ -415,11 +405,9 @@ def _pool(limits: Limits) -> Iterator[ProcessPool]:
     finally:
         pool.stop()
         pool.join()
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+        for name in ONE_THREAD:
+            os.environ.pop(name, None)
+        os.environ.update(before)
 
 
 @contextlib.contextmanager
