@@ -84,7 +84,7 @@ SMOOTH_DEGREE = 3  # of the field over the board that is no corner's noise
 FAIR = 3  # of the strongest causes are tested with each view's own noise
 NOTHING_LEFT = 1e-3  # of the p-value: so seldom is a cause missed that is all there is
 MOST, MOST_OF_SHAPE = 0.75, 0.5  # paper is never without a shape, whatever comes on top
-LEAST_GAIN = 0.02  # of the noise's variance: what takes less is no cause
+LEAST_GAIN = 0.02  # of the variance of the noise: a lens that gains less is as good
 STIFF = 0.1  # nor is it stiff: that much of what its shape does changes from view to view
 # At most 2 % of healthy sessions may get a finding. Six kinds of test at this level make 0.2 %; the
 # rest is for noise that is not quite Gaussian and for the checks that are no F-tests.
@@ -94,7 +94,7 @@ PRIOR_PX = 0.1  # corner noise until residuals were looked at
 LEAST_SHAPE_M = 1e-6
 DENT_SIGMAS, DENT_M = 3.5, 2e-4  # of a corner that stands out from its board
 LEAST_PX = 1e-6  # of noise, where exact corners have none
-REFIT_STEPS, FISHEYE_STEPS = 40, 150
+REFIT_STEPS, FISHEYE_STEPS = 40, 300
 SMALL_DECREASE = 1e-7  # of the squares: a step that saves less is the last
 LEAST_DAMPING, MOST_DAMPING = 1e-12, 1.0  # of the columns' own squares
 SPOILED_RATIO = 3.0  # a view's rms over the others' median; blurred or far views reach 2
@@ -514,7 +514,7 @@ def named(found: CauseSearch[Calibration]) -> list[Accepted[Calibration]]:
     good = list(shape) if closed or taken(shape) >= MOST_OF_SHAPE * held else []
     # Paper that bends from view to view is taken in, lest others pass for it, and is not named:
     # what neighbouring corners of any image have in common looks like it.
-    crumbs = max(STIFF**2 * taken(good), LEAST_GAIN * noise)
+    crumbs = STIFF**2 * taken(good)
     large = [s for s in others if taken([s]) > crumbs and s.test.cause != FLEX]
     for step in large:
         if step.test.cause in OWN:

@@ -51,7 +51,7 @@ BARE_MARGIN, BARE_SIDES, ONE_BARE_MARGIN = 0.125, 2, 0.25
 # Real and normal: a glass plate is flat to 0.1 mm, a fixed lens breathes 0.1 % with temperature,
 # and a board held "still" moves 5 mm/s for the 20 ms that an image takes.
 NORMAL_BOW_M, NORMAL_DRIFT, NORMAL_MOTION_M = 1e-4, 2e-3, 1e-4
-RIVAL_LEVEL = 1e-3  # of a fisheye with fewer coefficients, which lenses of this model never need
+RIVAL_LEVEL = 0.01  # of a fisheye with fewer coefficients: to lenses of this model it loses
 NORMAL_LENS_PX = 0.05  # no measurement with the camera notices less
 NORMAL_SHIFT_PX = 1.0  # of the centre over a session
 UNEXPLAINED = 0.8  # of the corners' noise: what neighbours share in any JPEG stays below
