@@ -66,34 +66,6 @@ if TYPE_CHECKING:
     from coursekit.results import export
     from coursekit.submission.submit import submit
 
-__all__ = [
-    "arm",
-    "attribution",
-    "boards",
-    "budget",
-    "cameras",
-    "capture",
-    "check",
-    "checkpoint",
-    "drag",
-    "evidence",
-    "export",
-    "geometry",
-    "hand_eye",
-    "intrinsics",
-    "lessons",
-    "open_camera",
-    "place",
-    "plots",
-    "progress",
-    "results",
-    "simulation",
-    "specifications",
-    "stereo",
-    "submission",
-    "submit",
-]
-
 _FUNCTIONS = {
     "capture": "coursekit.cameras.capture",
     "open_camera": "coursekit.cameras",
@@ -106,15 +78,16 @@ _FUNCTIONS = {
     "export": "coursekit.results",
     "submit": "coursekit.submission.submit",
 }
+_ROOMS = ["arm", "attribution", "boards", "budget", "cameras", "geometry", "hand_eye", "intrinsics", "lessons", "plots", "results", "simulation", "specifications", "stereo", "submission"]
 
 
 def __getattr__(name: str) -> Any:
     if name in _FUNCTIONS:
         return getattr(importlib.import_module(_FUNCTIONS[name]), name)
-    if name in __all__:
+    if name in _ROOMS:
         return importlib.import_module(f"coursekit.{name}")
     raise AttributeError(f"module 'coursekit' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return __all__
+    return [*_ROOMS, *_FUNCTIONS]

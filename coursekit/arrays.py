@@ -14,16 +14,3 @@ Image = NDArray[np.uint8]  # grey (H, W) or BGR (H, W, 3)
 AnyArray = NDArray[Any]
 Interval = tuple[float, float]  # low and high end, mostly of 95 %
 Window = tuple[int, int, int, int]  # left, top, width, height, px
-__all__ = [
-    "AnyArray",
-    "ArrayLike",
-    "Bools",
-    "Floats",
-    "Grey",
-    "Image",
-    "Integers",
-    "Interval",
-    "Mask",
-    "NDArray",
-    "Window",
-]

@@ -12,7 +12,7 @@ from typing import Self, TypeVar, overload
 from coursekit.arrays import Interval
 from coursekit.checks import is_number, want
 
-T = TypeVar("T")
+Item = TypeVar("Item")
 WIDTH = 88  # characters: fits a notebook's output cell; JupyterLab breaks longer lines in mid-word
 
 
@@ -93,17 +93,17 @@ class Finding:
         return "\n".join([self.title, *(wrapped(line, WIDTH - 3, "  ") for line in lines)])
 
 
-class Listed(Sequence[T]):
+class Listed(Sequence[Item]):
     """Things in their order, like an immutable list; a slice keeps what is said of them."""
 
-    def __init__(self, things: Iterable[T] = ()) -> None:
+    def __init__(self, things: Iterable[Item] = ()) -> None:
         self._things = tuple(things)
 
     @overload
-    def __getitem__(self, index: int) -> T: ...
+    def __getitem__(self, index: int) -> Item: ...
     @overload
     def __getitem__(self, index: slice) -> Self: ...
-    def __getitem__(self, index: int | slice) -> T | Self:
+    def __getitem__(self, index: int | slice) -> Item | Self:
         if not isinstance(index, slice):
             return self._things[index]
         part = copy.copy(self)

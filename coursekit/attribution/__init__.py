@@ -11,14 +11,3 @@ from coursekit.attribution.verdict import (
     four_sets,
     simulate_misses,
 )
-
-__all__ = [
-    "Attribution",
-    "Blame",
-    "Entry",
-    "Ledger",
-    "SimulatedMisses",
-    "attribute",
-    "four_sets",
-    "simulate_misses",
-]

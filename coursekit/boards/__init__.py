@@ -12,15 +12,3 @@ from coursekit.boards.board import (
 )
 from coursekit.boards.detector import detect, detect_all
 from coursekit.boards.sheet import save_sheet
-
-__all__ = [
-    "DICTIONARIES",
-    "Board",
-    "BoardNotFound",
-    "Detection",
-    "Detections",
-    "Skipped",
-    "detect",
-    "detect_all",
-    "save_sheet",
-]

@@ -37,7 +37,7 @@ OFFSET_PX = 0.10  # std
 # How far the colour lens is from the factory's figures, std: plausible, not measured. Its pixels
 # are square to a far smaller part than its focal length is known.
 FOCAL_ERROR, ASPECT_ERROR, CENTRE_ERROR_PX = 0.003, 0.0002, 1.5
-RADIAL = ((0.020, 0.003), (-0.030, 0.005))  # k1 and k2 that the factory's lack: mean and std
+LENS_SPREAD = ((0.020, 0.003), (-0.030, 0.005))  # k1 and k2 that the factory's lack: mean and std
 TANGENTIAL = 3e-4
 DRIFT_PX, DRIFT_TIME_S = 0.008, 3.0  # a wall at 0.5 m then varies as published ones do
 
@@ -227,7 +227,7 @@ def _true_lens(seed: int, reported: Intrinsics) -> Intrinsics:
     rng = np.random.default_rng([seed, zlib.crc32(b"colour lens")])
     scale, aspect = 1 + FOCAL_ERROR * rng.standard_normal(), ASPECT_ERROR * rng.standard_normal()
     dx, dy = CENTRE_ERROR_PX * rng.standard_normal(2)
-    radial = [mean + std * rng.standard_normal() for mean, std in RADIAL]
+    radial = [mean + std * rng.standard_normal() for mean, std in LENS_SPREAD]
     missed = [*radial, *(TANGENTIAL * rng.standard_normal(2)), 0.0]
     fx, fy = reported.fx * scale * (1 + aspect), reported.fy * scale * (1 - aspect)
     cx, cy = reported.cx + dx, reported.cy + dy

@@ -27,25 +27,3 @@ from coursekit.hand_eye.planning import held_out, next_pose
 from coursekit.hand_eye.poses import MOUNTS, observability
 from coursekit.hand_eye.session import METHODS, HandEyeResult, HandEyeSession, solve
 from coursekit.hand_eye.views import board_poses
-
-__all__ = [
-    "CLOSED_FORMS",
-    "METHODS",
-    "MOUNTS",
-    "HandEyeResult",
-    "HandEyeSession",
-    "NotDetermined",
-    "SolverFailed",
-    "StudyPoint",
-    "board_poses",
-    "diagnose",
-    "error_study",
-    "held_out",
-    "motions",
-    "next_pose",
-    "observability",
-    "rotation_from_shifts",
-    "rotation_half",
-    "solve",
-    "translation_half",
-]

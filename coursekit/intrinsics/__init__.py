@@ -24,24 +24,3 @@ from coursekit.intrinsics.fit import (
     image_grid,
     tilts,
 )
-
-__all__ = [
-    "MODELS",
-    "Bow",
-    "CalibrationFailed",
-    "Comparison",
-    "Coverage",
-    "HalvesDifference",
-    "IntrinsicsResult",
-    "Tilts",
-    "calibrate",
-    "compare",
-    "coverage",
-    "diagnose",
-    "fit_bow",
-    "fit_shape",
-    "halves",
-    "image_grid",
-    "stored_power",
-    "tilts",
-]

@@ -4,15 +4,3 @@ from __future__ import annotations
 
 from coursekit.plots import depth_noise, error_budget, hand_eye, intrinsics, pinhole
 from coursekit.plots.style import COLORS, LessonFigure, drag, figure
-
-__all__ = [
-    "COLORS",
-    "LessonFigure",
-    "depth_noise",
-    "drag",
-    "error_budget",
-    "figure",
-    "hand_eye",
-    "intrinsics",
-    "pinhole",
-]

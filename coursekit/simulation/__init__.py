@@ -13,24 +13,3 @@ from coursekit.simulation.arm_sessions import (
 from coursekit.simulation.corner_sessions import Effects, corner_session
 from coursekit.simulation.rig import Rig, RigView, cost_curve, match
 from coursekit.simulation.scenes import Box, Scene, artefact_scene, render, tabletop, wall_scene
-
-__all__ = [
-    "Box",
-    "Effects",
-    "HandEyeMistakes",
-    "Rig",
-    "RigView",
-    "Scene",
-    "artefact_scene",
-    "corner_session",
-    "cost_curve",
-    "default_setup",
-    "hand_eye_session",
-    "match",
-    "render",
-    "shared_target",
-    "tabletop",
-    "touch_corners",
-    "truth_of",
-    "wall_scene",
-]

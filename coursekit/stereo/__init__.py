@@ -41,23 +41,3 @@ from coursekit.stereo.law import (
     unrounded_std,
 )
 from coursekit.stereo.windows import AveragingCurve, WindowStats, averaging_curve, window_stats
-
-__all__ = [
-    "AveragingCurve",
-    "BiasFit",
-    "BiasPriors",
-    "BlockFace",
-    "NoiseFit",
-    "WindowStats",
-    "averaging_curve",
-    "block_face",
-    "depth_from_disparity",
-    "depth_noise",
-    "depth_slope",
-    "fit_bias",
-    "fit_noise",
-    "robust_depth",
-    "rounded_variance",
-    "unrounded_std",
-    "window_stats",
-]
