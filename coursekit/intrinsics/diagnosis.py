@@ -261,8 +261,11 @@ def _wrong_lens(start: Calibration) -> Finding | None:
         return _TEXTS.finding("lens_folds", rms=_flat(start.left_px), **beyond)
     if start.estimated[4:].any(axis=1).all():  # else the model has more coefficients to give
         rival, p_value = causes.as_fisheye(start)
-        gain = start.left_px**2 - rival.left_px**2
-        if p_value < RIVAL_LEVEL and gain > causes.LEAST_GAIN * start.noise_px**2:
+        least = causes.LEAST_GAIN * start.noise_px**2
+        if start.shows_shape:  # where paper that is no plane explains more, it comes first
+            heights = start.plain.explains(start.hypothesis(causes.HEIGHTS))
+            least = max(least, start.left_px**2 - heights.rest)
+        if p_value < RIVAL_LEVEL and start.left_px**2 - rival.left_px**2 > least:
             figures = {"rival": _flat(rival.left_px), "noise": _flat(rival.noise_px)}
             return _TEXTS.finding("lens_is_fisheye", p_value, rms=_flat(start.left_px), **figures)
     step = causes.search_lens(start)
