@@ -78,7 +78,23 @@ _FUNCTIONS = {
     "export": "coursekit.results",
     "submit": "coursekit.submission.submit",
 }
-_ROOMS = ["arm", "attribution", "boards", "budget", "cameras", "geometry", "hand_eye", "intrinsics", "lessons", "plots", "results", "simulation", "specifications", "stereo", "submission"]
+_ROOMS = [
+    "arm",
+    "attribution",
+    "boards",
+    "budget",
+    "cameras",
+    "geometry",
+    "hand_eye",
+    "intrinsics",
+    "lessons",
+    "plots",
+    "results",
+    "simulation",
+    "specifications",
+    "stereo",
+    "submission",
+]
 
 
 def __getattr__(name: str) -> Any:

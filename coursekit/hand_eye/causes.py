@@ -29,16 +29,8 @@ from coursekit.arm import Arm, ArmErrors, fk_covariance, pose_difference
 from coursekit.arrays import Floats, NDArray
 from coursekit.causes import CauseSearch, Hypothesis, Tested, likelihood_ratios, search
 from coursekit.geometry import turned
+from coursekit.hand_eye import poses
 from coursekit.hand_eye.closed_form import motions, rotation_by_axes, translation_half
-from coursekit.hand_eye.poses import (
-    Mount,
-    by_arm_twist,
-    by_X_and_Y,
-    camera_board,
-    carrier_stand,
-    mean_pose,
-    stand_board,
-)
 from coursekit.hand_eye.session import HandEyeSession
 from coursekit.hand_eye.views import enlarged
 
@@ -95,7 +87,7 @@ class PosePairs:
 
     T_base_gripper: Floats
     T_camera_board: Floats
-    mount: Mount
+    mount: poses.Mount
     image: Floats
     segment: NDArray[np.intp]
     view: NDArray[np.intp]
@@ -135,7 +127,7 @@ class PosePairs:
 
     def exchanged(self) -> PosePairs:
         """Camera and arm with their parts exchanged, as eye-to-hand: C Y^-1 = X^-1 M."""
-        M = carrier_stand(self.T_base_gripper, self.mount)
+        M = poses.carrier_stand(self.T_base_gripper, self.mount)
         return replace(
             self, T_base_gripper=self.T_camera_board, T_camera_board=M, mount="eye_to_hand"
         )
@@ -183,7 +175,7 @@ class Fit:
     def by_X_and_Y(self) -> Floats:
         """d predicted twists / d twists of X and of the Y that is each pair's, (n, 6, 12)."""
         pairs = self.pairs
-        return by_X_and_Y(pairs.T_base_gripper, self.X, self.Y[pairs.segment], pairs.mount)
+        return poses.by_X_and_Y(pairs.T_base_gripper, self.X, self.Y[pairs.segment], pairs.mount)
 
     def says(self) -> str:
         """Its typical residual in words: "0.4 mm and 0.05 deg"."""
@@ -224,7 +216,7 @@ def robust_fit(pairs: PosePairs, start: tuple[Floats, Floats] | None = None) -> 
 
 
 def _at(pairs: PosePairs, X: Floats, Y: Floats) -> Fit:
-    predicted = camera_board(pairs.T_base_gripper, X, Y[pairs.segment], pairs.mount)
+    predicted = poses.camera_board(pairs.T_base_gripper, X, Y[pairs.segment], pairs.mount)
     return Fit(pairs, X, Y, pose_difference(predicted, pairs.T_camera_board))
 
 
@@ -236,8 +228,8 @@ def _closed_form(pairs: PosePairs) -> tuple[Floats, Floats]:
     X = np.eye(4)
     X[:3, :3] = rotation_by_axes(A, B)
     X[:3, 3] = translation_half(A, B, X[:3, :3])
-    places = stand_board(pairs.T_base_gripper, pairs.T_camera_board, X, pairs.mount)
-    Y = [mean_pose(places[pairs.segment == k]) for k in range(pairs.segment.max() + 1)]
+    places = poses.stand_board(pairs.T_base_gripper, pairs.T_camera_board, X, pairs.mount)
+    Y = [poses.mean_pose(places[pairs.segment == k]) for k in range(pairs.segment.max() + 1)]
     return X, np.stack(Y)
 
 
@@ -426,7 +418,7 @@ class MendedPairs:
     def _by_arm(self) -> Floats:
         """d predicted twist / d the gripper's twist in the base's axes, (n, 6, 6)."""
         pairs, fit = self.fit.pairs, self.fit
-        return by_arm_twist(pairs.T_base_gripper, fit.X, fit.Y[pairs.segment], pairs.mount)
+        return poses.by_arm_twist(pairs.T_base_gripper, fit.X, fit.Y[pairs.segment], pairs.mount)
 
     def _joints(self) -> Floats:
         """The joint angles (n, 6) with their zeros put right, rad."""

@@ -36,30 +36,12 @@ from functools import cached_property
 
 import numpy as np
 
+from coursekit import causes as engine
 from coursekit.arrays import Floats, Interval, Mask, NDArray
 from coursekit.boards import Detection, Detections
-from coursekit.causes import (
-    Accepted,
-    CauseSearch,
-    Explained,
-    Hypothesis,
-    Projection,
-    Tested,
-    search,
-)
 from coursekit.checks import want
 from coursekit.geometry import Intrinsics, distort, moved
-from coursekit.intrinsics.derivatives import (
-    FISHEYE_POWERS,
-    RADIAL,
-    NormalEquations,
-    fisheye_with_derivatives,
-    parameter_vector,
-    project_with_derivatives,
-    selection,
-    twist_columns,
-    with_parameters,
-)
+from coursekit.intrinsics import derivatives
 from coursekit.intrinsics.fit import MIN_CORNERS, IntrinsicsResult, evaluate
 from coursekit.words import p_text
 
@@ -173,7 +155,7 @@ class Calibration:
         ids = np.concatenate([d.ids for d in detections])
         pixels = np.concatenate([d.pixels for d in detections])
         view = np.repeat(np.arange(n), [len(d.ids) for d in detections])
-        estimated = selection(result.names)
+        estimated = derivatives.selection(result.names)
         left_out = int((~estimated[4:].any(axis=1)).sum())
         corners = CornerTable(points[ids], pixels, view, ids)
         names = tuple(d.name or f"view {i}" for i, d in enumerate(detections))
@@ -210,7 +192,11 @@ class Calibration:
         # The row at which a corner was seen is measured: nothing has to be solved for it.
         time = (corners.pixels[:, 1] + 0.5) / camera.height - 0.5
         points = still + time[:, None] * values[SHUTTER][corners.view]
-        project = fisheye_with_derivatives if self.fisheye else project_with_derivatives
+        project = (
+            derivatives.fisheye_with_derivatives
+            if self.fisheye
+            else derivatives.project_with_derivatives
+        )
         pixels, by_camera, by_point = project(points, camera)
         left_out = by_camera[:, :, 4:][:, :, ~self.estimated[4:].any(axis=1)]
         terms = np.concatenate([lens_terms(pixels, camera.size), left_out], axis=2)
@@ -238,7 +224,10 @@ class Calibration:
             LENS: terms * scale,
         }
         shared = [by_camera @ self.estimated, *(columns[c] for c in self.sizes if c not in OWN)]
-        own = [twist_columns(points, by_point), *(columns[c] for c in self.sizes if c in OWN)]
+        own = [
+            derivatives.twist_columns(points, by_point),
+            *(columns[c] for c in self.sizes if c in OWN),
+        ]
         moved_centre = principal + number[:, None] * values[DRIFT][1:]
         return Linear(
             corners.pixels - moved_centre - from_axis * scale[:, 0],
@@ -255,7 +244,7 @@ class Calibration:
         flat = stretch_shape(self, self.board) @ self.values[STRETCH] + spread @ self.values[PRINT]
         return np.column_stack([flat, z])
 
-    def projection(self, weights: Floats | None = None, smooth: bool = False) -> Projection:
+    def projection(self, weights: Floats | None = None, smooth: bool = False) -> engine.Projection:
         """The residuals without what the model imitates; weights (N,), one a corner.
 
         smooth: nor what a shape of the board and a smooth field over each view imitate.
@@ -270,10 +259,10 @@ class Calibration:
         blocks = [(rows, own[rows]) for rows in rows_of]
         columns = np.concatenate(shared, axis=2).reshape(len(view), -1)
         by_row = None if weights is None else np.repeat(weights, 2)
-        return Projection(linear.residuals.ravel(), columns, blocks, by_row)
+        return engine.Projection(linear.residuals.ravel(), columns, blocks, by_row)
 
     @cached_property
-    def plain(self) -> Projection:
+    def plain(self) -> engine.Projection:
         """`projection` with all corners alike."""
         return self.projection()
 
@@ -333,7 +322,7 @@ class Calibration:
 
     # --- the search ---
 
-    def hypotheses(self) -> Iterator[Hypothesis]:
+    def hypotheses(self) -> Iterator[engine.Hypothesis]:
         """The physical causes that were not added, the worst view, and corners far out."""
         for cause in PHYSICAL:
             if cause not in self.sizes and (self.shows_shape or cause not in (HEIGHTS, PRINT)):
@@ -347,14 +336,14 @@ class Calibration:
         if len(wrong):
             yield _free(BAD_CORNERS, np.column_stack([2 * wrong, 2 * wrong + 1]).ravel())
 
-    def hypothesis(self, cause: str) -> Hypothesis:
+    def hypothesis(self, cause: str) -> engine.Hypothesis:
         """A physical cause: one set of columns for all views, or one set a view."""
         columns = self.linear.columns[cause]
         n = len(columns)
         columns = self._by_view(columns) if cause in OWN else columns.reshape(2 * n, -1)
         if cause == LENS:  # terms of different units: each as the px that it moves corners by
             columns = columns / np.sqrt(np.mean(columns**2, axis=0) + 1e-300)
-        return Hypothesis(cause, columns, typical=TYPICAL[cause])
+        return engine.Hypothesis(cause, columns, typical=TYPICAL[cause])
 
     def _by_view(self, columns: Floats) -> Floats:
         """Columns (N, 2, k) that each view has of its own, (2 N, views k)."""
@@ -371,9 +360,13 @@ class Calibration:
         it all and are the likelier; where corners only share errors with their neighbours, all do.
         """
         fields = self._by_view(self._fields)
-        return self.plain.explains(Hypothesis("smooth", fields, typical=PRIOR_PX)).tested().strength
+        return (
+            self.plain.explains(engine.Hypothesis("smooth", fields, typical=PRIOR_PX))
+            .tested()
+            .strength
+        )
 
-    def tested(self, hypotheses: Sequence[Hypothesis]) -> list[Tested]:
+    def tested(self, hypotheses: Sequence[engine.Hypothesis]) -> list[engine.Tested]:
         """The test of each hypothesis; the fair p-value only of those that can be accepted."""
         tests = [self.plain.explains(hypothesis).tested() for hypothesis in hypotheses]
         physical = sorted(t.strength for t in tests if t.cause in PHYSICAL)
@@ -381,7 +374,7 @@ class Calibration:
         fair = [t.cause in PHYSICAL and t.strength >= least for t in tests]
         return [self.test(t.hypothesis) if f else t for t, f in zip(tests, fair, strict=True)]
 
-    def test(self, hypothesis: Hypothesis) -> Tested:
+    def test(self, hypothesis: engine.Hypothesis) -> engine.Tested:
         """One hypothesis; a physical cause has its p-value from weights after each view's noise.
 
         The variance of each view is taken from what remains after the cause, so that the cause
@@ -395,7 +388,7 @@ class Calibration:
         fair = self.projection(self._noise_weights(explained))
         return replace(test, log_p=fair.explains(hypothesis).log_p)
 
-    def matters(self, test: Tested) -> bool:
+    def matters(self, test: engine.Tested) -> bool:
         """Whether a view stands out from the others; the rest is for the findings to say."""
         if test.cause != SPOILED_VIEW:
             return True
@@ -403,20 +396,20 @@ class Calibration:
         others = float(np.median(np.delete(rms, rms.argmax())))
         return test.size >= max(SPOILED_RATIO * others, SPOILED_PX)
 
-    def accept(self, test: Tested) -> Calibration:
+    def accept(self, test: engine.Tested) -> Calibration:
         """The calibration with a cause added, or corners set aside, fitted again."""
         if test.cause in PHYSICAL:
             return self.with_cause(test)
         return refit(replace(self, corners=self.corners.keep(~self.corners_of(test))))
 
-    def with_cause(self, test: Tested) -> Calibration:
+    def with_cause(self, test: engine.Tested) -> Calibration:
         """The calibration with a physical cause added, fitted again."""
         least = LEAST_SHAPE_M if test.cause in (HEIGHTS, PRINT) else 1e-12
         sizes = {**self.sizes, test.cause: max(test.size, least)}
         noise = math.sqrt(self.plain.explains(test.hypothesis).rest)
         return refit(replace(self, sizes=sizes, prior_px=max(noise, LEAST_PX)))
 
-    def corners_of(self, test: Tested) -> Mask:
+    def corners_of(self, test: engine.Tested) -> Mask:
         """The corners (N,) that a spoiled view or bad corners concern."""
         mask = np.zeros(len(self.corners.view), bool)
         mask[np.asarray(test.hypothesis.rows) // 2] = True
@@ -436,7 +429,7 @@ class Calibration:
         limit = np.sqrt(2 * np.log(len(length) / CHANCE_LEVEL)) / RAYLEIGH_MEDIAN
         return np.flatnonzero((length > limit * sigma) & (length > BAD_CORNER_PX))
 
-    def _noise_weights(self, explained: Explained) -> Floats:
+    def _noise_weights(self, explained: engine.Explained) -> Floats:
         """1 / sigma of each corner (N,), from the residuals of its view, shrunk to the common."""
         squares = (explained.after.reshape(-1, 2) ** 2).sum(axis=1)
         dof = max(explained.dof - int(explained.visible.sum()), 1)
@@ -446,14 +439,14 @@ class Calibration:
         return np.maximum(variance, 1e-300)[self.index] ** -0.5
 
 
-def _free(cause: str, rows: NDArray[np.intp], at: int = 0, tried: int = 1) -> Hypothesis:
+def _free(cause: str, rows: NDArray[np.intp], at: int = 0, tried: int = 1) -> engine.Hypothesis:
     """Single coordinates that may be anything."""
-    return Hypothesis(cause, np.eye(len(rows)), at, rows, TYPICAL[cause], tried)
+    return engine.Hypothesis(cause, np.eye(len(rows)), at, rows, TYPICAL[cause], tried)
 
 
-def search_residuals(start: Calibration) -> CauseSearch[Calibration]:
+def search_residuals(start: Calibration) -> engine.CauseSearch[Calibration]:
     """The causes that the residuals of a fit speak for, the strongest first."""
-    return search(start, CHANCE_LEVEL)
+    return engine.search(start, CHANCE_LEVEL)
 
 
 def as_fisheye(model: Calibration) -> tuple[Calibration, float]:
@@ -469,15 +462,20 @@ def as_fisheye(model: Calibration) -> tuple[Calibration, float]:
     R, t = model.poses[corners.view, :3, :3], model.poses[corners.view, :3, 3]
     points = np.einsum("nij,nj->ni", R, corners.points) + t
     out = float((np.hypot(points[:, 0], points[:, 1]) / points[:, 2]).max())
-    tangent, parameters = np.linspace(0.0, out, 100), parameter_vector(camera)
+    tangent, parameters = np.linspace(0.0, out, 100), derivatives.parameter_vector(camera)
     straight = parameters[4:] * [1, 1, 0, 0, 1]  # without the tangential ones
     radius = distort(np.column_stack([tangent, 0.0 * tangent]), straight)[:, 0]
-    series = np.linalg.lstsq(np.arctan(tangent)[:, None] ** FISHEYE_POWERS, radius, rcond=None)[0]
+    series = np.linalg.lstsq(
+        np.arctan(tangent)[:, None] ** derivatives.FISHEYE_POWERS, radius, rcond=None
+    )[0]
     parameters[:2] *= series[0]
     parameters[4:] = 0.0
-    parameters[RADIAL] = series[1:] / series[0]
+    parameters[derivatives.RADIAL] = series[1:] / series[0]
     estimated = model.estimated[:, model.estimated[[6, 7]].sum(axis=0) == 0]
-    camera, values = with_parameters(camera, parameters), {**model.values, LENS: np.zeros(10)}
+    camera, values = (
+        derivatives.with_parameters(camera, parameters),
+        {**model.values, LENS: np.zeros(10)},
+    )
     rival = replace(model, camera=camera, estimated=estimated, values=values, fisheye=True)
     rival = refit(rival, FISHEYE_STEPS)
     left = [np.bincount(m.index, (m.linear.residuals**2).sum(axis=1)) for m in (model, rival)]
@@ -485,7 +483,7 @@ def as_fisheye(model: Calibration) -> tuple[Calibration, float]:
     return rival, float(ttest_1samp(mine - theirs, 0.0, alternative="greater").pvalue)
 
 
-def search_lens(start: Calibration) -> Accepted[Calibration] | None:
+def search_lens(start: Calibration) -> engine.Accepted[Calibration] | None:
     """The step to a lens that the model cannot follow, where that explains most of the residuals.
 
     Then nothing else is asked: a wrong lens passes for every other cause. None where another
@@ -495,18 +493,18 @@ def search_lens(start: Calibration) -> Accepted[Calibration] | None:
     best = max(tests, key=lambda test: test.strength)
     if best.cause != LENS or best.log_p > math.log(CHANCE_LEVEL):
         return None
-    step = Accepted(best, start, start.with_cause(best), ())
+    step = engine.Accepted(best, start, start.with_cause(best), ())
     excess = start.left_px**2 - start.noise_px**2
     return step if start.left_px**2 - step.after.left_px**2 > MOST * max(excess, 0.0) else None
 
 
-def named(found: CauseSearch[Calibration]) -> list[Accepted[Calibration]]:
+def named(found: engine.CauseSearch[Calibration]) -> list[engine.Accepted[Calibration]]:
     """The accepted steps that explain what there is; the three of a board's shape are one cause."""
     noise = found.model.noise_px**2
     shape = [step for step in found.accepted if step.test.cause in SHAPE]
     others = [s for s in found.accepted if s.test.cause in PHYSICAL and s not in shape]
 
-    def taken(steps: Sequence[Accepted[Calibration]]) -> float:
+    def taken(steps: Sequence[engine.Accepted[Calibration]]) -> float:
         return sum(step.before.left_px**2 - step.after.left_px**2 for step in steps)
 
     closed = found.model.smooth[1] > NOTHING_LEFT and len(others) <= 1
@@ -526,14 +524,14 @@ def named(found: CauseSearch[Calibration]) -> list[Accepted[Calibration]]:
 
 
 def _sound(
-    found: CauseSearch[Calibration], good: Sequence[Accepted[Calibration]]
-) -> list[Accepted[Calibration]]:
+    found: engine.CauseSearch[Calibration], good: Sequence[engine.Accepted[Calibration]]
+) -> list[engine.Accepted[Calibration]]:
     """The steps up to the first physical one that is not good: what comes later rests on it."""
     physical = [step.test.cause in PHYSICAL and step not in good for step in found.accepted]
     return found.accepted[: physical.index(True)] if any(physical) else found.accepted
 
 
-def explained(found: CauseSearch[Calibration]) -> Calibration:
+def explained(found: engine.CauseSearch[Calibration]) -> Calibration:
     """The end of a search with nothing in it but what is `named`."""
     good = named(found)
     causes = {step.test.cause for step in good}
@@ -713,13 +711,13 @@ def _step(model: Calibration, damping: float) -> tuple[Floats, Floats]:
     held, values = _shape_prior(model)
     s.append(np.diag(held)[held > 0])
     r.append(-values[held > 0])
-    return NormalEquations(np.concatenate(s), b, np.concatenate(r)).step()
+    return derivatives.NormalEquations(np.concatenate(s), b, np.concatenate(r)).step()
 
 
 def _moved(model: Calibration, shared: Floats, own: Floats) -> Calibration | None:
     """The model after a step, None where that leads to no camera."""
     p = model.estimated.shape[1]
-    parameters = parameter_vector(model.camera) + model.estimated @ shared[:p]
+    parameters = derivatives.parameter_vector(model.camera) + model.estimated @ shared[:p]
     if not (np.isfinite(parameters).all() and (parameters[:2] > 0).all()):
         return None
     poses, values = model.poses.copy(), dict(model.values)
@@ -733,7 +731,7 @@ def _moved(model: Calibration, shared: Floats, own: Floats) -> Calibration | Non
         else:
             value += shared[at_shared : at_shared + len(value)]
             at_shared += len(value)
-    camera = with_parameters(model.camera, parameters)
+    camera = derivatives.with_parameters(model.camera, parameters)
     return replace(model, camera=camera, poses=poses, values=values)
 
 

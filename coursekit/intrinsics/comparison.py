@@ -18,13 +18,7 @@ from coursekit.arrays import ArrayLike, Floats
 from coursekit.boards import Board, Detection
 from coursekit.checks import want
 from coursekit.geometry import Intrinsics, deproject, moved, project
-from coursekit.intrinsics.derivatives import (
-    parameter_vector,
-    project_with_derivatives,
-    scaled_inverse,
-    selection,
-    twist_columns,
-)
+from coursekit.intrinsics import derivatives
 from coursekit.intrinsics.fit import (
     MAP_SHAPE,
     IntrinsicsResult,
@@ -149,11 +143,13 @@ def difference_px(
     T = np.eye(4)
     for _ in range(_GAUSS_NEWTON_STEPS):
         at = points[known] @ T[:3, :3].T + T[:3, 3]
-        seen, _, by_point = project_with_derivatives(at, second)
-        columns = (weight[..., None] * twist_columns(at, by_point)[..., :free]).reshape(-1, free)
+        seen, _, by_point = derivatives.project_with_derivatives(at, second)
+        columns = (weight[..., None] * derivatives.twist_columns(at, by_point)[..., :free]).reshape(
+            -1, free
+        )
         residuals = (weight * (pixels[known] - seen)).ravel()
         twist = np.zeros(6)
-        twist[:free] = scaled_inverse(columns.T @ columns) @ (columns.T @ residuals)
+        twist[:free] = derivatives.scaled_inverse(columns.T @ columns) @ (columns.T @ residuals)
         T = moved(T[None], twist[None])[0]
         if np.abs(columns @ twist[:free]).max() < 1e-9 * weight.max():
             break
@@ -172,7 +168,7 @@ def _without_motion(columns: Floats, weights: Floats) -> Floats:
     parameters, motion = columns[..., :-6], columns[..., -6:][..., moving]
     flat = (columns[used] * weights[used, None, None]).reshape(-1, columns.shape[-1])
     A, b = flat[:, -6:][:, moving], flat[:, :-6]
-    return parameters - motion @ (scaled_inverse(A.T @ A) @ (A.T @ b))
+    return parameters - motion @ (derivatives.scaled_inverse(A.T @ A) @ (A.T @ b))
 
 
 def _wald(difference: Floats, covariance: Floats, dof: float) -> float:
@@ -184,7 +180,7 @@ def _wald(difference: Floats, covariance: Floats, dof: float) -> float:
 
     p = len(difference)
     left = max(dof - p + 1, 1.0)
-    squares = float(difference @ scaled_inverse(covariance) @ difference)
+    squares = float(difference @ derivatives.scaled_inverse(covariance) @ difference)
     return float(f.sf(squares * left / (p * dof), p, left))
 
 
@@ -265,8 +261,10 @@ def compare(
     depth = np.full(len(grid), float(range_m))
     theirs = deproject(grid, depth, factory.K, factory.dist)
     shift = np.linalg.norm(deproject(grid, depth, ours.K, ours.dist) - theirs, axis=1)
-    full = parameter_vector(ours) - parameter_vector(factory)
-    difference = np.linalg.pinv(selection(names)) @ full  # "f" against the mean of fx and fy
+    full = derivatives.parameter_vector(ours) - derivatives.parameter_vector(factory)
+    difference = (
+        np.linalg.pinv(derivatives.selection(names)) @ full
+    )  # "f" against the mean of fx and fy
     sigma_px = result.uncertainty_map(range_m, shape, "camera")
     return Comparison(
         names=names,

@@ -39,15 +39,7 @@ from coursekit.boards import Board, Detection
 from coursekit.boards.board import check_detections
 from coursekit.checks import array, choice, is_number, want
 from coursekit.geometry import Intrinsics, deproject, make_transform, project
-from coursekit.intrinsics.derivatives import (
-    PARAMETERS,
-    NormalEquations,
-    Scatter,
-    parameter_vector,
-    project_with_derivatives,
-    selection,
-    twist_columns,
-)
+from coursekit.intrinsics import derivatives
 from coursekit.words import Estimate, wrapped
 
 Fixed = Literal["world", "camera"]
@@ -105,7 +97,7 @@ class IntrinsicsResult(Estimate):
     model: str
     names: tuple[str, ...]
     T_camera_board: Floats
-    equations: NormalEquations
+    equations: derivatives.NormalEquations
     board: Board
     points: Floats
     detections: Sequence[Detection]
@@ -181,7 +173,7 @@ class IntrinsicsResult(Estimate):
         return self.equations.shared[:, : len(self.names)], tuple(self.equations.poses)
 
     @cached_property
-    def _scatter(self) -> Scatter:
+    def _scatter(self) -> derivatives.Scatter:
         return self.equations.scatter(len(self.names))
 
     @cached_property
@@ -207,18 +199,18 @@ class IntrinsicsResult(Estimate):
 
     def value(self, name: str) -> float:
         """The estimate of one of `names`."""
-        return float(parameter_vector(self.intrinsics)[self._row(name)])
+        return float(derivatives.parameter_vector(self.intrinsics)[self._row(name)])
 
     def sigma(self, name: str) -> float:
         """The standard deviation of one of `names`, px for K."""
-        row = selection(self.names)[self._row(name)]
+        row = derivatives.selection(self.names)[self._row(name)]
         return math.sqrt(float(row @ self.covariance @ row))
 
     def _row(self, name: str) -> int:
         """Where the parameter of this name stands in `PARAMETERS`; ValueError if not estimated."""
         known = (*self.names, "fx", "fy") if "f" in self.names else self.names
         choice("name", name, known)
-        return PARAMETERS.index("fx" if name == "f" else name)
+        return derivatives.PARAMETERS.index("fx" if name == "f" else name)
 
     # --- what that means for a pixel ---
 
@@ -469,17 +461,17 @@ def evaluate(
     R = np.repeat(T_camera_board[:, :3, :3], counts, axis=0)
     at = np.einsum("nij,nj->ni", R, points[ids])
     at += np.repeat(T_camera_board[:, :3, 3], counts, axis=0)
-    predicted, by_parameter, by_point = project_with_derivatives(at, intrinsics)
+    predicted, by_parameter, by_point = derivatives.project_with_derivatives(at, intrinsics)
     residuals = np.concatenate([d.pixels for d in detections]) - predicted
-    shared = [by_parameter @ selection(names)]
+    shared = [by_parameter @ derivatives.selection(names)]
     for by_extra in extra.values():
         moves = np.einsum("nij,nj->ni", R, by_extra[ids])
         shared.append(np.einsum("nij,nj->ni", by_point, moves)[..., None])
-    poses = np.split(twist_columns(at, by_point), np.cumsum(counts)[:-1])
+    poses = np.split(derivatives.twist_columns(at, by_point), np.cumsum(counts)[:-1])
     weights, off = held or (np.zeros(len(extra)), np.zeros(len(extra)))
     known = np.concatenate([np.zeros((len(extra), len(names))), np.diag(weights)], axis=1)
     seen = np.concatenate(shared, axis=-1).reshape(2 * len(ids), -1)
-    equations = NormalEquations(
+    equations = derivatives.NormalEquations(
         shared=np.concatenate([seen, known[weights > 0]]),
         poses=tuple(block.reshape(-1, 6) for block in poses),
         residuals=np.concatenate([residuals.ravel(), -off[weights > 0]]),
@@ -589,11 +581,11 @@ def projection_columns(
     At an infinite range a translation moves nothing.
     """
     points = points_at(pixels, range_m, intrinsics)
-    _, by_parameter, by_point = project_with_derivatives(points, intrinsics)
-    motion = twist_columns(points, by_point)
+    _, by_parameter, by_point = derivatives.project_with_derivatives(points, intrinsics)
+    motion = derivatives.twist_columns(points, by_point)
     if math.isinf(range_m):
         motion[..., 3:] = 0.0
-    return np.concatenate([by_parameter @ selection(names), motion], axis=-1)
+    return np.concatenate([by_parameter @ derivatives.selection(names), motion], axis=-1)
 
 
 def worst_direction(covariance: Floats) -> Floats:

@@ -38,19 +38,10 @@ from tqdm.auto import tqdm
 
 from coursekit import results
 from coursekit.checks import positive, want
+from coursekit.submission import report
 from coursekit.submission.flags import as_json
 from coursekit.submission.format import NO_TEXT, slug
 from coursekit.submission.recompute import grading_rules
-from coursekit.submission.report import (
-    ReportLine,
-    across,
-    class_page,
-    grade_file,
-    grades_csv,
-    not_graded,
-    out_of_memory,
-    paragraphs_page,
-)
 from coursekit.words import counted
 
 TIMEOUT_S = 10.0
@@ -72,7 +63,7 @@ CANNOT_START = (
     "too, more memory is needed, or the installation is broken (run `python3 course.py test`)"
 )
 
-Graded = tuple[ReportLine, str]  # a line in the class, and the page of the student
+Graded = tuple[report.ReportLine, str]  # a line in the class, and the page of the student
 Work = Callable[[str, str, str], Graded]  # of the file's path, its name and the page's
 
 
@@ -173,7 +164,7 @@ def grade_folder(
         with (
             tqdm(total=len(bundles), initial=kept, unit="bundle", disable=not progress) as bar,
             _noted_interrupts() as interrupted,
-            contextlib.closing(work_through(unfinished, grade_file, limits)) as outcomes,
+            contextlib.closing(work_through(unfinished, report.grade_file, limits)) as outcomes,
         ):
             for bundle, outcome in outcomes:
                 _store(out, bundle, outcome)  # and not here: a class of any size fits
@@ -364,14 +355,14 @@ def _outcome(future: Future[Graded], bundle: Bundle, limits: Limits) -> Graded:
         says = f"It ended the process that graded it ({_ending(error.exitcode)}). Look inside."
         return _failed(bundle, "died", says)
     if isinstance(error, MemoryError):
-        return out_of_memory(bundle.name), ""
+        return report.out_of_memory(bundle.name), ""
     says = f"The grader failed on it ({type(error).__name__}). Please report it with the file."
     return _failed(bundle, "error", says)
 
 
 def _failed(bundle: Bundle, reason: str, says: str) -> Graded:
     """The line of a bundle whose grading failed, and no page."""
-    return not_graded(bundle.name, reason, says), ""
+    return report.not_graded(bundle.name, reason, says), ""
 
 
 def _ending(code: int) -> str:
@@ -436,7 +427,7 @@ def _context() -> Any:
     if sys.platform != "linux":
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([grade_file.__module__])
+    context.set_forkserver_preload([report.grade_file.__module__])
     return context
 
 
@@ -502,10 +493,12 @@ def _is_report(folder: Path) -> bool:
         return False
 
 
-def _load(out: Path, bundle: Bundle) -> ReportLine | None:
+def _load(out: Path, bundle: Bundle) -> report.ReportLine | None:
     """The line of a bundle that is kept."""
     try:
-        return ReportLine.from_dict(json.loads((out / ROWS / f"{bundle.key}.json").read_bytes()))
+        return report.ReportLine.from_dict(
+            json.loads((out / ROWS / f"{bundle.key}.json").read_bytes())
+        )
     except (OSError, AttributeError, KeyError, TypeError, ValueError):
         return None
 
@@ -526,23 +519,25 @@ def _store(out: Path, bundle: Bundle, outcome: Graded) -> None:
     results.write_bytes(out / ROWS / f"{bundle.key}.json", as_json(line).encode())
 
 
-def _finish(out: Path, bundles: list[Bundle]) -> list[ReportLine]:
+def _finish(out: Path, bundles: list[Bundle]) -> list[report.ReportLine]:
     """Write what takes the whole class; returns the lines with what they share."""
     gone = "What was kept of it is gone. Run the same command again."
-    lines = across(
-        [_load(out, bundle) or not_graded(bundle.name, "lost", gone) for bundle in bundles]
+    lines = report.across(
+        [_load(out, bundle) or report.not_graded(bundle.name, "lost", gone) for bundle in bundles]
     )
     pages = {bundle.page for bundle in bundles}
-    results.write_bytes(out / PARAGRAPHS, paragraphs_page(lines).encode())
-    results.write_bytes(out / PAGE, class_page(lines).encode())
-    results.write_bytes(out / CSV, grades_csv(lines).encode("utf-8-sig"))  # so spreadsheets see ë
+    results.write_bytes(out / PARAGRAPHS, report.paragraphs_page(lines).encode())
+    results.write_bytes(out / PAGE, report.class_page(lines).encode())
+    results.write_bytes(
+        out / CSV, report.grades_csv(lines).encode("utf-8-sig")
+    )  # so spreadsheets see ë
     for path in (out / STUDENTS).iterdir():
         if f"{STUDENTS}/{path.name}" not in pages:
             path.unlink()  # of a bundle that is no more, or an older grader
     return lines
 
 
-def _kind(line: ReportLine) -> str:
+def _kind(line: report.ReportLine) -> str:
     """What the summary counts a line as: graded, refused or failed."""
     if line.points is not None:
         return "graded"
