@@ -38,6 +38,7 @@ lists what the room offers. A module is named for what is in it.
 from __future__ import annotations
 
 import importlib
+import pkgutil
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -78,32 +79,18 @@ _FUNCTIONS = {
     "export": "coursekit.results",
     "submit": "coursekit.submission.submit",
 }
-_ROOMS = [
-    "arm",
-    "attribution",
-    "boards",
-    "budget",
-    "cameras",
-    "geometry",
-    "hand_eye",
-    "intrinsics",
-    "lessons",
-    "plots",
-    "results",
-    "simulation",
-    "specifications",
-    "stereo",
-    "submission",
-]
 
 
 def __getattr__(name: str) -> Any:
     if name in _FUNCTIONS:
         return getattr(importlib.import_module(_FUNCTIONS[name]), name)
-    if name in _ROOMS:
+    try:
         return importlib.import_module(f"coursekit.{name}")
-    raise AttributeError(f"module 'coursekit' has no attribute {name!r}")
+    except ModuleNotFoundError as error:
+        if error.name != f"coursekit.{name}":
+            raise
+        raise AttributeError(f"module 'coursekit' has no attribute {name!r}") from None
 
 
 def __dir__() -> list[str]:
-    return [*_ROOMS, *_FUNCTIONS]
+    return [*_FUNCTIONS, *(room.name for room in pkgutil.iter_modules(__path__))]
