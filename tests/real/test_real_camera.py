@@ -112,5 +112,5 @@ def test_a_truncated_bag_is_refused(rs, folder, tmp_path, fraction):
     data = (folder / NAME).read_bytes()
     path = tmp_path / "cut.bag"
     path.write_bytes(data[: int(fraction * len(data))])
-    with pytest.raises(CameraError, match=r"damaged, incomplete .* record it anew"):
+    with pytest.raises(CameraError, match=r"is truncated: .* record it anew"):
         open_camera(path)
