@@ -12,7 +12,7 @@ from typing import Self, TypeVar, overload
 from coursekit.arrays import Interval
 from coursekit.checks import is_number, want
 
-Item = TypeVar("Item")
+Thing = TypeVar("Thing")
 WIDTH = 88  # characters: fits a notebook's output cell; JupyterLab breaks longer lines in mid-word
 
 
@@ -93,17 +93,17 @@ class Finding:
         return "\n".join([self.title, *(wrapped(line, WIDTH - 3, "  ") for line in lines)])
 
 
-class Listed(Sequence[Item]):
+class Listed(Sequence[Thing]):
     """Things in their order, like an immutable list; a slice keeps what is said of them."""
 
-    def __init__(self, things: Iterable[Item] = ()) -> None:
+    def __init__(self, things: Iterable[Thing] = ()) -> None:
         self._things = tuple(things)
 
     @overload
-    def __getitem__(self, index: int) -> Item: ...
+    def __getitem__(self, index: int) -> Thing: ...
     @overload
     def __getitem__(self, index: slice) -> Self: ...
-    def __getitem__(self, index: int | slice) -> Item | Self:
+    def __getitem__(self, index: int | slice) -> Thing | Self:
         if not isinstance(index, slice):
             return self._things[index]
         part = copy.copy(self)

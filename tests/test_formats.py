@@ -945,7 +945,7 @@ def kept(tmp_path, monkeypatch, result):
 def test_results_carry_all_that_a_robot_needs(kept, result) -> None:
     found = results.load("03_intrinsics")
     assert (found.serial, found.lens) == ("728612070259", LENS)
-    assert json.loads((kept / "03_intrinsics.json").read_text())["lens"]["width"] == 848
+    assert json.loads((kept / "03_intrinsics.json").read_text("utf-8"))["lens"]["width"] == 848
     placed = results.load("04_hand_eye").placement
     assert np.array_equal(placed.T, result.X)
     assert np.array_equal(placed.covariance, result.covariance[:6, :6])
@@ -956,7 +956,7 @@ def test_results_carry_all_that_a_robot_needs(kept, result) -> None:
 
 def test_results_of_before_are_read_and_say_what_they_lack(kept) -> None:
     for lesson, message in (("03_intrinsics", "no lens"), ("04_hand_eye", "no place")):
-        old = json.loads((kept / f"{lesson}.json").read_text())
+        old = json.loads((kept / f"{lesson}.json").read_text("utf-8"))
         old = {key: old[key] for key in old if key not in ("lens", "placement", "serial")}
         results.write_json(kept / f"{lesson}.json", old | {"format": 1})
         assert results.load(lesson).camera == "D435"
@@ -970,7 +970,7 @@ def test_a_file_that_is_there_stays(kept, tmp_path) -> None:
     with pytest.raises(FileExistsError, match="overwrite=True"):
         ck.export("03_intrinsics", "ros", out)
     ck.export("03_intrinsics", "colmap", out, overwrite=True)
-    assert "FULL_OPENCV" in out.read_text()
+    assert "FULL_OPENCV" in out.read_text("utf-8")
 
 
 def test_the_command_writes_and_prints(kept, tmp_path, capsys) -> None:
@@ -979,7 +979,7 @@ def test_the_command_writes_and_prints(kept, tmp_path, capsys) -> None:
     out = tmp_path / "camera.urdf"
     turn = ["--link", "camera_link", "--link-to-optical", "turn", "--parent", "tool0"]
     assert main(["export", "04_hand_eye", "--to", "urdf", "--out", str(out), *turn]) == 0
-    assert from_urdf(out.read_text())[1:] == ("tool0", "camera_link")
+    assert from_urdf(out.read_text("utf-8"))[1:] == ("tool0", "camera_link")
     assert main(["export", "03_intrinsics", "--to", "kalibr"]) == 0
     said = capsys.readouterr().out
     assert "camera_model: pinhole" in said

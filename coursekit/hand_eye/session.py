@@ -27,7 +27,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from itertools import groupby
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 import numpy as np
@@ -274,7 +274,7 @@ class HandEyeSession:
         found: dict[str, Detection] = {}
         for below, files in groupby(sorted(rows), os.path.dirname):  # views have bare names
             some = detect_all([place / file for file in files], board, progress)
-            found |= {os.path.join(below, view.name): view for view in some}
+            found |= {(PurePosixPath(below) / view.name).as_posix(): view for view in some}
             skipped += some.skipped
         used = [file for file in rows if file in found]
         if len(used) < FEWEST_POSES:

@@ -43,11 +43,13 @@ def ur3e(q: np.ndarray) -> np.ndarray:
 def webcams(real_data) -> dict[int, he.HandEyeSession]:
     """Four webcams that look at a UR3e with a board in its gripper; as published."""
     folder = real_data / "alimedlej_ur3_four_webcams"
-    table = json.loads((folder / "dataset_ur3a_joint_images_40poses.json").read_text())["poses"]
+    table = json.loads((folder / "dataset_ur3a_joint_images_40poses.json").read_text("utf-8"))[
+        "poses"
+    ]
     q = [[row["joint_angles_deg"][f"joint_{k}"] for k in range(1, 7)] for row in table]
     T, found = ur3e(np.radians(q)), {}
     for camera in CAMERAS:
-        given = json.loads((folder / f"intrinsics_cam{camera}.json").read_text())
+        given = json.loads((folder / f"intrinsics_cam{camera}.json").read_text("utf-8"))
         K, to_720 = given["intrinsics_K"], 2 / 3
         centre = [(K[name] + 0.5) * to_720 - 0.5 for name in ("cx", "cy")]
         coeffs = given["distortion"]["coefficients"][:5]
@@ -80,10 +82,10 @@ def healthy(real_data, moveit_poses, webcams) -> dict[str, he.HandEyeSession]:
     found = {f"cam{camera}": put_right(webcams[camera], camera) for camera in CAMERAS}
     found["moveit"] = he.HandEyeSession("eye_to_hand", *moveit_poses)
     folder = real_data / "song_dobot_cr5"
-    rows = json.loads((folder / "arm_data.json").read_text())["poses"]
+    rows = json.loads((folder / "arm_data.json").read_text("utf-8"))["poses"]
     T = [make_transform(Rotation.from_euler("xyz", [row[k] for k in ("rx", "ry", "rz")], True),
                         [row[k] / 1e3 for k in ("x", "y", "z")]) for row in rows]  # fmt: skip
-    seen = json.loads((folder / "camera_data.json").read_text())["poses"]
+    seen = json.loads((folder / "camera_data.json").read_text("utf-8"))["poses"]
     C = [make_transform(Rotation.from_rotvec(np.ravel(row["rvec"])), np.ravel(row["tvec"]) / 1e3)
          for row in seen]  # fmt: skip
     found["song"] = he.HandEyeSession("eye_in_hand", np.stack(T), np.stack(C))
@@ -146,7 +148,7 @@ def test_intervals_hold_published_cameras_or_those_fit_far_worse(real_data, heal
     for camera in CAMERAS:
         session = healthy[f"cam{camera}"]
         result, rms = session.solve(), []
-        published = _matrix_of(json.loads(path.read_text()), f"cam{camera}")
+        published = _matrix_of(json.loads(path.read_text("utf-8")), f"cam{camera}")
         for name, X in (("published", published), ("ours", result.X)):
             places = stand_board(session.T_base_gripper, result.measured, X, session.mount)
             Y = mean_pose(places)
