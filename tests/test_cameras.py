@@ -398,10 +398,10 @@ def test_simulated_depth_beyond_16_bits_is_invalid():
 def test_a_frame_without_colour_in_metres_by_the_depth_unit():
     depth = np.array([[0, 1000, 2000, 65535], [1, 2, 3, 4]], np.uint16)
     frame = Frame(depth, None, 0.0001, 0.5, 9, Intrinsics(4, 2, 5.0, 5.0, 1.5, 0.5))
-    expected = [[0, 0.1, 0.2, 6.5535], [1e-4, 2e-4, 3e-4, 4e-4]]
+    expected = [[0, 0.1, 0.2, 0], [1e-4, 2e-4, 3e-4, 4e-4]]  # the largest count is no depth
     np.testing.assert_allclose(frame.depth_m, expected, rtol=1e-6)
-    point = [1.5 / 5 * 6.5535, -0.65535, 6.5535]
-    np.testing.assert_allclose(frame.points()[0, 3], point, rtol=1e-6)
+    point = [0.5 / 5 * 0.2, -0.02, 0.2]
+    np.testing.assert_allclose(frame.points()[0, 2], point, rtol=1e-6)
     with pytest.raises(CameraError, match="no colour stream"):
         frame.depth_on_color()
     assert repr(frame) == "Frame 9 at 0.500 s: depth 4x2, no colour"

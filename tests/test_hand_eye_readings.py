@@ -189,9 +189,9 @@ def test_what_is_large_is_never_nothing() -> None:
 
 
 def test_whose_joint_angles_are_meant_is_said(tmp_path) -> None:
-    (tmp_path / "poses.csv").write_text("file,x,y,z,rx,ry,rz\n0.png,0,0,0,0,0,0\n", "utf-8")
+    (tmp_path / "poses.csv").write_text("file,x,y,z\n0.png,0,0,0\n", "utf-8")
     lens = session(SEEDS[0], 15, detections=True)
-    with pytest.raises(ValueError, match=r"joint angles \(rad\) of a WidowX AI"):
+    with pytest.raises(ValueError, match=r"joint angles of the WidowX AI \(rad\)"):
         HandEyeSession.from_folder(tmp_path, "eye_in_hand", lens.board, lens.intrinsics)
     q = widowx().random(np.random.default_rng(0), 12)
     other = replace(session(9, 12), T_base_gripper=widowx().forward(q), q=q)
