@@ -285,7 +285,7 @@ def test_what_is_graded_is_not_graded_again(in_process, tmp_path, monkeypatch):
 def test_what_failed_is_tried_again(tmp_path, monkeypatch):
     folder, out = quick(tmp_path / "in", ["a", "kill"]), tmp_path / "out"
     with monkeypatch.context() as patch:
-        patch.setattr(batch, "grade_file", misbehave)
+        patch.setattr(batch.report, "grade_file", misbehave)
         first = graded(folder, out)
     assert (first.failed, first.graded) == (1, 0)
     assert "1 not graded (time, memory or a crash)" in str(first)
