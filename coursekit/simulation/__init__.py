@@ -6,6 +6,7 @@ from coursekit.simulation.arm_sessions import (
     HandEyeMistakes,
     default_setup,
     hand_eye_session,
+    session_folder,
     shared_target,
     touch_corners,
     truth_of,
