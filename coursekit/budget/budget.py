@@ -86,15 +86,15 @@ class _Conversion:
 
 
 _CONVERSIONS: dict[str, _Conversion] = {
-    "image": _Conversion((("px", 1.0),), "× Z/f = {per:.2f} mm/px", _across),
+    "image": _Conversion((("px", 1.0),), "Z/f: {per:.2f} mm/px", _across),
     "ray": _Conversion((("mm", 1e3),), "along the ray", _ray),
-    "disparity": _Conversion((("px", 1.0),), "× Z²/(fB) = {per:.1f} mm/px", _disparity),
+    "disparity": _Conversion((("px", 1.0),), "Z²/(fB): {per:.1f} mm/px", _disparity),
     "depth": _Conversion((("%", 1e2), ("px", 1.0)), "sZ - oZ²/(fB)", _depth),
     "turn": _Conversion(
-        (("deg", math.degrees(1.0)),), "× {lever:.2f} m lever = {per:.1f} mm/deg", _turn
+        (("deg", math.degrees(1.0)),), "lever {lever:.2f} m: {per:.1f} mm/deg", _turn
     ),
     "shift": _Conversion((("mm", 1e3),), "direct", lambda _: np.eye(3)),
-    "intrinsics": _Conversion((("σ", 1.0),), "derivatives by K and lens", _by_K),
+    "intrinsics": _Conversion((("σ", 1.0),), "by K and lens", _by_K),
 }
 FACTORED = ("depth", "intrinsics")  # their components have different units
 
@@ -147,7 +147,7 @@ class ErrorTerm:
         want(self.mean is None or self.normal, "mean", self.mean, "None, or normal=True")
 
     def conversion(self, view: View) -> str:
-        """In words, how the magnitude reaches the object, such as "× Z/f = 1.01 mm/px"."""
+        """In words, how the magnitude reaches the object, such as "Z/f: 1.01 mm/px"."""
         how = _CONVERSIONS[self.along]
         per = 1e3 / how.shown[0][1] * float(np.linalg.norm(how.matrix(view), 2))
         return how.words.format(per=per, lever=np.linalg.norm(view.lever_base))
@@ -164,7 +164,7 @@ class ErrorTerm:
             return ", ".join(f"{factor * value:+.2g} {unit}" for (unit, factor), value in pairs)
         unit, factor = ("σ", 1.0) if self.factor else shown[0]
         low, high = (f"{factor * value:.2g}" for value in (self.low, self.high))
-        repeats = f", {factor * self.floor:.2g} repeats" if self.floor else ""
+        repeats = f", {factor * self.floor:.2g} stays" if self.floor else ""
         return f"{high} {unit}{repeats}" if low == high else f"{low} to {high} {unit}"
 
     @property
@@ -279,11 +279,6 @@ class AxisBudget:
     noise_m: float
     worst_case_m: Interval
     quadrature_m: Interval
-
-    @property
-    def reach_m(self) -> float:
-        """The biases in quadrature at their largest, and two sigmas of noise."""
-        return self.quadrature_m[1] + 2 * self.noise_m
 
 
 @dataclass(frozen=True, eq=False)
@@ -521,7 +516,7 @@ class ErrorBudget:
 
     def table(self) -> tuple[Sequence[str], list[Sequence[str]]]:
         """Heading and one line of text a term; along closing: the most that it does there."""
-        head = ("error", "kind", "magnitude", "conversion", "at the object", "along closing")
+        head = ("error", "kind", "magnitude", "conversion", "at the object", "closing")
         lines: list[Sequence[str]] = []
         for row in self.rows:
             term, at = row.term, span(row.low_m, row.high_m)
@@ -532,11 +527,12 @@ class ErrorBudget:
         return (head[:-1], [line[:-1] for line in lines]) if self._stated else (head, lines)
 
     def sources(self) -> list[str]:
-        """Whose numbers the rows are, a line for each source."""
+        """Whose numbers the rows are, a line for each source; none where all are from one."""
         rows: dict[str, list[str]] = {}
         for term in self.terms:
             rows.setdefault(term.source, []).append(term.name)
-        return [f"{', '.join(names)}: {source}" for source, names in rows.items()]
+        lines = [f"from {source}: {', '.join(names)}" for source, names in rows.items()]
+        return lines if len(lines) > 1 else []
 
     def summary(self) -> list[str]:
         """The sums, a line each, with the question each answers."""
@@ -569,9 +565,9 @@ class ErrorBudget:
         return all(term.stated_m is not None for term in self.terms)
 
     def __repr__(self) -> str:
-        whose = (wrapped(line, 84, first="  ", indent="    ") for line in self.sources())
+        whose = (wrapped(line, 84) for line in self.sources())
         table = words.table(*self.table())
-        return "\n".join([self._heading(), table, *self.summary(), "whose numbers:", *whose])
+        return "\n".join([self._heading(), table, *self.summary(), *whose])
 
     def _repr_html_(self) -> str:
         heading, sums = html.escape(self._heading()), [*self.summary(), *self.sources()]

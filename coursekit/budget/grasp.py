@@ -15,8 +15,8 @@ from coursekit.results import ErrorKind
 
 DRAWS = 20_000  # of a probability that is redrawn while dragging: a standard error of 0.4 % at most
 FEW_DRAWS = 10  # a gain of so many draws says nothing about which row is first
-BY_GRASPS = "in the order of the grasps gained"
-BY_ROOM = "all grasps alike, with or without; in the order of the room taken along closing"
+BY_GRASPS = "what it gains, in the order of grasps:"
+BY_ROOM = "what it gains, in the order of room along closing, because no row gains grasps:"
 WIDTH_WANTED = "a positive length of at most 1 m: 60 mm is 0.060"  # more was meant in millimetres
 
 
@@ -139,23 +139,26 @@ class Gain:
         """Of the tolerance along closing, that is given back: the bias, and two sigmas of noise."""
         return self.worst_case_m + 2 * self.noise_m
 
-    def __str__(self) -> str:
+    def line(self, grasps: bool = True) -> str:
+        """The gain in words; grasps: with what it gains in these."""
         action = "halve" if self.factor == 0.5 else f"{self.factor:g} times"
         few = abs(self.success) < FEW_DRAWS / DRAWS
-        gained = "   -  " if few else f"{100 * self.success:+.1f} %"
+        share = "<0.1" if few else f"{100 * self.success:+.1f}"
+        gained = f"{share:>5} % of grasps, " if grasps else ""
         return (
-            f"{action} {self.name + ':':<22} {gained} of grasps; room {1e3 * self.room_m:.1f} mm: "
-            f"bias {1e3 * self.worst_case_m:.1f}, noise 2 × {1e3 * self.noise_m:.2f}"
+            f"{action} {self.name + ':':<21} {gained}{1e3 * self.room_m:.1f} mm of room "
+            f"(bias {1e3 * self.worst_case_m:.1f} + 2 × noise {1e3 * self.noise_m:.2f})"
         )
 
 
 class Ranking(tuple[Gain, ...]):
-    """Gains, the largest first. order: by what, in words."""
+    """Gains, the largest first. by_room: all change the grasps alike, and room counts."""
 
-    order: str
+    by_room: bool
 
     def __repr__(self) -> str:
-        return "\n".join(["what it gains, " + self.order + ":", *(f"  {gain}" for gain in self)])
+        order = BY_ROOM if self.by_room else BY_GRASPS
+        return "\n".join([order, *("  " + gain.line(not self.by_room) for gain in self)])
 
 
 def sensitivity(budget: ErrorBudget, factor: float = 0.5) -> Ranking:
@@ -181,5 +184,5 @@ def sensitivity(budget: ErrorBudget, factor: float = 0.5) -> Ranking:
     chance = max(2 * math.sqrt(before * (1 - before) / DRAWS), FEW_DRAWS / DRAWS)
     alike = max(abs(gain.success) for gain in gains) <= chance
     ranked = Ranking(sorted(gains, key=lambda g: -(g.room_m if alike else g.success)))
-    ranked.order = BY_ROOM if alike else BY_GRASPS
+    ranked.by_room = alike
     return ranked
