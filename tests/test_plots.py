@@ -355,7 +355,6 @@ def error_budget_figures() -> dict[str, plots.LessonFigure]:
         "between_fingers": error_budget.between_fingers(
             budget.LESSON_GRIPPER, budget.CUBE, table.noise_covariance, (1.0, 2.0, 0.5), others
         ),
-        "distances": error_budget.distances(budget.best_distance(table)),
         "misses": error_budget.misses(missed),
     }
 

@@ -193,9 +193,9 @@ class ErrorTerm:
 
         matrix: that of this view, known already.
         """
-        gain, middle = np.linalg.norm(direction @ matrix), abs(direction @ self.middle_m(view))
-        low, high = self.range
-        return float(max(low * gain, middle - high * gain)), float(middle + high * gain)
+        gain, middle = float(np.linalg.norm(direction @ matrix)), direction @ self.middle_m(view)
+        (low, high), off = self.range, abs(float(middle))
+        return max(low * gain, off - high * gain), off + high * gain
 
     def at_object_m(self, view: View) -> Interval:
         """(low, high) of the length of the displacement at the object, m.

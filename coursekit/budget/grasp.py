@@ -150,6 +150,9 @@ class Gain:
             f"(bias {1e3 * self.worst_case_m:.1f} + 2 × noise {1e3 * self.noise_m:.2f})"
         )
 
+    def __str__(self) -> str:
+        return self.line()
+
 
 class Ranking(tuple[Gain, ...]):
     """Gains, the largest first. by_room: all change the grasps alike, and room counts."""

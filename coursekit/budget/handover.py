@@ -178,7 +178,7 @@ class HandOver:
         """Of the whole: "reference" as soon as one notebook's numbers are the reference's."""
         sources = [found.yours.source if found.yours else "reference" for found in self]
         order = ("reference", "simulated", "recorded", "live")
-        return min(sources, key=order.index)  # type: ignore[return-value]
+        return min(sources, key=order.index)
 
     @property
     def name(self) -> str:
