@@ -160,6 +160,16 @@ def depth_m(depth, k):
     return counts
 
 
+@pytest.mark.parametrize("name", ["lidar.bag", "lidar.db3", "lidar.mcap"])
+def test_a_recording_without_depth_is_named_for_what_it_is(tmp_path, name):
+    driver = Driver(tmp_path / name)
+    driver.messages = lambda: [("/lidar/image", 1.0, driver.image(1.0, "lidar", "mono8", grey(1)))]
+    with pytest.raises(
+        CameraError, match=r"ROS topics \(/lidar/image \.\.\.\) without depth"
+    ):
+        open_camera(driver.write())
+
+
 @pytest.mark.parametrize(
     ("model", "message"),
     [("equidistant", "fisheye"), ("rational_polynomial", None)],

@@ -211,7 +211,7 @@ def place(camera: Camera, name: str, distance_m: float) -> Iterator[Camera]:
     yield camera
 
 
-def described(camera: Camera, where: str, without: str) -> str:
+def camera_line(camera: Camera, where: str, without: str) -> str:
     """A camera's figures in a line; without: what is said of a baseline that it does not have."""
     depth, color, baseline_m = camera.depth, camera.color, camera.baseline_m
     colour = f"colour {color.width}x{color.height}" if color else "no colour"

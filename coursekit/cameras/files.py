@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from coursekit import checks, results
 from coursekit.arrays import AnyArray, Floats, NDArray
 from coursekit.cameras import recording
-from coursekit.cameras.camera import Camera, described
+from coursekit.cameras.camera import Camera, camera_line
 from coursekit.cameras.frames import FRAMES_PER_S, NO_DEPTH, CameraError, Description, Frame
 from coursekit.cameras.librealsense import LibraryMissing
 from coursekit.cameras.realsense import RealSense, shortest_decimal
@@ -76,7 +76,7 @@ class RosBag(Camera):
             self._describe(reader)
 
     def __repr__(self) -> str:
-        return described(self, f"recording {self._path.name}, read by rosbags", "unknown")
+        return camera_line(self, f"recording {self._path.name}, read by rosbags", "unknown")
 
     @contextlib.contextmanager
     def _reader(self) -> Iterator[Any]:
@@ -146,9 +146,9 @@ class RosBag(Camera):
             name, stamp = self._names[topic], message.header.stamp
             counts[name] += 1
             number, time_s = counts[name], stamp.sec + 1e-9 * stamp.nanosec
-            pairs = numbered.get((topic.partition("/image")[0], at_ns))
-            if pairs and "Frame number" in pairs:
-                number, time_s = int(pairs["Frame number"]), float(pairs["timestamp"]) / 1000.0
+            said = numbered.get((topic.partition("/image")[0], at_ns), {})
+            if "Frame number" in said:
+                number, time_s = int(said["Frame number"]), float(said["timestamp"]) / 1000.0
             elif topic.startswith("/device_"):
                 number = message.header.seq
             yield name, _Shot(message, time_s, number)
@@ -403,7 +403,7 @@ class ImageFolder(Camera):
         self.source, self.serial, self.color, self.T_color_depth = "recorded", "", None, None
 
     def __repr__(self) -> str:
-        return described(self, f"{self._what}, {counted(len(self._images), 'image')}", "none")
+        return camera_line(self, f"{self._what}, {counted(len(self._images), 'image')}", "none")
 
     def stream(self) -> Generator[Frame, None, None]:
         import cv2

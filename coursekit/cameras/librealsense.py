@@ -48,8 +48,9 @@ def load_librealsense() -> ModuleType:
     except ModuleNotFoundError:
         raise LibraryMissing(
             "pyrealsense2 is not installed, so no RealSense can be opened and nothing recorded: "
-            "`pip install -r requirements-camera.txt` installs it on x86-64 Linux and Windows; there "
-            "is none for macOS and most ARM computers, where recordings and the simulated camera work"
+            "`pip install -r requirements-camera.txt` installs it on x86-64 Linux and Windows; "
+            "there is none for macOS and most ARM computers, where recordings and the simulated "
+            "camera work"
         ) from None
     except ImportError as error:
         raise LibraryMissing(

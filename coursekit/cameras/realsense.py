@@ -17,7 +17,7 @@ import numpy as np
 from coursekit import specifications
 from coursekit.arrays import AnyArray, Image
 from coursekit.cameras import recording
-from coursekit.cameras.camera import Camera, described
+from coursekit.cameras.camera import Camera, camera_line
 from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Frame
 from coursekit.cameras.librealsense import device_info, load_librealsense, start_problem
 from coursekit.geometry import Intrinsics, make_transform
@@ -183,7 +183,7 @@ class RealSense(Camera):
 
     def __repr__(self) -> str:
         where = f"recording {self._path.name}" if self._path else f"live, serial {self.serial}"
-        return described(self, where, "unknown")
+        return camera_line(self, where, "unknown")
 
     # --- frames --------------------------------------------------------------------------------
 
