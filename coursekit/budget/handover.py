@@ -44,7 +44,7 @@ NEEDED: dict[str, tuple[str, ...]] = {  # by notebook; "a|b": either
 BY_SIGMA = ("03_intrinsics", "04_hand_eye")  # their sigmas are the rows; without they say nothing
 TOGETHER = ("01_pinhole", "03_intrinsics", "04_hand_eye")  # all of it from one place, or none
 LAW = "depth_bias"  # the name in the file of the covariance of s and o
-FIXED = "eye_to_hand"
+STANDING = "eye_to_hand"
 COVARIANCE_OF = {"03_intrinsics": "intrinsics", "04_hand_eye": "X"}  # its name in the file
 USUAL_DEPTH_SIZE = (848, 480)  # of the depth image, where notebook 1 did not keep it
 
@@ -202,7 +202,7 @@ class HandOver:
         baseline_m = 1e-3 * self._also("01_pinhole", "baseline", usual_mm)
         return View(Intrinsics(width, height, fx, fy, cx, cy), LESSON_DISTANCE_M, baseline_m)
 
-    def terms(self, subtract_depth_bias: bool = False, mount: str = FIXED) -> tuple[ErrorTerm, ...]:
+    def terms(self, subtract_depth_bias: bool = False, mount: str = STANDING) -> tuple[ErrorTerm, ...]:
         """The rows, each with its source.
 
         subtract_depth_bias: as if every depth were corrected by the bias that notebook 2 measured,
@@ -335,7 +335,7 @@ class HandOver:
         fixed, of = notebook.result().eye_to_hand, notebook.result().quantities["tx"].note
         order = [known.names.index(name) for name in MOUNT_TWIST]
         variances = np.diag(known.matrix)[order] * np.repeat([math.radians(1.0), 1e-3], 3) ** 2
-        if mount == FIXED and fixed is not None and fixed.covariance is not None:
+        if mount == STANDING and fixed is not None and fixed.covariance is not None:
             variances, of = np.diag(fixed.covariance), fixed.mount
         turn, shift = (SIGMAS * math.sqrt(part.mean()) for part in np.split(variances, 2))
         whose = notebook.whose() + f", {of.replace('_', ' ')}" * bool(of)

@@ -106,7 +106,7 @@ def _tilted(degrees: float, sign: float = 1.0) -> tuple[float, float, float]:
     return sign * math.sin(math.radians(degrees)), math.cos(math.radians(degrees)), 0.0
 
 
-LENGTHS: Rows = [
+LESSON_ROWS: Rows = [
     (1.0, 1.0, None, "noise"),
     (0.7, 0.7, None, "noise"),
     (2.0, 6.0, None, "bias"),
@@ -133,8 +133,8 @@ ADD_UP = Exercise(
         "order": lambda *sums: np.array(sums),
     },
     cases=[
-        (LENGTHS[1:4], 5.0),
-        (LENGTHS, 7.0),
+        (LESSON_ROWS[1:4], 5.0),
+        (LESSON_ROWS, 7.0),
         ([(0.6, 0.6, None, "noise"), (1.5, 1.5, _tilted(60, -1), "noise"),
           (1.0, 4.0, _tilted(25, -1), "bias"), (1.0, 3.0, _tilted(40), "bias"),
           (0.0, 2.0, None, "bias")], 3.0),
