@@ -6,9 +6,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.ticker import MultipleLocator
+from mpl_toolkits.mplot3d import proj3d
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from scipy.spatial.transform import Rotation
 
 from coursekit.arrays import ArrayLike, Floats
+from coursekit.geometry import deproject, transform_points
 from coursekit.hand_eye import StudyPoint
 from coursekit.plots.style import (
     COLORS,
@@ -16,68 +20,97 @@ from coursekit.plots.style import (
     STYLES,
     LessonFigure,
     cross,
+    figure,
     panels,
     plain_ticks,
     single,
 )
 from coursekit.simulation.arm_poses import Setup
 
-AXIS_M = 0.09  # how long a frame's axes are drawn
+VIEW_M = 0.16  # how far the camera's pyramid is drawn
+ROOM_M = ((-0.30, 0.66), (-0.36, 0.36), (0.0, 0.84))  # x, y, z of the base that is shown
+CLEAR_PX = 13.0  # around a letter
 
 
-def mounts(setups: Mapping[str, Setup], joints: Mapping[str, ArrayLike]) -> LessonFigure:
-    """Rigs from the side, at true scale: the arm's links, the camera's view, the board.
+def mounts(
+    setups: Mapping[str, Setup], joints: Mapping[str, ArrayLike], view_from_deg: float = -65.0
+) -> LessonFigure:
+    """Rigs in space, at true scale: the arm, the camera's view, the board, and T, X and C.
 
-    joints: the joint angles (6,), rad, at which each rig is drawn. Seen from the arm's right, so
-    x of the base points to the right and z up.
+    joints: the joint angles (6,), rad, at which each rig is drawn. view_from_deg: from where, about
+    the vertical: -90 has x of the base to the right, 0 looks along it.
     """
-    fig, axes = panels(len(setups), len(setups), 9.6, 4.4, sharey=True)
-    for ax, (name, setup) in zip(axes, setups.items(), strict=True):
-        _side_view(ax, setup, np.asarray(joints[name], float))
-        ax.set_title(name)
-        ax.label_outer()
+    fig = figure(10.0, 4.9)
+    fig.set_layout_engine("none")  # the 3-D axes reserve far more room than they use
+    texts = []
+    for k, (name, setup) in enumerate(setups.items()):
+        ax: Any = fig.add_axes((k / len(setups), 0.0, 0.98 / len(setups), 1.0), projection="3d")
+        limits = dict(zip(("xlim", "ylim", "zlim"), ROOM_M, strict=True))
+        ax.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)", **limits)
+        ax.set_box_aspect(np.ptp(ROOM_M, axis=1), zoom=0.96)
+        for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
+            axis.set_major_locator(MultipleLocator(0.3))
+        ax.view_init(elev=18, azim=view_from_deg)
+        ax.set_title(name, y=0.94)
+        lengths = _rig(ax, setup, np.asarray(joints[name], float))
+        texts.append(f"{name}: " + ", ".join(f"{k} {v:.2f} m" for k, v in lengths.items()))
     return fig.saying(
-        "Side views at true scale: with the camera on the wrist it looks along the gripper at a "
-        "board on the table; with the camera over the shoulder it looks down at a board in the "
-        "gripper."
+        "Two rigs in space with the arrows T (base to gripper), X (to the camera) and C (camera to "
+        "board), at true scale. " + "; ".join(texts)
     )
 
 
-def _side_view(ax: Any, setup: Setup, q: Floats) -> None:
-    T_base_gripper = setup.arm.forward(q)
+def _rig(ax: Any, setup: Setup, q: Floats) -> dict[str, float]:
+    """The arm, the board, what the camera sees, and the three arrows; their lengths, m."""
+    gripper, on_wrist = setup.arm.forward(q), setup.mount == "eye_in_hand"
+    camera = gripper @ setup.X if on_wrist else setup.X
+    board, base = setup.Y if on_wrist else gripper @ setup.Y, np.eye(4)
     links = setup.arm.link_frames(q)[:, :3, 3]
-    chain = np.concatenate([[[0.0, 0.0, 0.0]], links, T_base_gripper[None, :3, 3]])
-    ax.plot(chain[:, 0], chain[:, 2], "o-", color=COLORS["block"], lw=5, ms=7)
-    on_wrist = setup.mount == "eye_in_hand"
-    T_base_camera = T_base_gripper @ setup.X if on_wrist else setup.X
-    T_base_board = setup.Y if on_wrist else T_base_gripper @ setup.Y
-    rim = setup.board.points[[0, setup.board.corners[0] - 1, -1, -setup.board.corners[0]]]
-    board = rim @ T_base_board[:3, :3].T + T_base_board[:3, 3]
-    ax.plot(*board[[0, 1, 2, 3, 0]][:, [0, 2]].T, color=COLORS["ink"], lw=3)
-    ax.annotate("board", board[2, [0, 2]], (8, 8), textcoords="offset points")
-    eye = T_base_camera[:3, 3]
-    for corner in board:
-        ax.plot(*np.array([eye, corner])[:, [0, 2]].T, color=COLORS["color"], lw=0.8)
-    for T, label, offset in (
-        (np.eye(4), "base", (-10, -16)),
-        (T_base_gripper, "gripper", (10, -18)),
-        (T_base_camera, "camera", (-34, 16)),
-    ):
-        _axes(ax, T)
-        ax.annotate(label, T[[0, 2], 3], offset, textcoords="offset points", fontsize=10,
-                    bbox={"fc": "white", "ec": "none", "alpha": 0.7, "pad": 1})  # fmt: skip
-    ax.axhline(0, color=COLORS["faint"], lw=1)
-    ax.set(aspect="equal", xlabel="x of the base (m)", ylabel="z of the base (m)",
-           xlim=(-0.3, 0.75), ylim=(-0.08, 0.9))  # fmt: skip
+    chain = np.concatenate([np.zeros((1, 3)), links, gripper[None, :3, 3]])
+    ax.plot(*chain.T, "o-", color=COLORS["block"], lw=5, ms=7)
+    rim = transform_points(board, setup.board.outline)
+    ax.add_collection3d(Poly3DCollection([rim], fc=COLORS["cube"], ec=COLORS["ink"], alpha=0.5))
+    wide, high = setup.intrinsics.size
+    pixels = np.array([(0, 0), (wide, 0), (wide, high), (0, high)], float)
+    far = deproject(pixels, np.full(4, VIEW_M), setup.intrinsics.K)
+    view = transform_points(camera, np.vstack([far, np.zeros(3)]))[[0, 1, 2, 3, 0, 4, 1, 4, 2, 4, 3]]
+    ax.plot(*view.T, color=COLORS["color"], lw=1.2)
+    arrows = {
+        "T": (base, gripper, "model"),
+        "X": (gripper if on_wrist else base, camera, "measured"),
+        "C": (camera, board, "truth"),
+    }
+    ends = [np.stack([start[:3, 3], end[:3, 3]]) for start, end, _ in arrows.values()]
+    taken = [_on_page(ax, line) for line in (chain, rim[[0, 1, 2, 3, 0]], view, *ends)]
+    for (name, (*_, color)), line in zip(arrows.items(), taken[3:], strict=True):
+        place = _arrow(ax, name, line[0], line[-1], COLORS[color], np.concatenate(taken))
+        taken.append(place)
+    lengths = [float(np.linalg.norm(end - start)) for start, end in ends]
+    return dict(zip(arrows, lengths, strict=True))
 
 
-def _axes(ax: Any, T: Floats) -> None:
-    """A frame's x and z axis as they look from the side."""
-    at = T[[0, 2], 3]
-    for column, color in ((0, "measured"), (2, "model")):
-        tip = at + AXIS_M * T[[0, 2], column]
-        ax.annotate("", tip, at, arrowprops={"arrowstyle": "-|>", "color": COLORS[color], "lw": 2})
-        ax.annotate("xyz"[column], tip, color=COLORS[color], fontweight="bold", fontsize=10)
+def _on_page(ax: Any, line: Floats) -> Floats:
+    """Points along a line through (n, 3), m, as (m, 2) px on the page."""
+    steps = np.linspace(0, len(line) - 1, 30 * (len(line) - 1) + 1)
+    points = [np.interp(steps, np.arange(len(line)), column) for column in line.T]
+    flat = proj3d.proj_transform(*points, ax.get_proj())[:2]
+    return np.asarray(ax.transData.transform(np.transpose(flat)))
+
+
+def _arrow(ax: Any, name: str, start: Floats, end: Floats, color: str, taken: Floats) -> Floats:
+    """An arrow on the page, px, its letter where nothing else is; where that is, (1, 2)."""
+    head = {"arrowstyle": "-|>", "color": color, "lw": 2.2, "shrinkA": 0, "shrinkB": 0}
+    ax.annotate("", end, start, xycoords="figure pixels", textcoords="figure pixels",
+                arrowprops=head, zorder=10)  # fmt: skip
+    along = (end - start) / np.linalg.norm(end - start)
+    across = np.array([-along[1], along[0]])
+    sides = [side * away for away in np.arange(CLEAR_PX + 1, 80, 3) for side in (1, -1)]
+    places = np.array([(start + end) / 2 + side * across for side in sides])
+    room = np.linalg.norm(places[:, None] - taken, axis=2).min(axis=1)
+    place = places[np.argmax(room > CLEAR_PX) if (room > CLEAR_PX).any() else room.argmax()]
+    ax.annotate(name, place, xycoords="figure pixels", color=color, ha="center", va="center",
+                fontweight="bold", fontsize=13, zorder=11)  # fmt: skip
+    return place[None]
 
 
 def diversity(sessions: Mapping[str, Floats]) -> LessonFigure:
