@@ -435,6 +435,35 @@ def test_nonsense_is_refused_with_what_is_wanted(which):
         open_camera(which)
 
 
+def test_a_name_makes_a_unit_of_ones_own(monkeypatch, tmp_path):
+    monkeypatch.setenv("COURSEKIT_RESULTS", str(tmp_path / "results"))
+    monkeypatch.setenv("COURSEKIT_CAMERA", "simulated")
+    assert (ck.my_unit(), ck.my_unit(), open_camera().seed) == (7, 7, 7)
+    assert not (tmp_path / "results").exists()
+    mine = ck.my_unit("José Müller")
+    assert mine == ck.my_unit("  jose MÜLLER ") == ck.my_unit() == open_camera().seed == 60769597
+    assert open_camera("simulated", seed=8).seed == 8
+    assert open_camera().reveal() != open_camera(seed=7).reveal()
+    others = {ck.my_unit(f"Student {n}") for n in range(200)}
+    assert len(others) == 200
+    assert min(others) > 9_999_999  # far from the seeds that notebooks count up from
+
+
+def test_a_damaged_unit_says_what_to_do(monkeypatch, tmp_path):
+    monkeypatch.setenv("COURSEKIT_RESULTS", str(tmp_path))
+    for damaged in ("", "[]", "{}", '{"seed": "7"}', '{"seed": -1}', '{"seed": 7.5}'):
+        (tmp_path / "unit.json").write_text(damaged, encoding="utf-8")
+        with pytest.raises(ValueError, match=r'^unit\.json in results/ is .* ck\.my_unit\("your'):
+            open_camera("simulated")
+    assert open_camera("simulated", seed=7).seed == 7
+    assert ck.my_unit("Ada") == ck.my_unit()
+    for nameless in (" ", "!?"):
+        with pytest.raises(ValueError, match=r"^name: got .*, want one with letters"):
+            ck.my_unit(nameless)
+    with pytest.raises(ValueError, match=r"^name: got int, want str"):
+        ck.my_unit(7)
+
+
 def test_opening_the_simulated_camera_loads_no_hardware_library():
     code = (
         "import sys, coursekit as ck; ck.open_camera('simulated').depth; "
