@@ -800,7 +800,7 @@ class HandEyeResult(Estimate):
             lines.append(wrapped(f"NOT DETERMINED: {'; '.join(self.free)}", indent=""))
         lines.append(f"residuals: {pixels}{self.rms_mm:.2f} mm at the board (rms)")
         lines.append(
-            f"spread: {self.spread_board_mm:.2f} mm of the board on its stand, "
+            f"spread: {self.spread_board_mm:.2f} mm of the board in the {name_Y.split('_')[1]}, "
             f"{self.spread_gripper_mm:.2f} mm and {self.spread_gripper_deg:.3f} deg of the gripper"
         )
         return "\n".join(lines)

@@ -209,6 +209,17 @@ def hand_eye_session(
     return _reported(truth, q, dq, Detections(found)), truth
 
 
+def unknown_sessions(seed: int) -> dict[str, HandEyeSession]:
+    """Three sessions with the camera on the wrist, each with one mistake for somebody to find."""
+    mistakes = {
+        "P": HandEyeMistakes(square_scale=1.05),
+        "Q": HandEyeMistakes(inverted_poses=True),
+        "R": HandEyeMistakes(slip_m=0.005),
+    }
+    made = {name: hand_eye_session("eye_in_hand", seed, mistakes=m) for name, m in mistakes.items()}
+    return {name: session for name, (session, _) in made.items()}
+
+
 def rendered_session(
     mount: Mount, seed: int, n: int = 20, arm_errors: ArmErrors | None = None
 ) -> tuple[HandEyeSession, HandEyeTruth, list[Grey]]:
