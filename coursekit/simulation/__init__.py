@@ -10,6 +10,7 @@ from coursekit.simulation.arm_sessions import (
     shared_target,
     touch_corners,
     truth_of,
+    unknown_sessions,
 )
 from coursekit.simulation.corner_sessions import Effects, corner_session
 from coursekit.simulation.rig import Rig, RigView, cost_curve, match

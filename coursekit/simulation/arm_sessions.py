@@ -209,16 +209,36 @@ def hand_eye_session(
     return _reported(truth, q, dq, Detections(found)), truth
 
 
+def unknown_sessions(seed: int) -> dict[str, HandEyeSession]:
+    """Three sessions with the camera on the wrist, each with one mistake for somebody to find."""
+    mistakes = {
+        "P": HandEyeMistakes(square_scale=1.05),
+        "Q": HandEyeMistakes(inverted_poses=True),
+        "R": HandEyeMistakes(slip_m=0.005),
+    }
+    made = {name: hand_eye_session("eye_in_hand", seed, mistakes=m) for name, m in mistakes.items()}
+    return {name: session for name, (session, _) in made.items()}
+
+
 def rendered_session(
-    mount: Mount, seed: int, n: int = 20, arm_errors: ArmErrors | None = None
+    mount: Mount,
+    seed: int,
+    n: int = 20,
+    arm_errors: ArmErrors | None = None,
+    progress: bool = False,
 ) -> tuple[HandEyeSession, HandEyeTruth, list[Grey]]:
     """A healthy session of rendered images (h, w), whose corners `boards.detect` found.
 
-    As `hand_eye_session`, at about 0.1 s an image. Raises BoardNotFound where the board is not
-    found in one, which the poses are chosen to avoid.
+    As `hand_eye_session`, at about 0.1 s an image, with a bar of progress if asked. Raises
+    BoardNotFound where the board is not found in one, which the poses are chosen to avoid.
     """
     truth, q, dq = _poses(mount, seed, n, arm_errors, HandEyeMistakes())
-    images, board = list(images_of(truth, seed)), truth.setup.board
+    from tqdm.auto import tqdm
+
+    rendered = tqdm(
+        images_of(truth, seed), total=n, unit="image", leave=False, disable=not progress
+    )
+    images, board = list(rendered), truth.setup.board
     found = [detect(image, board, f"view_{i:02d}") for i, image in enumerate(images)]
     return _reported(truth, q, dq, Detections(found)), truth, images
 
@@ -234,7 +254,7 @@ def session_folder(mount: Mount, seed: int, into: str | os.PathLike[str]) -> Pat
         card = folder / SESSION
         if card.is_file() and json.loads(card.read_text("utf-8"))["seed"] == seed:
             return folder
-    session, _, images = rendered_session(mount, seed, FOLDER_VIEWS, ArmErrors())
+    session, _, images = rendered_session(mount, seed, FOLDER_VIEWS, ArmErrors(), True)
     names = tuple(f"{name}.jpg" for name in session.names)
     encoded = (cv2.imencode(".jpg", image, JPEG)[1].tobytes() for image in images)
     about = {
