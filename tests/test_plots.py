@@ -331,7 +331,7 @@ def hand_eye_figures() -> dict[str, plots.LessonFigure]:
         "diversity": hand_eye.diversity({"this session": session.T_base_gripper}),
         "study": hand_eye.study(error_study(trials=5)),
         "more_poses": hand_eye.more_poses(counts, {"a": [3.0, 2.9]}, {"a": [1.0, 0.7]}),
-        "evidence": hand_eye.evidence(unknown_sessions(11)),
+        "agreement": hand_eye.agreement(unknown_sessions(11)),
         "gaps": hand_eye.gaps([1.0, 2.0, 2.0], [False, False, True]),
         "touched": hand_eye.touched([[1.0, -1.0, 0.5], [2.0, 0.0, 0.1]]),
     }
