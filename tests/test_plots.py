@@ -149,8 +149,10 @@ def test_point_cloud_shows_what_is_near_from_the_side_if_there_is_anything() -> 
     near[200:280, 300:500] = 0.45
     cases = ((near, (0.45, 0.45), True), (np.full_like(near, 0.9), (0.9, 0.9), False))
     for depth, shown, says in cases:
-        solid, above = pinhole.point_cloud(geometry.deproject_image(depth, D435.depth)).axes
+        solid, above, _ = pinhole.point_cloud(geometry.deproject_image(depth, D435.depth)).axes
         (dots,) = solid.collections
+        if says:  # one colour, one depth
+            assert dots.get_clim() == above.collections[0].get_clim() == pytest.approx((0.45, 0.9))
         z = np.asarray(dots._offsets3d[1])
         assert (z.min(), z.max()) == pytest.approx(shown)
         assert ("Z < 0.6 m" in solid.get_title()) == says
@@ -331,7 +333,7 @@ def hand_eye_figures() -> dict[str, plots.LessonFigure]:
         "diversity": hand_eye.diversity({"this session": session.T_base_gripper}),
         "study": hand_eye.study(error_study(trials=5)),
         "more_poses": hand_eye.more_poses(counts, {"a": [3.0, 2.9]}, {"a": [1.0, 0.7]}),
-        "evidence": hand_eye.evidence(unknown_sessions(11)),
+        "agreement": hand_eye.agreement(unknown_sessions(11)),
         "gaps": hand_eye.gaps([1.0, 2.0, 2.0], [False, False, True]),
         "touched": hand_eye.touched([[1.0, -1.0, 0.5], [2.0, 0.0, 0.1]]),
     }

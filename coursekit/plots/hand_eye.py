@@ -27,7 +27,7 @@ from coursekit.plots.style import (
 from coursekit.simulation.arm_poses import Setup
 
 VIEW_M = 0.16  # how far the camera's pyramid is drawn
-ROOM_M = ((-0.30, 0.66), (-0.36, 0.36), (0.0, 0.84))  # x, y, z of the base that is shown
+SPACE_M = ((-0.30, 0.66), (-0.36, 0.36), (0.0, 0.84))  # x, y, z of the base that is shown
 CLEAR_PX = 13.0  # around a letter
 
 
@@ -44,9 +44,9 @@ def mounts(
     texts = []
     for k, (name, setup) in enumerate(setups.items()):
         ax: Any = fig.add_axes((k / len(setups), 0.0, 0.98 / len(setups), 1.0), projection="3d")
-        limits = dict(zip(("xlim", "ylim", "zlim"), ROOM_M, strict=True))
+        limits = dict(zip(("xlim", "ylim", "zlim"), SPACE_M, strict=True))
         ax.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)", **limits)
-        ax.set_box_aspect(np.ptp(ROOM_M, axis=1), zoom=0.96)
+        ax.set_box_aspect(np.ptp(SPACE_M, axis=1), zoom=0.96)
         for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
             axis.set_major_locator(MultipleLocator(0.3))
         ax.view_init(elev=18, azim=view_from_deg)
@@ -148,7 +148,7 @@ def diversity(sessions: Mapping[str, Floats]) -> LessonFigure:
     )
 
 
-def evidence(sessions: Mapping[str, HandEyeSession]) -> LessonFigure:
+def agreement(sessions: Mapping[str, HandEyeSession]) -> LessonFigure:
     """Three things that a session shows before anybody believes its X, a row for each session.
 
     From all pairs of poses how far gripper and camera turned (deg) and how far each moved along the

@@ -56,7 +56,14 @@ SIMULATED = "simulated"  # what session.json calls its source
 WHOSE_LENS: dict[Mount, str] = {"eye_in_hand": "D405", "eye_to_hand": "D435"}
 FOLDER_VIEWS = 20
 # Progressive: the same pixels in a tenth less space.
-JPEG = [cv2.IMWRITE_JPEG_QUALITY, 92, cv2.IMWRITE_JPEG_OPTIMIZE, 1, cv2.IMWRITE_JPEG_PROGRESSIVE, 1]
+JPEG_OPTIONS = [
+    cv2.IMWRITE_JPEG_QUALITY,
+    92,
+    cv2.IMWRITE_JPEG_OPTIMIZE,
+    1,
+    cv2.IMWRITE_JPEG_PROGRESSIVE,
+    1,
+]
 FOLDER_ORIGIN = (
     "Rendered by coursekit.simulation.session_folder: a WidowX AI with hidden errors, its seed as "
     "given, stops at each pose; the lens is this device's colour camera, and the intrinsics given "
@@ -256,7 +263,7 @@ def session_folder(mount: Mount, seed: int, into: str | os.PathLike[str]) -> Pat
             return folder
     session, _, images = rendered_session(mount, seed, FOLDER_VIEWS, ArmErrors(), True)
     names = tuple(f"{name}.jpg" for name in session.names)
-    encoded = (cv2.imencode(".jpg", image, JPEG)[1].tobytes() for image in images)
+    encoded = (cv2.imencode(".jpg", image, JPEG_OPTIONS)[1].tobytes() for image in images)
     about = {
         "camera": f"Simulated {WHOSE_LENS[mount]}",
         "source": SIMULATED,
