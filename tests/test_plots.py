@@ -148,8 +148,10 @@ def test_point_cloud_shows_what_is_near_from_the_side_if_there_is_anything() -> 
     near[200:280, 300:500] = 0.45
     cases = ((near, (0.45, 0.45), True), (np.full_like(near, 0.9), (0.9, 0.9), False))
     for depth, shown, says in cases:
-        solid, above = pinhole.point_cloud(geometry.deproject_image(depth, D435.depth)).axes
+        solid, above, _ = pinhole.point_cloud(geometry.deproject_image(depth, D435.depth)).axes
         (dots,) = solid.collections
+        if says:  # one colour, one depth
+            assert dots.get_clim() == above.collections[0].get_clim() == pytest.approx((0.45, 0.9))
         z = np.asarray(dots._offsets3d[1])
         assert (z.min(), z.max()) == pytest.approx(shown)
         assert ("Z < 0.6 m" in solid.get_title()) == says
