@@ -101,7 +101,7 @@ def entries_of_K(scene: tuple[Box, ...], camera: Intrinsics, **moved: float) -> 
     moved: new values, px, of fx, fy, cx or cy. Raises ValueError for another name.
     """
     changed = Intrinsics.from_dict(camera.to_dict() | moved)
-    fig, ax = single(8.0, 4.8)
+    fig, ax = single(7.0, 4.1)
     for intrinsics, color, style, name in (
         (camera, COLORS["model"], "-", "K of the camera"),
         (changed, COLORS["measured"], "--", "your K"),
