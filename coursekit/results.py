@@ -52,6 +52,18 @@ class MeasuringCamera(Protocol):
 
 
 @dataclass(frozen=True)
+class Origin:
+    """What stands in for a camera where somebody else's took the images: photographs in a folder.
+
+    >>> Origin("photographs in desk").source
+    'recorded'
+    """
+
+    name: str
+    source: Source = "recorded"
+
+
+@dataclass(frozen=True)
 class Quantity:
     """A number with its unit.
 

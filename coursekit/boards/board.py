@@ -371,9 +371,15 @@ class Detections(Listed[Detection]):
         lines += [f"  {view!r}" for view in self[:LISTED]]
         if len(self) > LISTED:
             lines.append(f"  and {len(self) - LISTED} more")
-        lines += [f"  not used: {skip!r}" for skip in self.skipped[:LISTED_SKIPPED]]
-        if len(self.skipped) > LISTED_SKIPPED:
-            lines.append(f"  and {len(self.skipped) - LISTED_SKIPPED} more not used")
+        alike: dict[str, list[Skipped]] = {}  # by the reason, which is often that of all
+        for skip in self.skipped:
+            alike.setdefault(skip.reason, []).append(skip)
+        lines += [
+            f"  not used: {first!r}" + f" (and {len(others)} more)" * bool(others)
+            for first, *others in list(alike.values())[:LISTED_SKIPPED]
+        ]
+        if len(alike) > LISTED_SKIPPED:
+            lines.append(f"  and others, for {len(alike) - LISTED_SKIPPED} more reasons")
         return "\n".join(lines)
 
 

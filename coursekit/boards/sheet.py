@@ -28,7 +28,7 @@ BAR_MM = 100.0
 MM_PER_INCH = 25.4
 ADVICE = """\
 Print at 100 % (no "fit to page"). The bar must measure 100 mm; if not, use the measured square.
-Glue it dead flat to glass or aluminium: 1 mm of bow spoils fx by 2 %."""
+Glue it dead flat to glass or aluminium: 1 mm of bow spoils fx by 3 %."""
 
 
 def save_sheet(
