@@ -7,9 +7,10 @@ from pathlib import Path
 
 from coursekit.cameras import conventions
 from coursekit.cameras.camera import Camera, place
+from coursekit.cameras.files import ImageFolder, RecordedSet, RosBag, play
 from coursekit.cameras.frames import CameraError, Frame, Frames
 from coursekit.cameras.librealsense import LibraryMissing, connected_realsenses
-from coursekit.cameras.realsense import ImageFolder, RealSense, RecordedSet
+from coursekit.cameras.realsense import RealSense
 from coursekit.cameras.recording import INDEX, INTRINSICS
 from coursekit.cameras.simulated import PLUG_IN, SimulatedCamera, my_unit
 
@@ -19,7 +20,7 @@ __all__ = [
 
 VARIABLE = "COURSEKIT_CAMERA"
 CAMERA_NAMES = (
-    'want "auto", "simulated", a serial number, the path of a .db3 or .bag recording, '
+    'want "auto", "simulated", a serial number, the path of a .db3, .bag or .mcap recording, '
     "or a folder of them or of depth images"
 )
 
@@ -88,6 +89,8 @@ def _live(serial: str, infrared: bool) -> Camera:
 def _recording(path: Path) -> Camera:
     path = path.expanduser()
     if not path.is_dir():
-        return RealSense(path=path)
+        return play(path)
+    if (path / "metadata.yaml").exists():  # what `ros2 bag record` makes
+        return RosBag(path)
     images = (path / INTRINSICS).exists() or any(path.glob("*.png"))
     return ImageFolder(path) if images and not (path / INDEX).exists() else RecordedSet(path)

@@ -211,6 +211,17 @@ def place(camera: Camera, name: str, distance_m: float) -> Iterator[Camera]:
     yield camera
 
 
+def camera_line(camera: Camera, where: str, without: str) -> str:
+    """A camera's figures in a line; without: what is said of a baseline that it does not have."""
+    depth, color, baseline_m = camera.depth, camera.color, camera.baseline_m
+    colour = f"colour {color.width}x{color.height}" if color else "no colour"
+    baseline = without if baseline_m is None else f"{1000 * baseline_m:.1f} mm"
+    return (
+        f"{camera.name} ({where}): depth {depth.width}x{depth.height}, {colour}, "
+        f"baseline {baseline}, depth unit {1000 * camera.depth_scale_m:g} mm"
+    )
+
+
 def _lens_text(lens: Intrinsics) -> str:
     names = ("k1", "k2", "p1", "p2", "k3")
     coeffs = ", ".join(f"{n} {c:+.4f}" for n, c in zip(names, lens.coeffs, strict=True) if c)

@@ -113,7 +113,7 @@ def halves(
     total = first.covariance + second.covariance
     apart = np.array([second.value(name) - first.value(name) for name in first.names])
     known = len(apart)
-    alone = sum(r.sigma_px**2 * r.equations.shared_covariance[:known, :known] for r in both)
+    noise = [r.sigma_px**2 * r.equations.shared_covariance[:known, :known] for r in both]
     return HalvesDifference(
         first=first,
         second=second,
@@ -121,7 +121,7 @@ def halves(
         difference_px=difference.reshape(*shape, 2),
         expected_px=worst_direction(spread @ total @ np.swapaxes(spread, -1, -2)).reshape(shape),
         p_value=_wald(apart, total, min(first.dof, second.dof)),
-        noise_p_value=_wald(apart, alone, min(r.equations.dof for r in both)),
+        noise_p_value=_wald(apart, noise[0] + noise[1], min(r.equations.dof for r in both)),
     )
 
 
