@@ -190,7 +190,7 @@ def uncertainty(results: Mapping[str, IntrinsicsResult], range_m: float) -> Less
     """Maps of the standard deviation of a projected pixel, with one scale for all of them."""
     maps = {name: r.uncertainty_map(range_m, (30, 40)) for name, r in results.items()}
     ends = [f([f(m) for m in maps.values()]) for f in (np.nanmin, np.nanmax)]  # a lens may fold
-    fig, axes = panels(len(maps), len(maps), 3.1 * len(maps) + 0.7, 3.0)
+    fig, axes = panels(len(maps), len(maps), 3.1 * len(maps) + 0.7, 2.7)
     edge = [withStroke(linewidth=2.5, foreground=COLORS["ink"])]
     for ax, (name, sigma) in zip(axes, maps.items(), strict=True):
         width, height = results[name].intrinsics.size
@@ -204,8 +204,6 @@ def uncertainty(results: Mapping[str, IntrinsicsResult], range_m: float) -> Less
             text.set_path_effects(edge)
         image_axes(ax, width, height)
         ax.set_title(f"{name}: {np.nanmin(sigma):.2g} to {np.nanmax(sigma):.2g} px", fontsize=10)
-    for ax in axes[1:]:
-        ax.set_ylabel("")
     bar = fig.colorbar(shown, ax=axes, label="σ of a projected pixel (px)", shrink=0.9)
     plain_ticks(bar.ax.yaxis, LEVELS_PX)
     return fig.saying(
@@ -294,15 +292,12 @@ def rooms(results: Mapping[str, IntrinsicsResult]) -> LessonFigure:
     for bar, view, (name, result) in zip(bars, views, results.items(), strict=False):
         rms = result.per_view_rms_px
         bar.bar(np.arange(1, len(rms) + 1), rms, color=COLORS["measured"])
-        bar.set(ylim=(0, 3 * usual), xlabel="view (number)")
+        bar.set(ylim=(0, 3 * usual), xlabel="view (number)", ylabel="RMS (px)")
         bar.set_title(f"{name}: RMS {result.rms_px:.2f} px", fontsize=10)
         for at in np.flatnonzero(rms > 3 * usual):
             bar.annotate(f"{rms[at]:.1f} px", (at + 1, 3 * usual), (6, -4), va="top",
                          textcoords="offset points", fontsize=9)  # fmt: skip
         _pattern(view, result)
-    for row in rows:
-        row[0][0].set_ylabel("RMS (px)")
-        row[1][0].set_ylabel("v (px)")
     return fig.saying(
         "RMS of each view, and the residuals of the worst one, smoothed: "
         + "; ".join(
@@ -326,8 +321,8 @@ def _pattern(ax: Any, result: IntrinsicsResult) -> None:
     _arrows(ax, pixels, errors, times, width=0.007)
     middle, half = (pixels.min(axis=0) + pixels.max(axis=0)) / 2, np.ptp(pixels, axis=0) / 2
     width, height = 1.2 * max(half[0], half[1] / 0.75) * np.array([1, 0.75])  # all alike
-    ax.set(xlim=(middle[0] - width, middle[0] + width), aspect="equal", xlabel="u (px)",
-           ylim=(middle[1] + height, middle[1] - height))  # fmt: skip
+    (left, top), (right, bottom) = middle - (width, height), middle + (width, height)
+    ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="u (px)", ylabel="v (px)")
     ax.set_title(f"view {worst + 1}, arrows x{times:g}", fontsize=10)
 
 
