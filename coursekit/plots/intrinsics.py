@@ -320,8 +320,8 @@ def _pattern(ax: Any, result: IntrinsicsResult) -> None:
     ax.plot(*pixels.T, ".", ms=4, color=COLORS["model"])
     _arrows(ax, pixels, errors, times, width=0.007)
     middle, half = (pixels.min(axis=0) + pixels.max(axis=0)) / 2, np.ptp(pixels, axis=0) / 2
-    width, height = 1.2 * max(half[0], half[1] / 0.75) * np.array([1, 0.75])  # all alike
-    (left, top), (right, bottom) = middle - (width, height), middle + (width, height)
+    rim = 1.2 * max(half[0], half[1] / 0.75) * np.array([1, 0.75])  # of one shape in all of them
+    (left, top), (right, bottom) = middle - rim, middle + rim
     ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="u (px)", ylabel="v (px)")
     ax.set_title(f"view {worst + 1}, arrows x{times:g}", fontsize=10)
 
