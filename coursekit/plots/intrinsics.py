@@ -288,6 +288,8 @@ def rooms(results: Mapping[str, IntrinsicsResult]) -> LessonFigure:
     rows = [band.subplots(2, columns, height_ratios=(1, 2.4)) for band in bands]
     bars = np.concatenate([row[0] for row in rows])
     views = np.concatenate([row[1] for row in rows])
+    for empty in (*bars[n:], *views[n:]):
+        empty.set_visible(False)
     usual = float(np.median([np.median(r.per_view_rms_px) for r in results.values()]))
     for bar, view, (name, result) in zip(bars, views, results.items(), strict=False):
         rms = result.per_view_rms_px
