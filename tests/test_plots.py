@@ -89,7 +89,7 @@ def test_there_is_a_figure_of_every_function(figures) -> None:
         if function.__annotations__["return"] == "LessonFigure"
     }
     assert drawing == {name.partition(" ")[0] for name in figures}
-    assert len(drawing) == 39
+    assert len(drawing) == 38
 
 
 def test_similar_triangles_shows_f_x_over_z() -> None:
@@ -387,7 +387,6 @@ def error_budget_figures() -> dict[str, plots.LessonFigure]:
         "between_fingers": error_budget.between_fingers(
             budget.LESSON_GRIPPER, budget.CUBE, table.noise_covariance, (1.0, 2.0, 0.5), others
         ),
-        "distances": error_budget.distances(budget.best_distance(table)),
         "misses": error_budget.misses(missed),
     }
 
