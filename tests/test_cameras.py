@@ -429,6 +429,13 @@ def test_the_environment_variable_names_the_camera_of_auto(monkeypatch, tabletop
         open_camera()
 
 
+def test_what_the_factory_says_is_the_reference_of_notebook_01():
+    path = ck.specifications.DATA / "reference_results" / "01_pinhole.json"
+    stored = ck.results.read(path).quantities
+    del stored["one_pixel_at_450_mm"]
+    assert open_camera("simulated").factory_values() == stored
+
+
 @pytest.mark.parametrize("which", ["", "bogus", 7, None, b"a.db3", "Simulated"])
 def test_nonsense_is_refused_with_what_is_wanted(which):
     with pytest.raises(ValueError, match=r'^which: got .*, want "auto", "simulated", a serial'):

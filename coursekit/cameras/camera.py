@@ -15,6 +15,8 @@ from coursekit import checks
 from coursekit.cameras import recording
 from coursekit.cameras.frames import CameraError, Description, Frame, Frames
 from coursekit.geometry import Intrinsics
+from coursekit.results import Quantity
+from coursekit.words import counting
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,22 @@ class Camera(Description, ABC):
             'open_camera("simulated") opened can reveal it'
         )
 
+    def factory_values(self) -> dict[str, Quantity]:
+        """What the device says of itself, for `results.save`: nobody has told how uncertain it is.
+
+        depth_fx to color_cy, depth_width and depth_height in px; the baseline in mm.
+        """
+        says = {}
+        for name, lens in (("depth", self.depth), ("color", self.color)):
+            for entry in ("fx", "fy", "cx", "cy") if lens else ():
+                value, note = getattr(lens, entry), "factory, sigma not given"
+                says[f"{name}_{entry}"] = Quantity(value, "px", None, "bias", note)
+        for name, size in zip(("width", "height"), self.depth.size, strict=True):
+            says[f"depth_{name}"] = Quantity(size, "px")
+        if self.baseline_m is not None:
+            says["baseline"] = Quantity(1000 * self.baseline_m, "mm", None, "bias", "factory")
+        return says
+
     def frames(self, n: int = 1, progress: bool = True) -> Frames:
         """The next n frames; of a recording always its first n.
 
@@ -174,18 +192,16 @@ class Camera(Description, ABC):
         return index.folder
 
     def _take(self, n: int, progress: bool) -> Iterator[Frame]:
-        """Up to n frames with a progress bar; one printed line when a recording ends early."""
-        from tqdm.auto import tqdm
-
+        """Up to n frames, counted on a line; one printed line when a recording ends early."""
         count = 0
         with (
             contextlib.closing(self.stream()) as stream,
-            tqdm(total=n, unit="frame", leave=False, disable=not progress or n < 10) as bar,
+            counting(n, "frame", progress and n >= 10) as counts,
         ):
             for frame in itertools.islice(stream, n):
                 yield frame
                 count += 1
-                bar.update()
+                counts()
         if count < n:
             print(f"The recording ends after {count} of the {n} frames asked for.")
 
