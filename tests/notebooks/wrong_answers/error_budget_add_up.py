@@ -34,6 +34,9 @@ changed(
         "math.sqrt(noise2), worst -> noise2, worst": "noise_squared",
         "math.sqrt(quad2), p -> quad2, p": "quadrature_squared",
         "worst += high * c -> worst += low * c": None,
+        "worst += high * c -> worst += low * c and quad2 += (high * c) -> quad2 += (low * c)": (
+            "least_for_most"
+        ),
         "(low**2 + low * high + high**2) / 3 -> ((low + high) / 2) ** 2": "mean_squared",
         "(low**2 + low * high + high**2) / 3 -> high**2": "largest_squared",
         "(low**2 + low * high + high**2) / 3 -> (low**2 + high**2) / 2": "ends_squared",
@@ -82,6 +85,9 @@ changed(
         "np.where(free, 1 / 3, part**2) -> np.where(free, 1 / 2, part**2)": "half_for_third",
         "square[~noisy].sum() -> square.sum()": "noise_in_the_share",
         "bias = most[~noisy] -> bias = most": "noise_in_the_bias",
+        "bias = most[~noisy] -> bias = ((low + high) / 2 * part)[~noisy]": "middle_for_most",
+        "np.where(free, 1 / 3, part**2) -> np.where(free, 1 / 3, part)": "not_squared",
+        "noise = np.linalg.norm(most[noisy]) -> noise = np.linalg.norm(most)": "bias_in_the_noise",
         "noise = np.linalg.norm(most[noisy]) -> noise = most[noisy].sum()": "noise_added",
         "noise = np.linalg.norm(most[noisy]) -> noise = most[noisy].mean()": "noise_mean",
         "bias.sum(), np.linalg.norm(bias) -> np.linalg.norm(bias), np.linalg.norm(bias)": (
