@@ -241,9 +241,8 @@ def shown(image):
 def test_on_the_next_day_every_answer_and_every_figure_is_there(browser, server_at, page, name):
     """The copy is saved, its kernel ended, and opened again: nothing runs in it."""
     drawn = cell_with(page, "ck.drag(").count()
-    page.get_by_role("menuitem", name="File", exact=True).click()
-    page.locator("[data-command='docmanager:save']").click()
-    page.locator(".jp-mod-dirty").first.wait_for(state="detached")
+    with page.expect_response(lambda r: r.request.method == "PUT" and "/contents/" in r.url):
+        page.keyboard.press("Control+s")
     stop_kernel(page)
     page.close()
     later = open_page(browser, server_at.format(name, f"{name}-later"))
