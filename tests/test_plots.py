@@ -89,7 +89,7 @@ def test_there_is_a_figure_of_every_function(figures) -> None:
         if function.__annotations__["return"] == "LessonFigure"
     }
     assert drawing == {name.partition(" ")[0] for name in figures}
-    assert len(drawing) == 39
+    assert len(drawing) == 38
 
 
 def test_similar_triangles_shows_f_x_over_z() -> None:
@@ -279,13 +279,13 @@ def intrinsics_figures() -> dict[str, plots.LessonFigure]:
     return {
         "best_fits": intrinsics.best_fits(X, Y, {"30 deg": seen}, 600.0),
         "board": intrinsics.board(BOARD),
-        "views": intrinsics.views(SESSION, boards.detect_all(shipped, BOARD, False)),
+        "views": intrinsics.views(str(SESSION), boards.detect_all(shipped, BOARD, False)),
         "coverage": intrinsics.coverage(two["Q"]),
         "residuals": intrinsics.residuals(two["Q"]),
         "uncertainty": intrinsics.uncertainty(two, 0.45),
         "two_sessions": intrinsics.two_sessions(two),
         "rules": intrinsics.rules(two, 0.45),
-        "signature": intrinsics.signature(two),
+        "rooms": intrinsics.rooms(two),
         "power": intrinsics.power(stored_power()),
         "difference": intrinsics.difference(compare(two["Q"], D435.color)),
     }
@@ -387,7 +387,6 @@ def error_budget_figures() -> dict[str, plots.LessonFigure]:
         "between_fingers": error_budget.between_fingers(
             budget.LESSON_GRIPPER, budget.CUBE, table.noise_covariance, (1.0, 2.0, 0.5), others
         ),
-        "distances": error_budget.distances(budget.best_distance(table)),
         "misses": error_budget.misses(missed),
     }
 
