@@ -37,6 +37,11 @@ def test_record_writes_a_recording_and_says_how_to_play_it(tmp_path, capsys):
     assert cli.main([*arguments, "--overwrite"]) == 0
 
 
+def test_it_says_which_course_this_is(capsys):
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"coursekit {cli.doctor.edition()}\n"
+
+
 FAILURES = [
     ("record --out a.bag --frames 3 --camera simulated", "--out: got 'a.bag', want"),
     ("record --out a.db3 --frames 0 --camera simulated", "--frames: got 0, want a whole"),
