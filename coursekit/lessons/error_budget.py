@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -75,10 +76,17 @@ def _build_sums(steps: Mapping[str, Step]) -> Model:
         along = steps["along"]
         noises = [high * along(toward) for _, high, toward, _ in noise]
         most = [steps["most"](low, high, toward) * along(toward) for low, high, toward, _ in bias]
-        parts = [steps["third"]() if row[2] is None else along(row[2]) ** 2 for row in bias]
-        squares = [steps["square"](*row[:2]) * part for row, part in zip(bias, parts, strict=True)]
-        sigma = steps["sigma"](steps["rigs"](squares, noises), most)
-        sums = steps["noise"](noises), steps["worst"](most), steps["quadrature"](most)
+        squares, others = (
+            [
+                steps["square"](low, high) * steps["part"](toward, along)
+                for low, high, toward, _ in of
+            ]
+            for of in (bias, noise)
+        )
+        variance = steps["rigs"](squares, noises, others)
+        summed = steps["summed"](most, noises)
+        sums = steps["noise"](noises), steps["worst"](summed), steps["quadrature"](summed)
+        sigma = steps["sigma"](variance, most)
         return steps["order"](*sums, steps["share"](tolerance / sigma if sigma else math.inf))
 
     return add_up
@@ -91,6 +99,10 @@ def _sorted(rows: Rows) -> tuple[Rows, Rows]:
 
 def _along(toward: Any) -> float:
     return 1.0 if toward is None else abs(toward[0])
+
+
+def _part(toward: Any, along: Step, third: float = 1 / 3) -> float:
+    return third if toward is None else float(along(toward)) ** 2
 
 
 def _root(values: list[float]) -> float:
@@ -126,8 +138,9 @@ ADD_UP = Exercise(
         "worst": sum,
         "quadrature": _root,
         "square": lambda low, high: (low * low + low * high + high * high) / 3,
-        "third": lambda: 1 / 3,
-        "rigs": lambda squares, noises: sum(squares),
+        "part": _part,
+        "rigs": lambda squares, noises, others: sum(squares),
+        "summed": lambda most, noises: most,
         "sigma": lambda variance, most: math.sqrt(variance),
         "share": _beyond,
         "order": lambda *sums: np.array(sums),
@@ -161,18 +174,23 @@ def _third_of(toward: Any, value: float) -> float:
 
 
 ADD_UP.add_mistakes(
+    ("kinds", "kinds_exchanged", lambda rows: _sorted(rows)[::-1]),
     ("kinds", "noise_in_the_bias", lambda rows: (_sorted(rows)[0], rows)),
+    ("summed", "noise_in_the_bias", lambda most, noises: most + noises),
     ("kinds", "bias_in_the_noise", lambda rows: (rows, _sorted(rows)[1])),
     ("along", "not_projected", lambda toward: 1.0),
     ("along", "direction_sign", lambda toward: 1.0 if toward is None else toward[0]),
     ("along", "other_axis", lambda toward: 1.0 if toward is None else abs(toward[1])),
     ("along", "any_way_nothing", lambda toward: 0.0 if toward is None else abs(toward[0])),
     ("most", "third_of_the_worst", lambda low, high, toward: high * _third_of(toward, 3**-0.5)),
+    ("along", "third_of_the_worst", lambda toward: _third_of(toward, 3**-0.5)),
     ("most", "least_for_most", lambda low, high, toward: low),
     ("most", "middle_for_most", lambda low, high, toward: (low + high) / 2),
     ("noise", "noise_added", sum),
     ("noise", "noise_squared", lambda values: _root(values) ** 2),
+    ("noise", "squares_forgotten", lambda values: math.sqrt(sum(values))),
     ("noise", "noise_mean", lambda values: _root(values) / max(len(values), 1) ** 0.5),
+    ("noise", "noise_mean", lambda values: sum(values) / max(len(values), 1)),
     ("worst", "worst_in_quadrature", _root),
     ("quadrature", "quadrature_added", sum),
     ("quadrature", "quadrature_squared", lambda values: _root(values) ** 2),
@@ -180,10 +198,17 @@ ADD_UP.add_mistakes(
     ("square", "largest_squared", lambda low, high: high * high),
     ("square", "ends_squared", lambda low, high: (low * low + high * high) / 2),
     ("square", "spread_squared", lambda low, high: (high - low) ** 2 / 12),
-    ("third", "third_forgotten", lambda: 1.0),
-    ("third", "third_rooted", lambda: 3**-0.5),
-    ("third", "half_for_third", lambda: 0.5),
-    ("rigs", "noise_in_the_share", lambda squares, noises: sum(squares) + _root(noises) ** 2),
+    ("part", "third_forgotten", partial(_part, third=1.0)),
+    ("part", "third_rooted", partial(_part, third=3**-0.5)),
+    ("part", "half_for_third", partial(_part, third=0.5)),
+    ("part", "third_for_all", lambda toward, along: 1 / 3),
+    ("part", "not_squared", lambda toward, along: 1 / 3 if toward is None else along(toward)),
+    (
+        "rigs",
+        "noise_in_the_share",
+        lambda squares, noises, others: sum(squares) + _root(noises) ** 2,
+    ),
+    ("rigs", "noise_in_the_share", lambda squares, noises, others: sum(squares) + sum(others)),
     ("sigma", "variance_for_sigma", lambda variance, most: variance),
     ("sigma", "quadrature_for_sigma", lambda variance, most: _root(most)),
     ("sigma", "worst_for_sigma", lambda variance, most: sum(most)),
