@@ -410,6 +410,11 @@ def test_contrast_is_known_where_it_is_known():
     assert contrast("#777777", "#ffffff") == pytest.approx(4.48, abs=0.005)
 
 
+def test_every_line_of_a_figure_can_be_seen():
+    for name, color in COLORS.items():
+        assert name == "faint" or contrast(color, "#ffffff") >= 3, name
+
+
 def test_every_text_can_be_read_on_every_ground(style):
     texts, grounds = declared(style, "text"), declared(style, "ground")
     assert len(texts) >= 4

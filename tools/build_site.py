@@ -111,7 +111,7 @@ class Renderer(IPythonRenderer):
 
     def block_math(self, body: str) -> str:
         """A formula on a line of its own, which scrolls if it must."""
-        return f'<span class="formula">{mathml(body, display=True)}</span>'
+        return f'<span class="formula" tabindex="0">{mathml(body, display=True)}</span>'
 
     def latex_environment(self, name: str, body: str) -> str:
         """A LaTeX environment outside of dollar signs."""
@@ -123,7 +123,7 @@ class Renderer(IPythonRenderer):
 
     def table(self, text: str) -> str:
         """A table, which scrolls if it must."""
-        return f'<div class="table"><table>\n{text}</table></div>\n'
+        return f'<div class="table" tabindex="0"><table>\n{text}</table></div>\n'
 
     def link(self, text: str, url: str, title: str | None = None) -> str:
         """A link, to the page that its target becomes."""
@@ -218,7 +218,7 @@ def output_html(page: Page, cell: Cell, output: dict[str, Any]) -> str:
         return _figure(page, cell, output)
     if not text:
         return ""
-    return f'<pre class="output">{escape(text.rstrip())}</pre>\n'
+    return f'<pre class="output" tabindex="0">{escape(text.rstrip())}</pre>\n'
 
 
 def _figure(page: Page, cell: Cell, output: dict[str, Any]) -> str:
