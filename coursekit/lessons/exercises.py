@@ -9,15 +9,26 @@ lesson's module, and in its TOML file, under [mistakes], what the student will r
     PROJECT.add_mistakes(("read", "p1_p2_swapped", lambda k1, k2, p1, p2, k3: (k1, k2, p2, p1, k3)))
 
     p1_p2_swapped = ["your p1 and p2 are swapped", "Which of the two multiplies r² + 2x²?"]
+
+What nobody listed is left to a general device: it edits what goes into the right answer, into each
+of its steps and out of them (a sign, a factor, a column for another), and the source of each step
+(an operator, a bracket, a name for another), and keeps the first edit that alone gives the same
+numbers. Its words are in exercises.toml.
 """
 
 from __future__ import annotations
 
+import ast
+import inspect
 import itertools
+import re
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cache, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,7 +45,8 @@ Model = Callable[..., Any]
 class Mistake:
     """One wrong step: what it says to the learner, and a question that leads on.
 
-    One that stands `alone` is not tried together with others (one of a long family, say).
+    One that stands `alone` is not tried together with others (one of a long family, say). Without
+    a step, `wrong` is what is made of the whole function. One of the `device` is not listed.
     """
 
     name: str
@@ -43,6 +55,7 @@ class Mistake:
     step: str = ""
     wrong: Step = field(default=lambda: None)
     alone: bool = False
+    device: bool = False
 
 
 @dataclass(frozen=True)
@@ -88,6 +101,8 @@ class Exercise:
     _known: dict[tuple[int, ...], Floats | None] = field(
         default_factory=dict, init=False, repr=False
     )
+    _edits: list[list[Mistake]] = field(default_factory=list, init=False, repr=False)
+    _alone: list[Exercise] = field(default_factory=list, init=False, repr=False)  # the core
 
     @property
     def function(self) -> str:
@@ -108,7 +123,10 @@ class Exercise:
 
     def model(self, *mistakes: Mistake) -> Model:
         """The right function with these mistakes built in."""
-        return self.build(self.steps | {m.step: m.wrong for m in mistakes})
+        model = self.build(self.steps | {m.step: m.wrong for m in mistakes if m.step})
+        for mistake in mistakes:
+            model = model if mistake.step else mistake.wrong(model)
+        return model
 
     def check(self, function: Callable[..., Any]) -> Verdict:
         """The verdict on a learner's function; never raises, and notes the attempt."""
@@ -116,12 +134,19 @@ class Exercise:
 
     def judge(self, function: Callable[..., Any]) -> Verdict:
         """The verdict on a learner's function, without noting it."""
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return self._verdict(function)
+
+    def _verdict(self, function: Callable[..., Any]) -> Verdict:
         if not callable(function):
             return self._say("not attempted", f"got a {type(function).__name__}, not a function.")
         runs = [_run(function, args) for args in self.cases]
         if self.core and self._leaves_the_rest(self.core, function, runs):
-            cases = [args for args in self.cases if self.is_core(args)]
-            return replace(self, cases=cases, core=None, part_of=self).judge(function)
+            if not self._alone:
+                cases = [args for args in self.cases if self.is_core(args)]
+                self._alone.append(replace(self, cases=cases, core=None, part_of=self))
+            return self._alone[0]._verdict(function)
         unfinished = self._unfinished(runs)
         if unfinished:
             return unfinished
@@ -207,13 +232,42 @@ class Exercise:
                     seen = self._seen_in(first, mistakes, expected[first])
                     return self._several(seen, count, evidence)
                 return self._one(mistakes[0], count, evidence)
-        return self._say(
-            "wrong",
-            f"not right yet. {count}",
-            evidence,
-            "No single mistake that this check knows gives these numbers. Work this "
-            "case by hand, one step at a time, and compare.",
-        )
+        relation = self._relation(values, expected)
+        if relation:
+            return self._one(_device(*relation, "", replace), count, evidence)
+        text = f"not right yet. {count}"
+        return self._say("wrong", text, evidence, *self._right_parts(values, expected), BY_HAND)
+
+    def _relation(self, values: list[Floats], expected: list[Floats]) -> tuple[str, str] | None:
+        """What can be said of numbers that no model gives: they run away, or are proportional."""
+        both = list(zip(values, expected, strict=True))
+        if not self.nan_answers and not all(
+            (np.abs(v) <= 1e6 * (1 + np.abs(e).max())).all() for v, e in both
+        ):
+            return "runs_away", "your result"
+        factors = [float(np.vdot(e, v) / np.vdot(e, e)) for v, e in both]
+        first, off = factors[0], self.tolerance / 10
+        if not first or not all(
+            abs(abs(k) - abs(first)) < 1e-6 * abs(first) and np.allclose(v, k * e, 1e-6, off)
+            for k, (v, e) in zip(factors, both, strict=True)
+        ):
+            return None
+        if len({k > 0 for k in factors}) == 1:
+            return "factor", f"{first:.5g}"
+        return ("signs", "") if abs(abs(first) - 1) < 1e-6 else ("factor_and_signs", f"{first:.5g}")
+
+    def _right_parts(self, values: list[Floats], expected: list[Floats]) -> list[str]:
+        """Says which columns or numbers of the result are right in all cases, if some are."""
+        if min(e.ndim for e in expected) < 1 + bool(self.per_row):
+            return []
+        split = [[np.moveaxis(a, -bool(self.per_row), 0) for a in of] for of in (values, expected)]
+        pairs = (zip(v, e, strict=True) for v, e in zip(*split, strict=True))
+        right = [all(self._agrees(v, e) for v, e in part) for part in zip(*pairs, strict=True)]
+        if not any(right):
+            return []
+        good = _listed(ORDINALS[i] for i, fine in enumerate(right) if fine)
+        kind = "columns" if self.per_row else "parts"
+        return [f"Of the {kind} of your result the {good} agrees in every case, the others do not."]
 
     def _seen_in(self, case: int, mistakes: tuple[Mistake, ...], want: Floats) -> Mistake:
         """The first of several mistakes that by itself shows in this case."""
@@ -246,12 +300,21 @@ class Exercise:
         return self._say("wrong", text, *lines, first.ask, named=f"several, first {first.name}")
 
     def _combinations(self) -> Iterator[tuple[Mistake, ...]]:
-        """Each mistake alone, then each pair of different steps, earlier step first."""
+        """Each mistake alone, then each pair of different steps, earlier step first; the device's
+        edits; a mistake and an edit of the whole."""
         order = list(self.steps)
         yield from ((m,) for m in self.mistakes)
-        for a, b in itertools.combinations([m for m in self.mistakes if not m.alone], 2):
+        listed = [m for m in self.mistakes if not m.alone]
+        for a, b in itertools.combinations(listed, 2):
             if a.step != b.step:
                 yield (a, b) if order.index(a.step) < order.index(b.step) else (b, a)
+        if not self._edits:
+            self._edits += _all_edits(self)
+        single, double = self._edits
+        yield from ((m,) for m in single)
+        yield from ((m,) for m in double)
+        common = [m for m in single if not m.step and m.name in COMMON and "result" in m.says]
+        yield from itertools.product(listed, common)
 
     def _explains(self, mistakes: tuple[Mistake, ...], values: list[Floats]) -> bool:
         """Whether a wrong model gives exactly these values.
@@ -260,15 +323,23 @@ class Exercise:
         agrees, and the case is left out; so one case at least must show that the model is wrong.
         """
         shown = False
-        for value, args in zip(values[::-1], self.cases[::-1], strict=True):  # the last tell most
+        for value, args in self._telling(values):
             wrong = self._answer(mistakes, args)
             if wrong is None:
+                if mistakes[-1].device:
+                    return False
                 continue
-            if not self._agrees(value, wrong):
+            if value.shape != wrong.shape or not self._agrees(value, wrong):
                 return False
             right = self._answer((), args)
             shown = shown or right is None or not self._agrees(wrong, right)
         return shown
+
+    def _telling(self, values: list[Floats]) -> list[tuple[Floats, tuple[Any, ...]]]:
+        """Results with their cases, such as tell most first: the last one of the core, the last."""
+        both = list(zip(values, self.cases, strict=True))[::-1]
+        first = next(i for i, (_, args) in enumerate(both) if self.is_core(args))
+        return [both.pop(first), *both]
 
     def _answer(self, mistakes: tuple[Mistake, ...], args: tuple[Any, ...]) -> Floats | None:
         """What a wrong model makes of a case, None where it overflows.
@@ -277,17 +348,19 @@ class Exercise:
         """
         key = (*map(id, mistakes), id(args))
         if key not in self._known:
-            value = _as_numbers(_run(self.model(*mistakes), args).value)
+            try:
+                value = _as_numbers(self.model(*mistakes)(*args))
+            except Exception:  # an edit of the device may come to nothing
+                value = None
             overflows = value is not None and not self.nan_answers and not np.isfinite(value).all()
             self._known[key] = None if overflows else value
         return self._known[key]
 
     def _agrees(self, value: Floats, want: Floats) -> bool:
         """As np.allclose says with equal_nan, in a third of its time: checks ask this often."""
-        with np.errstate(all="ignore"):
-            off = np.abs(value - want)
-            if (off > self.tolerance + 1e-9 * np.abs(want)).any():
-                return False
+        off = np.abs(value - want)
+        if (off > self.tolerance + 1e-9 * np.abs(want)).any():
+            return False
         equal = (value == want) | (np.isnan(value) & np.isnan(want))
         return bool((np.isfinite(off) | equal).all())
 
@@ -295,8 +368,7 @@ class Exercise:
         """The first failing case, or its row that is furthest off, with its input."""
         args = self.cases[index]
         if want.ndim and self.per_row:
-            with np.errstate(all="ignore"):
-                off = np.abs(value - want).reshape(len(want), -1).max(axis=1)
+            off = np.abs(value - want).reshape(len(want), -1).max(axis=1)
             row = int(np.nan_to_num(off, nan=np.inf).argmax())
             args = tuple(a[row : row + 1] for a in args[: self.per_row]) + args[self.per_row :]
             value, want = value[row], want[row]
@@ -310,6 +382,10 @@ class Exercise:
         return Verdict(self.name, kind, f"{self.function}: {text}", lines, named)
 
 
+BY_HAND = (
+    "No single mistake that this check knows gives these numbers. Work this case by hand, one "
+    "step at a time, and compare."
+)
 IN_PLACE = Mistake(
     "in_place",
     "your function changes the array it is given",
@@ -335,9 +411,7 @@ class Run:
 def _run(function: Callable[..., Any], args: tuple[Any, ...]) -> Run:
     own = tuple(np.array(a) if isinstance(a, np.ndarray) else a for a in args)
     try:
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")
-            value = function(*own)
+        value = function(*own)
     except (Exception, SystemExit) as error:  # whatever a learner's code does, the check goes on
         return Run(None, error, _what_was_raised(error, function))
     changed = any(
@@ -365,3 +439,379 @@ def _as_numbers(value: Any) -> Floats | None:
         return array.astype(float) if array.dtype.kind in "fiub" else None
     except (TypeError, ValueError):
         return None
+
+
+# --- the general device ---
+
+Edit = Callable[[Any], Any]
+Place = tuple[Any, Any]  # a node of a syntax tree, or a list of them, and a field or an index of it
+Swap = tuple[Place, ast.AST]
+
+EDITS: dict[str, Edit] = {
+    "negative": np.negative,
+    "absolute": np.abs,
+    "reciprocal": lambda v: 1 / np.asarray(v),
+    "twice": lambda v: 2 * v,
+    "half": lambda v: v / 2,
+    "root_of_two": lambda v: np.sqrt(2) * v,
+    "root_of_two_missing": lambda v: v / np.sqrt(2),
+    "thousand": lambda v: 1000 * v,
+    "thousandth": lambda v: v / 1000,
+    "hundred": lambda v: 100 * v,
+    "hundredth": lambda v: v / 100,
+    "degrees": np.degrees,
+    "radians": np.radians,
+    "squared": np.square,
+    "rooted": np.sqrt,
+    "angle": np.arctan,
+    "sine": lambda v: v / np.sqrt(1 + np.square(v)),
+    "cosine": lambda v: 1 / np.sqrt(1 + np.square(v)),
+    "tangent": np.tan,
+    "truncated": np.trunc,
+    "rounded": np.rint,
+    "one_more": lambda v: v + 1,
+    "one_less": lambda v: v - 1,
+    "zero": np.zeros_like,
+    "one": np.ones_like,
+    "first_only": lambda v: np.broadcast_to(v[:1], v.shape),
+    "backwards": lambda v: v[::-1],
+    "transposed": lambda v: np.swapaxes(v, -1, -2),
+    "inverted": np.linalg.inv,
+    "normalised": lambda v: v / np.linalg.norm(v),
+}
+COMMON = ("negative", "twice", "half", "thousand", "hundred", "truncated", "exchanged", "copied")
+ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh")
+
+
+def _all_edits(exercise: Exercise) -> tuple[list[Mistake], list[Mistake]]:
+    """Single edits of the whole function and of its steps, and pairs within one step's source."""
+    args, steps = exercise.cases[-1], exercise.steps
+    seen: dict[str, tuple[tuple[Any, ...], Any]] = {}
+
+    def watched(name: str) -> Step:
+        def step(*values: Any) -> Any:
+            seen[name] = values, steps[name](*values)
+            return seen[name][1]
+
+        return step
+
+    def parts(result: Any) -> Any:  # of one case: its rows have columns, or it has a few parts
+        array = np.asarray(result)
+        return array if exercise.per_row or not array.ndim else tuple(array)
+
+    result = parts(exercise.build({name: watched(name) for name in steps})(*args))
+    names = [f"`{name}`" for name in inspect.signature(exercise.model()).parameters]
+    found, pairs = [], []
+    for kind, where, edit in _edits_of(result, "your result"):
+        found.append((kind, where, "", lambda f, e=edit: lambda *a: e(parts(f(*a)))))
+    for name, step in steps.items():
+        for count, (kind, where, wrong) in _rewritten(step):
+            (found if count == 1 else pairs).append((kind, where, name, wrong))
+    for kind, where, edit in _edits_of(args, names):
+        found.append((kind, where, "", lambda f, e=edit: lambda *a: f(*e(a))))
+    for kind, where, edit in _scaled(args, names, result, "your result"):
+        found.append((kind, where, "", lambda f, e=edit: lambda *a: e(a, parts(f(*a)))))
+    for name, (values, given) in seen.items():
+        step, own = steps[name], _argument_names(steps[name], len(values))
+        made = f"what is made of {_listed(own)}"
+        for kind, where, edit in _edits_of(given, made, deep=False):
+            found.append((kind, where, name, lambda *a, e=edit, f=step: e(f(*a))))
+        for kind, where, edit in _edits_of(values, own, deep=False):
+            found.append((kind, where, name, lambda *a, e=edit, f=step: f(*e(a))))
+        for kind, where, edit in _scaled(values, own, given, made):
+            found.append((kind, where, name, lambda *a, e=edit, f=step: e(a, f(*a))))
+    return [_device(*edit) for edit in found], [_device(*edit, several=True) for edit in pairs]
+
+
+def _device(kind: str, where: str, step: str, wrong: Step, several: bool = False) -> Mistake:
+    says, ask = (" ".join(text.split()) for text in _kinds()[kind])
+    says = says.replace("WHERE", where)
+    if several:
+        says = f"more than one mistake. Look first at this: {says}"
+    return Mistake(kind, says, ask, step, wrong, device=True)
+
+
+@cache
+def _kinds() -> dict[str, list[str]]:
+    return dict(questions.lesson_texts("exercises")["kinds"])
+
+
+def _listed(names: Iterable[str]) -> str:
+    *others, last = dict.fromkeys(names) or ["nothing"]
+    return f"{', '.join(others)} and {last}" if others else last
+
+
+def _argument_names(step: Step, count: int) -> list[str]:
+    try:
+        parameters = inspect.signature(step).parameters.values()
+    except ValueError:  # some functions written in C say none
+        return ["the input"] * count
+    own = [f"`{p.name}`" for p in parameters if p.kind is not p.VAR_POSITIONAL]
+    rest = [f"`{p.name}`" for p in parameters if p.kind is p.VAR_POSITIONAL]
+    return (own + rest * count)[:count]
+
+
+# Edits of a value: of all of it, and of its parts. Each is a kind, where it is, and what it does.
+
+
+def _edits_of(
+    value: Any, named: str | list[str], deep: bool = True
+) -> Iterator[tuple[str, str, Edit]]:
+    """named: what the value is called, or each part of a tuple; not deep: only a tuple has parts."""
+    whole = named if isinstance(named, str) else _listed(named)
+    if isinstance(value, (int, float, np.generic, np.ndarray)):
+        yield from ((kind, whole, edit) for kind, edit in EDITS.items())
+    parts = _parts(value, named) if deep or isinstance(value, tuple) else []
+    for label, index, part in parts:
+        for kind, where, edit in _edits_of(part, label, deep):
+            yield kind, where, partial(_at, [index], edit)
+    arrays = [(i, part) for _, i, part in parts if isinstance(part, (np.generic, np.ndarray))]
+    if len(arrays) > 1 and len({part.shape for _, part in arrays}) == 1:
+        for kind, where, edit in _edits_of(arrays[0][1], whole, deep):
+            yield kind, where, partial(_at, [i for i, _ in arrays], edit)
+    for (a, i, x), (b, j, y) in itertools.permutations(parts, 2):
+        if np.shape(x) == np.shape(y) and not callable(x):
+            yield "copied", _listed((a, b)), partial(_taken, [(i, j)])
+            yield "exchanged", _listed((a, b)), partial(_taken, [(i, j), (j, i)])
+
+
+def _parts(value: Any, named: str | list[str]) -> list[tuple[str, Any, Any]]:
+    """What each part is called, its index and itself: of a tuple, of columns, of a pose."""
+    labels = named if isinstance(named, list) else [f"the {n} part of {named}" for n in ORDINALS]
+    indices: list[Any] = []
+    if isinstance(value, tuple):
+        indices = list(range(len(value)))
+    elif isinstance(value, np.ndarray) and value.shape == (4, 4):
+        labels = [f"the {part} of {named}" for part in ("translation", "rotation", "last row")]
+        indices = [(slice(3), 3), (slice(3), slice(3)), 3]
+    elif isinstance(value, np.ndarray) and value.ndim == 2 and value.shape[1] < min(4, len(value)):
+        labels = [f"the {n} column of {named}" for n in ORDINALS]
+        indices = [(..., i) for i in range(value.shape[1])]
+    return [(label, i, value[i]) for label, i in zip(labels, indices)]  # noqa: B905
+
+
+def _scaled(
+    inputs: tuple[Any, ...], names: list[str], value: Any, named: str
+) -> Iterator[tuple[str, str, Callable[..., Any]]]:
+    """Edits that multiply or divide a value, or a part of it, by one of the inputs."""
+    indices = [index for _, index, _ in _parts(value, named)] or [None]
+    for (i, given), index in itertools.product(enumerate(inputs), indices):
+        if isinstance(given, (float, np.generic)) or np.ndim(given) == 1:
+            for kind, by in (("factor_too_many", np.multiply), ("factor_missing", np.divide)):
+                if index is None:
+                    yield kind, names[i], lambda a, v, i=i, by=by: by(v, a[i])
+                else:
+                    yield (
+                        kind,
+                        names[i],
+                        lambda a, v, i=i, by=by, n=index: _at([n], lambda x: by(x, a[i]), v),
+                    )
+
+
+def _at(indices: list[Any], edit: Edit, value: Any) -> Any:
+    new = list(value) if isinstance(value, tuple) else np.array(value, float)
+    for i in indices:
+        new[i] = edit(value[i])
+    return tuple(new) if isinstance(value, tuple) else new
+
+
+def _taken(pairs: list[tuple[Any, Any]], value: Any) -> Any:
+    new = list(value) if isinstance(value, tuple) else np.array(value, float)
+    for i, j in pairs:
+        new[i] = value[j]
+    return tuple(new) if isinstance(value, tuple) else new
+
+
+# Edits of the source of a step.
+
+OPERATORS: dict[type[ast.operator], dict[str, type[ast.operator]]] = {
+    ast.Add: {"subtracted": ast.Sub, "product_for_sum": ast.Mult},
+    ast.Sub: {"added": ast.Add},
+    ast.Mult: {"divided": ast.Div, "sum_for_product": ast.Add},
+    ast.Div: {"multiplied": ast.Mult, "difference_for_quotient": ast.Sub},
+    ast.Pow: {"power_as_product": ast.Mult},
+    ast.MatMult: {"elementwise": ast.Mult},
+}
+# Functions that are taken for each other, by family.
+FUNCTIONS = (
+    ("mean", "median", "sum", "max", "min", "std", "var"),
+    ("sin", "cos", "tan", "arctan", "arcsin", "arctan2", "hypot"),
+    ("inv", "transpose"),
+    ("sqrt", "square", "abs"),
+    ("round", "int"),
+)
+COMPARED: dict[type[ast.cmpop], tuple[type[ast.cmpop], ...]] = {
+    ast.GtE: (ast.Gt, ast.Eq),
+    ast.Gt: (ast.GtE,),
+    ast.LtE: (ast.Lt,),
+    ast.Lt: (ast.LtE,),
+    ast.Eq: (ast.NotEq,),
+    ast.NotEq: (ast.Eq, ast.Gt),
+}
+MOST_SITES = 45  # a step with more of them is not tried with two edits
+
+
+@cache
+def _rewritten(step: Step) -> list[tuple[int, tuple[str, str, Step]]]:
+    """The step with one edit of its source, or the like in several places; then with two.
+
+    Before each stands 1 or 2. A step without a source has none.
+    """
+    tree = _source(step)
+    if tree is None:
+        return []
+    space = step.__globals__ | inspect.getclosurevars(step).nonlocals
+    names = {n.arg for n in ast.walk(tree) if isinstance(n, ast.arg)}
+    names |= {n.id for n in ast.walk(tree) if isinstance(n, ast.Name) and type(n.ctx) is ast.Store}
+    sites, groups = [], defaultdict(list)
+    for place, node, path in _walk(tree):
+        for kind, detail, new in _alternatives(node, names):
+            where = detail[1] if kind == "name" else _named_in(node)
+            sites.append((kind, where, [(place, new)]))
+            for like in ((), path, where):
+                groups[kind, detail, like].append((where, (place, new)))
+    sites = [*_copied_lines(tree), *sites]
+    pairs = []
+    if len(sites) <= MOST_SITES:
+        pairs = [(kind, where, a + b) for (kind, where, a), (*_, b) in itertools.combinations(sites, 2)]
+    for (kind, *_), swaps in groups.items():
+        if len(swaps) > 1:
+            sites.append((kind, swaps[0][0], [swap for _, swap in swaps]))
+    found = [(1, "bracket", said, _compiled(new, space)) for said, new in _unbracketed(tree)]
+    for count, edits in ((1, sites), (2, pairs)):
+        for kind, where, swaps in edits:
+            found.append((count, kind, where, _compiled(tree, space, swaps)))
+    return [(count, (kind, said, new)) for count, kind, said, new in found if new is not None]
+
+
+@cache
+def _module(file: str) -> ast.Module:
+    return ast.parse(Path(file).read_text(encoding="utf-8"))
+
+
+def _source(step: Step) -> ast.Lambda | ast.FunctionDef | None:
+    """The lambda or the definition that a step was made by."""
+    code = getattr(step, "__code__", None)
+    if code is None or not Path(code.co_filename).exists():
+        return None
+    places = set(code.co_positions())
+    for node in ast.walk(_module(code.co_filename)):
+        if isinstance(node, ast.FunctionDef) and node.lineno == code.co_firstlineno:
+            return node
+        if isinstance(node, ast.Lambda):
+            body = node.body
+            if (body.lineno, body.end_lineno, body.col_offset, body.end_col_offset) in places:
+                return node
+    return None
+
+
+def _walk(holder: ast.AST, path: tuple[str, ...] = ()) -> Iterator[tuple[Place, ast.AST, Any]]:
+    """Each node: its place, itself and its path: the same in the line for the other axis."""
+    for name, child in ast.iter_fields(holder):
+        for i, part in enumerate(child if isinstance(child, list) else [child]):
+            if isinstance(part, ast.AST) and not isinstance(part, ast.arguments):
+                place = (child, i) if isinstance(child, list) else (holder, name)
+                yield place, part, (*path, name)
+                yield from _walk(part, (*path, name))
+
+
+def _alternatives(node: ast.AST, names: set[str]) -> Iterator[tuple[str, Any, ast.AST]]:
+    """What may be written in a node's place: the kind of edit, what tells it from others, the new."""
+    match node:
+        case ast.BinOp(left, op, right):
+            for kind, other in OPERATORS.get(type(op), {}).items():
+                yield kind, None, ast.BinOp(left, other(), right)
+            yield "dropped", ast.dump(right), left
+            yield "dropped", ast.dump(left), right
+            if isinstance(op, (ast.Sub, ast.Div, ast.MatMult)):
+                yield "turned_round", type(op), ast.BinOp(right, op, left)
+        case ast.Constant(value) if type(value) in (int, float):
+            for other in (value + 1, value - 1, -value):
+                yield "number", (value, other), ast.Constant(other)
+        case ast.Name(name, ast.Load()) if name in names:
+            for other in sorted(names - {name}):
+                yield "name", (name, f"`{other}`"), ast.Name(other, ast.Load())
+        case ast.Call(function, [first, *_] as arguments, keywords):
+            yield "function_dropped", ast.dump(function), first
+            name = getattr(function, "attr", getattr(function, "id", ""))
+            for other in (n for f in FUNCTIONS if name in f for n in f if n != name):
+                new = ast.parse(ast.unparse(function)[: -len(name)] + other, mode="eval").body
+                yield "function", (name, other), ast.Call(new, arguments, keywords)
+        case ast.Attribute(value, "T"):
+            yield "transpose_missing", None, value
+        case ast.UnaryOp(_, operand):
+            yield "sign_missing", None, operand
+        case ast.Compare(left, [op], rights):
+            for other in COMPARED.get(type(op), ()):
+                yield "comparison", None, ast.Compare(left, [other()], rights)
+
+
+def _copied_lines(tree: ast.AST) -> Iterator[tuple[str, str, list[Swap]]]:
+    """A line that repeats another one of the like form, and is not adapted everywhere."""
+    for node in ast.walk(tree):
+        lines = getattr(node, "elts", None) or getattr(node, "body", None)
+        for a, b in itertools.permutations(lines if isinstance(lines, list) else [], 2):
+            ours, theirs = (list(_walk(ast.Module([line], []))) for line in (a, b))
+            if [type(x) for _, x, _ in ours] == [type(y) for _, y, _ in theirs]:
+                swaps = [
+                    (place, x)
+                    for (_, x, _), (place, y, _) in zip(ours, theirs, strict=True)
+                    if isinstance(x, (ast.Name, ast.Constant)) and ast.dump(x) != ast.dump(y)
+                ][:5]
+                for n in range(1, len(swaps) + 1):
+                    for some in itertools.combinations(swaps, n):
+                        yield "line_copied", _named_in(*(x for _, x in some)), list(some)
+
+
+def _unbracketed(tree: ast.AST) -> Iterator[tuple[str, ast.AST]]:
+    """The source without one, two or all of its brackets."""
+    text, opened, brackets = ast.unparse(tree), [], []
+    for i, sign in enumerate(text):
+        if sign == "(":
+            opened.append(i)
+        elif sign == ")":
+            start = opened.pop()
+            if not re.match(r"[\w)\]]", text[start - 1 : start] or " "):
+                brackets.append((start, i))
+    chosen = [c for n in (1, 2, len(brackets)) for c in itertools.combinations(brackets, n)]
+    for some in dict.fromkeys(c for c in chosen if c):
+        gone = {i for pair in some for i in pair}
+        try:
+            new = ast.parse("".join(" " if i in gone else s for i, s in enumerate(text))).body[0]
+        except SyntaxError:
+            continue
+        new = new.value if isinstance(new, ast.Expr) else new
+        if type(new) is type(tree) and ast.dump(new) != ast.dump(tree):
+            yield _named_in(ast.parse(text[some[0][0] : some[0][1] + 1])), new
+
+
+def _named_in(*nodes: ast.AST) -> str:
+    """The first three names in some source."""
+    found = [n.id for node in nodes for n in ast.walk(node) if isinstance(n, ast.Name)]
+    return _listed([f"`{name}`" for name in found if name not in ("np", "math")][:3] or ["a number"])
+
+
+def _compiled(tree: Any, space: dict[str, Any], swaps: Iterable[Swap] = ()) -> Step | None:
+    """The function that a lambda or a definition makes with some of its nodes replaced; None for
+    what is no Python."""
+    old = [((holder, key), _put(holder, key, new)) for (holder, key), new in swaps]
+    own: dict[str, Step] = {}
+    body = ast.Assign([ast.Name("step", ast.Store())], tree) if isinstance(tree, ast.Lambda) else tree
+    try:
+        exec(compile(ast.fix_missing_locations(ast.Module([body], [])), "<edit>", "exec"), space, own)
+    except SyntaxError:
+        return None
+    finally:
+        for (holder, key), node in reversed(old):
+            _put(holder, key, node)
+    return next(iter(own.values()))
+
+
+def _put(holder: Any, key: Any, new: ast.AST) -> ast.AST:
+    """Sets a node in its place and gives the one that stood there."""
+    if isinstance(holder, list):
+        holder[key], new = new, holder[key]
+        return new
+    old = getattr(holder, key)
+    setattr(holder, key, new)
+    return old

@@ -28,6 +28,15 @@ def _lens(K: Floats) -> Any:
     return K[0, 0], K[1, 1], K[0, 2], K[1, 2]
 
 
+def _bend(x: Floats, y: Floats, k1: float, k2: float, p1: float, p2: float, k3: float) -> Any:
+    r2 = x**2 + y**2
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2),
+        y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y,
+    )
+
+
 def _bent(
     powers: tuple[float, float, float] = (1, 2, 3),
     tangential: float = 1,
@@ -95,7 +104,7 @@ PROJECT = Exercise(
     steps={
         "normalise": lambda X, Y, Z: (X / Z, Y / Z, 1.0),
         "read": lambda *dist: dist,
-        "bend": _bent(),
+        "bend": _bend,
         "to_pixels": _to_pixels,
         "image": _image,
         "columns": lambda u, v: np.stack([u, v], axis=1),
@@ -231,7 +240,7 @@ def _iterate(rounds: int) -> Step:
         xd, yd = x, y
         for _ in range(rounds):
             bent_x, bent_y = bend(x, y)
-            x, y = x + xd - bent_x, y + yd - bent_y
+            x, y = x + (xd - bent_x), y + (yd - bent_y)
         return x, y
 
     return unbend
@@ -274,7 +283,7 @@ DEPROJECT = Exercise(
     steps={
         "rays": _to_normalised,
         "read": lambda *dist: dist,
-        "bend": _bent(),
+        "bend": _bend,
         "unbend": _iterate(40),
         "scale": _scale,
         "points": lambda X, Y, Z: np.stack([X, Y, Z], axis=1),
@@ -286,8 +295,8 @@ DEPROJECT = Exercise(
         (_PIXEL, _DEPTHS[:1], LESSON_K, np.array([0.1, 0.0, 0.0, 0.0, 0.0])),
         (_PIXEL, _DEPTHS[:1], LESSON_K, np.array([0.0, 0.0, 0.0010, 0.0005, 0.0])),
         (_PIXEL, _DEPTHS[:1], LESSON_K, np.array([0.0, 0.0, 0.0, 0.0, 0.4])),
-        (_PIXELS, _DEPTHS, GENERIC_K, MIXED),
         (_CORNER, _DEPTHS[:1], WIDE_K, WIDE),
+        (_PIXELS, _DEPTHS, GENERIC_K, MIXED),
     ],
     per_row=2,
     unit="m",
