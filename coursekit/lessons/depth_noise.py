@@ -38,7 +38,7 @@ DEPTH_NOISE = Exercise(
     steps={
         "power": lambda Z: Z**2,
         "constant": lambda fx, baseline: fx * baseline,
-        "divide": lambda power, constant: power / constant,
+        "divide": lambda Z2, fxB: Z2 / fxB,
         "noise": lambda slope, sigma_d, Z: slope * sigma_d,
         "result": lambda sigma: sigma,
     },
@@ -47,7 +47,7 @@ DEPTH_NOISE = Exercise(
         (1.0, 447.0, 0.05, 0.08),
         (np.array([0.30, 0.45, 0.60]), 431.1, 0.0502, 0.08),
         (np.array([0.15, 0.20, 0.30, 0.45]), 425.0, 0.018, 0.06),
-        (np.array([[0.5, 0.7, 1.1], [1.3, 1.7, 1.9]]), 390.4, 0.0951, 0.25),
+        (np.array([[0.5, 0.7, 1.1], [1.3, 1.9, 7.5]]), 390.4, 0.0951, 0.25),
     ],
     per_row=1,
     unit="m",
@@ -95,6 +95,9 @@ DEPTH_NOISE.add_mistakes(
     ("result", "variance", lambda sigma: sigma**2),
     ("result", "root", np.sqrt),
     ("result", "negative", lambda sigma: -sigma),
+)
+DEPTH_NOISE.add_mistakes(
+    ("", "disparity", lambda law: lambda Z, fx, baseline, sigma_d: fx * baseline / Z), alone=True
 )
 
 
@@ -215,6 +218,7 @@ ROBUST_DEPTH = Exercise(
         (IMAGE, 7, 6, 4, 20),
         (IMAGE, -9, 6),
         (IMAGE, 6, -9),
+        (7 * IMAGE, 10, 8),
     ],
     per_row=0,
     unit="m",

@@ -143,15 +143,18 @@ class Exercise:
             return self._say("not attempted", f"got a {type(function).__name__}, not a function.")
         runs = [_run(function, args) for args in self.cases]
         if self.core and self._leaves_the_rest(self.core, function, runs):
-            if not self._alone:
-                cases = [args for args in self.cases if self.is_core(args)]
-                self._alone.append(replace(self, cases=cases, core=None, part_of=self))
-            return self._alone[0]._verdict(function)
-        unfinished = self._unfinished(runs)
+            return self._core_alone()._verdict(function)
+        unfinished = self._unfinished(function, runs)
         if unfinished:
             return unfinished
         expected = [np.asarray(self._answer((), args)) for args in self.cases]
         return self._compare(runs, expected)
+
+    def _core_alone(self) -> Exercise:
+        if not self._alone:
+            cases = [args for args in self.cases if self.is_core(args)]
+            self._alone.append(replace(self, cases=cases, core=None, part_of=self))
+        return self._alone[0]
 
     def is_core(self, args: tuple[Any, ...]) -> bool:
         return self.core is None or len(self.core.of(args)) == len(args)
@@ -170,10 +173,13 @@ class Exercise:
                     return False
         return True
 
-    def _unfinished(self, runs: list[Run]) -> Verdict | None:
+    def _unfinished(self, function: Callable[..., Any], runs: list[Run]) -> Verdict | None:
         """Not attempted, raised, or something that is not an array of the right shape."""
         if all(r.value is None and r.error is None for r in runs):
-            return self._say("not attempted", "not attempted yet: it returns None.")
+            code = getattr(function, "__code__", None)
+            if code is None or len(code.co_code) <= len(_nothing.__code__.co_code):
+                return self._say("not attempted", "not attempted yet: it returns None.")
+            return self._say("wrong", "it returns None: is there a `return`?", NO_RETURN)
         for run, args in zip(runs, self.cases, strict=True):
             if isinstance(run.error, NotImplementedError):
                 return self._say("not attempted", "not attempted yet.")
@@ -199,6 +205,8 @@ class Exercise:
             if value.shape != want.shape:
                 got, wanted = _shape(value), _shape(want)
                 text = f"wrong shape: it returns {got}, and {wanted} is wanted."
+                if self.per_row and 0 < value.ndim == want.ndim and len(value) < len(want):
+                    text += f" Every row of the input has one in the result: {len(want)} of them."
                 return self._say("wrong", text, self._given(args))
         return self._judged(values, expected, formal)
 
@@ -226,13 +234,22 @@ class Exercise:
         evidence = self._evidence(first, values[first], expected[first])
         if formal:
             return self._several(formal[0], count, evidence)
+        relation = self._relation(values, expected)
+        told = relation and relation[0] in ("runs_away", "constant")
         for mistakes in self._combinations():
+            if told and mistakes[-1].device:
+                break
             if self._explains(mistakes, values):
                 if len(mistakes) > 1:
                     seen = self._seen_in(first, mistakes, expected[first])
                     return self._several(seen, count, evidence)
                 return self._one(mistakes[0], count, evidence)
-        relation = self._relation(values, expected)
+        if self.core:  # what goes wrong there may hide behind the rest
+            rows = zip(values, expected, map(self.is_core, self.cases), strict=True)
+            of_core = [(value, want) for value, want, core in rows if core]
+            verdict = self._core_alone()._judged(*map(list, zip(*of_core, strict=True)), [])
+            if verdict.named:
+                return verdict
         if relation:
             return self._one(_device(*relation, "", replace), count, evidence)
         text = f"not right yet. {count}"
@@ -240,7 +257,16 @@ class Exercise:
 
     def _relation(self, values: list[Floats], expected: list[Floats]) -> tuple[str, str] | None:
         """What can be said of numbers that no model gives: they run away, or are proportional."""
+        if all(np.array_equal(v, values[0], equal_nan=True) for v in values):
+            return "constant", "your result"
         both = list(zip(values, expected, strict=True))
+        if self.per_row and all(self._agrees_but_for_rows(v, e) for v, e in both):
+            return "rows_lost", "your result"
+        if expected[0].shape == (3, 3) and all(
+            self._agrees(v, e) or (self._agrees(v @ v.T, np.eye(3)) and np.linalg.det(v) < 0)
+            for v, e in both
+        ):
+            return "mirrored", "your result"
         if not self.nan_answers and not all(
             (np.abs(v) <= 1e6 * (1 + np.abs(e).max())).all() for v, e in both
         ):
@@ -255,6 +281,15 @@ class Exercise:
         if len({k > 0 for k in factors}) == 1:
             return "factor", f"{first:.5g}"
         return ("signs", "") if abs(abs(first) - 1) < 1e-6 else ("factor_and_signs", f"{first:.5g}")
+
+    def _agrees_but_for_rows(self, value: Floats, want: Floats) -> bool:
+        """Whether of several rows some are right, and all others nothing: 0 or NaN."""
+        if not want.ndim or len(want) == 1:
+            return self._agrees(value, want)
+        right = [self._agrees(v, e) for v, e in zip(value, want, strict=True)]
+        return any(right) and all(
+            r or not np.nan_to_num(v).any() for r, v in zip(right, value, strict=True)
+        )
 
     def _right_parts(self, values: list[Floats], expected: list[Floats]) -> list[str]:
         """Says which columns or numbers of the result are right in all cases, if some are."""
@@ -382,6 +417,14 @@ class Exercise:
         return Verdict(self.name, kind, f"{self.function}: {text}", lines, named)
 
 
+def _nothing() -> None:
+    return None
+
+
+NO_RETURN = (
+    "Printing or keeping a result does not give it back: `return` does. And the template's own "
+    "`return None` has to go."
+)
 BY_HAND = (
     "No single mistake that this check knows gives these numbers. Work this case by hand, one "
     "step at a time, and compare."
@@ -445,6 +488,7 @@ def _as_numbers(value: Any) -> Floats | None:
 
 Edit = Callable[[Any], Any]
 Place = tuple[Any, Any]  # a node of a syntax tree, or a list of them, and a field or an index of it
+Way = tuple[tuple[str, int], ...]
 Swap = tuple[Place, ast.AST]
 
 EDITS: dict[str, Edit] = {
@@ -537,7 +581,7 @@ def _kinds() -> dict[str, list[str]]:
 
 
 def _listed(names: Iterable[str]) -> str:
-    *others, last = dict.fromkeys(names) or ["nothing"]
+    *others, last = dict.fromkeys(names) or ["the code"]
     return f"{', '.join(others)} and {last}" if others else last
 
 
@@ -577,9 +621,11 @@ def _edits_of(
 
 def _parts(value: Any, named: str | list[str]) -> list[tuple[str, Any, Any]]:
     """What each part is called, its index and itself: of a tuple, of columns, of a pose."""
-    labels = named if isinstance(named, list) else [f"the {n} part of {named}" for n in ORDINALS]
+    labels = named if isinstance(named, list) else []
     indices: list[Any] = []
     if isinstance(value, tuple):
+        kind = "part" if any(map(np.ndim, value)) else "number"
+        labels = labels or [f"the {n} {kind} of {named}" for n in ORDINALS]
         indices = list(range(len(value)))
     elif isinstance(value, np.ndarray) and value.shape == (4, 4):
         labels = [f"the {part} of {named}" for part in ("translation", "rotation", "last row")]
@@ -665,15 +711,23 @@ def _rewritten(step: Step) -> list[tuple[int, tuple[str, str, Step]]]:
     names |= {n.id for n in ast.walk(tree) if isinstance(n, ast.Name) and type(n.ctx) is ast.Store}
     sites, groups = [], defaultdict(list)
     for place, node, path in _walk(tree):
+        around = node if isinstance(node, ast.expr) and _named_in(node) else place[0]
         for kind, detail, new in _alternatives(node, names):
-            where = detail[1] if kind == "name" else _named_in(node)
-            sites.append((kind, where, [(place, new)]))
-            for like in ((), path, where):
+            where = _named_in(around) if isinstance(around, ast.AST) else "the code"
+            if kind == "name":
+                where = detail[1]
+            elif kind == "function_dropped":
+                where = f"`{ast.unparse(node.func).rpartition('.')[2]}` of {where}"
+            sites.append((kind, where or "the code", [(place, new)]))
+            beside = tuple(step for step in path if step[0] not in ("left", "right"))
+            for like in ((), tuple(name for name, _ in path), beside, where):
                 groups[kind, detail, like].append((where, (place, new)))
     sites = [*_copied_lines(tree), *sites]
     pairs = []
     if len(sites) <= MOST_SITES:
-        pairs = [(kind, where, a + b) for (kind, where, a), (*_, b) in itertools.combinations(sites, 2)]
+        pairs = [
+            (kind, where, a + b) for (kind, where, a), (*_, b) in itertools.combinations(sites, 2)
+        ]
     for (kind, *_), swaps in groups.items():
         if len(swaps) > 1:
             sites.append((kind, swaps[0][0], [swap for _, swap in swaps]))
@@ -705,14 +759,14 @@ def _source(step: Step) -> ast.Lambda | ast.FunctionDef | None:
     return None
 
 
-def _walk(holder: ast.AST, path: tuple[str, ...] = ()) -> Iterator[tuple[Place, ast.AST, Any]]:
-    """Each node: its place, itself and its path: the same in the line for the other axis."""
+def _walk(holder: ast.AST, path: Way = ()) -> Iterator[tuple[Place, ast.AST, Way]]:
+    """Each node: its place, itself and the way to it, fields with the number in a list of nodes."""
     for name, child in ast.iter_fields(holder):
         for i, part in enumerate(child if isinstance(child, list) else [child]):
             if isinstance(part, ast.AST) and not isinstance(part, ast.arguments):
                 place = (child, i) if isinstance(child, list) else (holder, name)
-                yield place, part, (*path, name)
-                yield from _walk(part, (*path, name))
+                yield place, part, (*path, (name, i))
+                yield from _walk(part, (*path, (name, i)))
 
 
 def _alternatives(node: ast.AST, names: set[str]) -> Iterator[tuple[str, Any, ast.AST]]:
@@ -721,6 +775,8 @@ def _alternatives(node: ast.AST, names: set[str]) -> Iterator[tuple[str, Any, as
         case ast.BinOp(left, op, right):
             for kind, other in OPERATORS.get(type(op), {}).items():
                 yield kind, None, ast.BinOp(left, other(), right)
+                if other is ast.Div:
+                    yield kind, "turned", ast.BinOp(right, other(), left)
             yield "dropped", ast.dump(right), left
             yield "dropped", ast.dump(left), right
             if isinstance(op, (ast.Sub, ast.Div, ast.MatMult)):
@@ -786,9 +842,12 @@ def _unbracketed(tree: ast.AST) -> Iterator[tuple[str, ast.AST]]:
 
 
 def _named_in(*nodes: ast.AST) -> str:
-    """The first three names in some source."""
-    found = [n.id for node in nodes for n in ast.walk(node) if isinstance(n, ast.Name)]
-    return _listed([f"`{name}`" for name in found if name not in ("np", "math")][:3] or ["a number"])
+    """The first three names of quantities in some source, none for a number."""
+    inside = [n for node in nodes for n in ast.walk(node)]
+    called = {id(n.func) for n in inside if isinstance(n, ast.Call)}
+    names = [n.id for n in inside if isinstance(n, ast.Name) and id(n) not in called]
+    found = list(dict.fromkeys(f"`{name}`" for name in names if name not in ("np", "math")))
+    return _listed(found[:3]) if found else ""
 
 
 def _compiled(tree: Any, space: dict[str, Any], swaps: Iterable[Swap] = ()) -> Step | None:
@@ -796,9 +855,13 @@ def _compiled(tree: Any, space: dict[str, Any], swaps: Iterable[Swap] = ()) -> S
     what is no Python."""
     old = [((holder, key), _put(holder, key, new)) for (holder, key), new in swaps]
     own: dict[str, Step] = {}
-    body = ast.Assign([ast.Name("step", ast.Store())], tree) if isinstance(tree, ast.Lambda) else tree
+    body = (
+        ast.Assign([ast.Name("step", ast.Store())], tree) if isinstance(tree, ast.Lambda) else tree
+    )
     try:
-        exec(compile(ast.fix_missing_locations(ast.Module([body], [])), "<edit>", "exec"), space, own)
+        exec(
+            compile(ast.fix_missing_locations(ast.Module([body], [])), "<edit>", "exec"), space, own
+        )
     except SyntaxError:
         return None
     finally:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -26,6 +27,9 @@ def _build_pair(steps: Mapping[str, Step]) -> Model:
     def motion_pair(
         gripper_i: Floats, gripper_j: Floats, board_i: Floats, board_j: Floats
     ) -> Floats:
+        gripper_i, gripper_j, board_i, board_j = steps["read"](
+            gripper_i, gripper_j, board_i, board_j
+        )
         invert = steps["inverse"]
         A = steps["A"](*steps["A pair"](gripper_i, gripper_j), invert)
         B = steps["B"](*steps["B pair"](board_i, board_j), invert)
@@ -64,11 +68,12 @@ MOTION_PAIR = Exercise(
     name="hand_eye.motion_pair",
     build=_build_pair,
     steps={
+        "read": lambda *poses: poses,
         "inverse": np.linalg.inv,
         "A pair": lambda i, j: (i, j),
-        "A": lambda first, second, inverse: inverse(second) @ first,  # the gripper's motion
+        "A": lambda gripper_i, gripper_j, inverse: inverse(gripper_j) @ gripper_i,
         "B pair": lambda i, j: (i, j),
-        "B": lambda first, second, inverse: second @ inverse(first),  # the camera's, by the board
+        "B": lambda board_i, board_j, inverse: board_j @ inverse(board_i),
         "order": lambda A, B: np.stack([A, B]),
     },
     cases=[_session_pair(0, plain=True), *(_session_pair(seed) for seed in range(1, 5))],
@@ -80,7 +85,38 @@ MOTION_PAIR = Exercise(
 )
 
 
+def _in_place_of(motions: Callable[..., Any]) -> Step:
+    """A mistake in both motions at once: what is made of the four poses instead."""
+    return lambda _: lambda *poses: np.stack(motions(*poses))
+
+
+def _places_subtracted(sign_A: float, sign_B: float) -> Step:
+    def wrong(gi: Floats, gj: Floats, bi: Floats, bj: Floats) -> Pair:
+        return (
+            make_transform(gj[:3, :3].T @ gi[:3, :3], sign_A * (gi - gj)[:3, 3]),
+            make_transform(bj[:3, :3] @ bi[:3, :3].T, sign_B * (bi - bj)[:3, 3]),
+        )
+
+    return _in_place_of(wrong)
+
+
+_inverse = np.linalg.inv
 MOTION_PAIR.add_mistakes(
+    (
+        "",
+        "elementwise",
+        _in_place_of(lambda gi, gj, bi, bj: (_inverse(gj) * gi, bj * _inverse(bi))),
+    ),
+    ("", "elementwise", _in_place_of(lambda gi, gj, bi, bj: (gj * gi, bj * bi))),
+    ("", "subtracted", _in_place_of(lambda gi, gj, bi, bj: (gj - gi, bj - bi))),
+    ("", "subtracted", _in_place_of(lambda gi, gj, bi, bj: (gi - gj, bi - bj))),
+    ("", "subtracted", _in_place_of(lambda gi, gj, bi, bj: (gi - gj, bj - bi))),
+    *(("", "places_subtracted", _places_subtracted(a, b)) for a in (1, -1) for b in (1, -1)),
+    alone=True,
+)
+MOTION_PAIR.add_mistakes(
+    ("read", "gripper_twice", lambda gi, gj, bi, bj: (gi, gj, gi, gj)),
+    ("read", "board_twice", lambda gi, gj, bi, bj: (bi, bj, bi, bj)),
     ("inverse", "transposed_pose", lambda T: T.T),
     ("inverse", "translation_not_turned", lambda T: make_transform(T[:3, :3].T, -T[:3, 3])),
     ("inverse", "not_inverted", lambda T: T),
@@ -111,12 +147,19 @@ def _build_half(steps: Mapping[str, Step]) -> Model:
     return rotation_half
 
 
-def _motions(seed: int, n: int) -> Pair:
-    """n motions and what the camera saw of them, without noise."""
+def _motions(seed: int, n: int, parallel: bool = False) -> Pair:
+    """n motions and what the camera saw of them, without noise; parallel: the first two are."""
     rng = np.random.default_rng(seed)
     X = Rotation.from_rotvec(rng.uniform(-1.5, 1.5, 3))
-    A = Rotation.from_rotvec(rng.uniform(-1.2, 1.2, (n, 3)))
+    turns = rng.uniform(-1.2, 1.2, (n, 3))
+    turns[0] = turns[1] / 2 if parallel else turns[0]
+    A = Rotation.from_rotvec(turns)
     return A.as_matrix(), (X.inv() * A * X).as_matrix()
+
+
+def _parallel(R: Floats) -> bool:
+    first, second = Rotation.from_matrix(R[:2]).as_rotvec()
+    return bool(np.linalg.norm(np.cross(first, second)) < 1e-9)
 
 
 def _quarter_turns() -> Pair:
@@ -135,14 +178,21 @@ ROTATION_HALF = Exercise(
         "turn": _turn,
         "result": lambda R: R,
     },
-    cases=[_quarter_turns(), _motions(1, 2), _motions(2, 3), _motions(3, 6), _motions(4, 20)],
+    cases=[
+        _quarter_turns(),
+        *(_motions(seed, 2) for seed in (1, 5, 6, 7, 8)),
+        _motions(2, 3),
+        _motions(9, 3, parallel=True),
+        _motions(3, 6),
+        _motions(4, 20),
+    ],
     per_row=0,
     unit="(rotation matrix)",
     tolerance=1e-6,
     describe=lambda args: (
         "the arm turns by 60 degrees about x, then by 40 about y; X is a quarter turn about z"
         if np.array_equal(args[0], _quarter_turns()[0])
-        else f"{len(args[0])} motions"
+        else f"{len(args[0])} motions" + ", the first two about one axis" * _parallel(args[0])
     ),
     show=lambda R: "; ".join(" ".join(f"{v:.3f}" for v in row) for row in np.atleast_2d(R)),
 )
@@ -164,4 +214,44 @@ ROTATION_HALF.add_mistakes(
     ("result", "negative", lambda R: -R),
     ("result", "not_scaled", lambda R: R / np.sqrt(3)),
     ("result", "not_scaled_and_negative", lambda R: -R / np.sqrt(3)),
+)
+
+
+def _eigenvectors(_: Model) -> Model:
+    """The axes as `np.linalg.eig` gives them, and Kabsch's rotation between them."""
+
+    def axis(R: Floats) -> Floats:
+        values, vectors = np.linalg.eig(R)
+        return np.real(vectors[:, np.argmin(np.abs(values - 1))])
+
+    return lambda R_A, R_B: _turn(*(np.array([axis(R) for R in of]) for of in (R_A, R_B)))
+
+
+def _kabsch(product: Callable[[Floats, Floats, Floats], Floats]) -> Step:
+    """Kabsch's method with another product of U, V^T and the matrix that makes it a rotation."""
+
+    def turn(a: Floats, b: Floats) -> Floats:
+        U, S, Vt = np.linalg.svd(a.T @ b)
+        if S[2] < 1e-9:  # the third direction has the sign that rounding gives it
+            return np.full((3, 3), np.nan)
+        return product(U, Vt, np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]))
+
+    return turn
+
+
+def _nearest(M: Floats) -> Floats:
+    U, _, Vt = np.linalg.svd(M)
+    return U @ Vt
+
+
+ROTATION_HALF.add_mistakes(
+    ("", "axis_without_sign", _eigenvectors),
+    ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: U @ D @ Vt.T)),
+    ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: Vt @ D @ U.T)),
+    ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: U @ Vt.T)),
+    ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: Vt @ U.T)),
+    ("", "same_frame", lambda _: lambda A, B: A[0] @ B[0].T),
+    ("", "same_frame", lambda _: lambda A, B: (A @ np.swapaxes(B, 1, 2)).mean(axis=0)),
+    ("", "same_frame", lambda _: lambda A, B: _nearest((A @ np.swapaxes(B, 1, 2)).mean(axis=0))),
+    alone=True,
 )

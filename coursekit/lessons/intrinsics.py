@@ -59,6 +59,7 @@ REPROJECTION_RMS = Exercise(
         ),
         _corners(1, 7, (0.20, 0.10), 0.3),
         _corners(2, 54, (0.10, 0.15), -0.1),
+        _corners(4, 60, (4.0, 7.0), -2.0),
         _corners(3, 120, (0.25, 0.08), 0.05),
     ],
     per_row=0,
@@ -69,9 +70,13 @@ REPROJECTION_RMS = Exercise(
 )
 
 
-def _mean_distances_everywhere(residuals: Floats, result: Floats) -> Floats:
-    distance = np.linalg.norm(residuals, axis=1)
-    return np.array([*np.abs(residuals).mean(axis=0), distance.mean()])
+def _everywhere(measure: Step) -> Step:
+    """The same measure of the errors in u, of those in v and of the distances."""
+
+    def whole(residuals: Floats, result: Floats) -> Any:
+        return measure(np.column_stack([residuals, np.linalg.norm(residuals, axis=1)]))
+
+    return whole
 
 
 # In the numbers of the two axes, whether or not the 2-D number is made of them.
@@ -84,6 +89,8 @@ _AXIS_MISTAKES: dict[str, Step] = {
     "summed": lambda e: np.sqrt(np.sum(e**2, axis=0)),
     "axis_over_2n": lambda e: np.sqrt(np.sum(e**2, axis=0) / (2 * len(e))),
     "largest": lambda e: np.max(np.abs(e), axis=0),
+    "median_absolute": lambda e: np.median(np.abs(e), axis=0),
+    "wrong_axis": lambda e: np.sqrt(np.mean(e**2, axis=1))[:2],
 }
 for _name, _axis in _AXIS_MISTAKES.items():
     REPROJECTION_RMS.add_mistakes(
@@ -98,7 +105,10 @@ REPROJECTION_RMS.add_mistakes(
     ("both", "both_without_root", lambda residuals, axes: float(np.sum(axes**2))),
     ("both", "norm_of_everything", lambda residuals, axes: float(np.linalg.norm(residuals))),
     ("whole", "squares_everywhere", lambda residuals, result: result**2),
-    ("whole", "mean_distances_everywhere", _mean_distances_everywhere),
+    ("whole", "mean_distances_everywhere", _everywhere(lambda e: np.mean(np.abs(e), axis=0))),
+    ("whole", "largest", _everywhere(lambda e: np.max(np.abs(e), axis=0))),
+    ("whole", "median_absolute", _everywhere(lambda e: np.median(np.abs(e), axis=0))),
+    ("whole", "mean_removed", _everywhere(lambda e: np.std(e, axis=0))),
     ("order", "v_before_u", lambda axes, both: np.array([axes[1], axes[0], both])),
     ("order", "both_first", lambda axes, both: np.array([both, *axes])),
 )
@@ -124,11 +134,16 @@ def _least_squares(seed: int, rows: int, columns: int, sigma: float) -> tuple[Fl
     return J, noise - J @ np.linalg.lstsq(J, noise, rcond=None)[0]
 
 
+def _freedom(J: Floats, residuals: Floats) -> int:
+    M, P = J.shape
+    return M - P
+
+
 FOCAL_SIGMA = Exercise(
     name="intrinsics.focal_sigma",
     build=_build_sigma,
     steps={
-        "freedom": lambda J, residuals: J.shape[0] - J.shape[1],
+        "freedom": _freedom,
         "noise": lambda residuals, freedom: residuals @ residuals / freedom,  # a variance
         "information": lambda J: J.T @ J,
         "first": lambda information: np.linalg.inv(information)[0, 0],
@@ -164,10 +179,15 @@ FOCAL_SIGMA.add_mistakes(
     ("noise", "noise_not_squared", lambda e, freedom: math.sqrt(e @ e / freedom)),
     ("noise", "noise_summed", lambda e, freedom: e @ e),
     ("noise", "spread_of_residuals", lambda residuals, freedom: np.var(residuals)),
+    ("noise", "spread_of_residuals", lambda residuals, freedom: np.var(residuals, ddof=1)),
+    ("noise", "noise_not_squared", lambda e, freedom: np.sum(np.abs(e)) / freedom),
     ("noise", "two_dimensional_rms", lambda residuals, freedom: 2 * np.mean(residuals**2)),
     ("first", "others_known", lambda information: 1.0 / information[0, 0]),
     ("first", "not_inverted", lambda information: information[0, 0]),
     ("first", "last_parameter", lambda information: np.linalg.inv(information)[-1, -1]),
+    ("first", "second_parameter", lambda information: np.linalg.inv(information)[1, 1]),
+    ("first", "whole_row", lambda information: abs(np.sum(np.linalg.inv(information)[0]))),
+    ("information", "rows_for_columns", lambda J: np.linalg.pinv(np.linalg.pinv(J @ J.T)[:1, :1])),
     ("scale", "divided_by_noise", lambda noise, first: first / noise),
     ("root", "variance", lambda value: value),
     ("root", "ninety_five", lambda value: 1.96 * math.sqrt(value)),
