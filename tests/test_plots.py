@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import html
 from types import SimpleNamespace
 
 import numpy as np
@@ -23,6 +24,7 @@ from coursekit.simulation import (
     default_setup,
     hand_eye_session,
     tabletop,
+    unknown_sessions,
 )
 
 D435 = specifications.device("D435").unit
@@ -147,8 +149,10 @@ def test_point_cloud_shows_what_is_near_from_the_side_if_there_is_anything() -> 
     near[200:280, 300:500] = 0.45
     cases = ((near, (0.45, 0.45), True), (np.full_like(near, 0.9), (0.9, 0.9), False))
     for depth, shown, says in cases:
-        solid, above = pinhole.point_cloud(geometry.deproject_image(depth, D435.depth)).axes
+        solid, above, _ = pinhole.point_cloud(geometry.deproject_image(depth, D435.depth)).axes
         (dots,) = solid.collections
+        if says:  # one colour, one depth
+            assert dots.get_clim() == above.collections[0].get_clim() == pytest.approx((0.45, 0.9))
         z = np.asarray(dots._offsets3d[1])
         assert (z.min(), z.max()) == pytest.approx(shown)
         assert ("Z < 0.6 m" in solid.get_title()) == says
@@ -163,7 +167,7 @@ def test_the_spot_has_room_on_the_sensor() -> None:
         assert sensor.get_xlim()[0] < spot < sensor.get_xlim()[1] < 1.5
 
 
-def test_drag_draws_its_start_and_follows_a_slider() -> None:
+def test_drag_draws_its_start_and_follows_a_slider(monkeypatch) -> None:
     drag = plots.drag(
         pinhole.similar_triangles, focal_length_mm=(1, 4, 1.93), depth_m=(0.35, 1.2, 0.45)
     )
@@ -175,8 +179,13 @@ def test_drag_draws_its_start_and_follows_a_slider() -> None:
     depth.value = 0.5
     assert depth.value == 0.5
     assert image.value != before
-    bundle, _ = drag._repr_mimebundle_()
-    assert bundle["text/plain"] == pinhole.similar_triangles(1.93, 0.45).alt
+    shown: list = []
+    monkeypatch.setattr("IPython.display.display", lambda data, **_: shown.append(data))
+    drag._ipython_display_()
+    figure, words = shown
+    assert figure["text/plain"] == pinhole.similar_triangles(1.93, 0.45).alt
+    assert html.escape(figure["text/plain"]) in words["text/html"]
+    assert html.escape(figure["text/plain"]) in before
 
 
 @pytest.mark.parametrize("slider", [(1, 2), (2, 1, 1.5), (1, 2, 3), (1, 1, 1)])
@@ -324,7 +333,8 @@ def hand_eye_figures() -> dict[str, plots.LessonFigure]:
         "diversity": hand_eye.diversity({"this session": session.T_base_gripper}),
         "study": hand_eye.study(error_study(trials=5)),
         "more_poses": hand_eye.more_poses(counts, {"a": [3.0, 2.9]}, {"a": [1.0, 0.7]}),
-        "gaps": hand_eye.gaps([1.0, 2.0], [2.0]),
+        "agreement": hand_eye.agreement(unknown_sessions(11)),
+        "gaps": hand_eye.gaps([1.0, 2.0, 2.0], [False, False, True]),
         "touched": hand_eye.touched([[1.0, -1.0, 0.5], [2.0, 0.0, 0.1]]),
     }
 
@@ -333,8 +343,30 @@ def test_the_rig_is_drawn_where_forward_kinematics_puts_it(figures) -> None:
     q = np.array([0.0, 0.7, 1.3, 0.7, 0.0, 0.0])
     rig = default_setup("eye_in_hand")
     chain = figures["mounts"].axes[0].lines[0]
-    x, z = chain.get_xdata()[-1], chain.get_ydata()[-1]
-    assert (x, z) == pytest.approx(tuple(rig.arm.forward(q)[[0, 2], 3]))
+    end = [places[-1] for places in chain.get_data_3d()]
+    assert end == pytest.approx(list(rig.arm.forward(q)[:3, 3]))
+
+
+def test_the_letters_of_the_arrows_lie_on_nothing() -> None:
+    """From wherever one looks: no letter is nearer to a line, an arrow or a letter than it says."""
+    rigs = {mount: default_setup(mount) for mount in ("eye_in_hand", "eye_to_hand")}
+    joints = dict(
+        zip(rigs, [(0, 1.1, 1.6, -1.2, 0, 0), (0, 0.86, 0.31, 0.73, 0, 1.57)], strict=True)
+    )
+    for view_from_deg in (-150.0, -65.0, -20.0):
+        for ax in hand_eye.mounts(rigs, joints, view_from_deg).axes:
+            letters = {t.get_text(): np.array(t.xy) for t in ax.texts if t.get_text()}
+            assert set(letters) == {"T", "X", "C"}
+            away = [
+                np.hypot(*(ax.transData.transform(page) - place).T).min()
+                for place in letters.values()
+                for line in ax.lines
+                for x, y, _, w in [
+                    ax.get_proj() @ [*line.get_data_3d(), np.ones_like(line.get_data_3d()[0])]
+                ]
+                for page in [np.column_stack([x / w, y / w])]
+            ]
+            assert min(away) > hand_eye.CLEAR_PX
 
 
 def test_gaps_say_their_root_mean_squares(figures) -> None:
@@ -355,7 +387,6 @@ def error_budget_figures() -> dict[str, plots.LessonFigure]:
         "between_fingers": error_budget.between_fingers(
             budget.LESSON_GRIPPER, budget.CUBE, table.noise_covariance, (1.0, 2.0, 0.5), others
         ),
-        "distances": error_budget.distances(budget.best_distance(table)),
         "misses": error_budget.misses(missed),
     }
 

@@ -11,24 +11,24 @@ import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import nbformat
 import numpy as np
 
 import coursekit as ck
-from coursekit.arm import ArmErrors
 from coursekit.boards import Board
 from coursekit.boards.board import seen
 from coursekit.boards.detector import SESSION
 from coursekit.budget.handover import REFERENCE
 from coursekit.cameras.capture import session_card
 from coursekit.cameras.simulated import SimulatedCamera
-from coursekit.hand_eye.poses import Mount
+from coursekit.hand_eye.poses import MOUNTS
 from coursekit.intrinsics import diagnose
 from coursekit.intrinsics.diagnosis import POWER_FILE
 from coursekit.results import Quantity, write_bytes, write_json
-from coursekit.simulation.arm_sessions import SIMULATED, rendered_session
+from coursekit.simulation.arm_sessions import session_folder
 from coursekit.simulation.corner_sessions import Effects, corner_session, view_poses
 from coursekit.specifications import DATA
 from coursekit.submission.format import Conclusion, Stack, Submission, bundle_bytes
@@ -45,15 +45,7 @@ ORIGIN = (
     "seed looks at the board from random places, as a hand would hold it. No real camera took it."
 )
 
-# The seed, which names the arm too (one arm carries both), and whose lens.
-HAND_EYE: dict[Mount, tuple[int, str]] = {"eye_in_hand": (1, "D405"), "eye_to_hand": (1, "D435")}
-HAND_EYE_VIEWS = 20
-HAND_EYE_ORIGIN = (
-    "Rendered by tools/make_data.py: a WidowX AI with hidden errors, its seed as given, stops at "
-    "each pose; the lens is this device's colour camera, and the intrinsics given are the true "
-    "ones. The table behind a board in the gripper goes along with it. No real arm or camera took "
-    "it. Where the camera really is, coursekit.simulation.arm_sessions.truth_of tells."
-)
+HAND_EYE_SEED = 1  # names the arm too: one arm carries both cameras
 
 
 def readme_picture() -> None:
@@ -148,22 +140,10 @@ def times_named(cause: str, size: float, seeds: Sequence[int] = POWER_SEEDS) -> 
 
 def hand_eye_sessions() -> None:
     """data/hand_eye_in_hand/, data/hand_eye_to_hand/: the sessions of notebook 04, without X."""
-    for mount, (seed, device) in HAND_EYE.items():
-        folder = DATA / f"hand_{mount}"
-        shutil.rmtree(folder, ignore_errors=True)
-        session, _, images = rendered_session(mount, seed, HAND_EYE_VIEWS, ArmErrors())
-        files = {
-            f"{name}.jpg": _jpeg(image, 92)
-            for name, image in zip(session.names, images, strict=True)
-        }
-        about = {
-            "camera": f"Simulated {device}",
-            "source": SIMULATED,
-            "seed": seed,
-            "views": HAND_EYE_VIEWS,
-            "origin": HAND_EYE_ORIGIN,
-        }
-        replace(session, names=tuple(files)).save(folder, files, about)
+    for mount in MOUNTS:
+        shutil.rmtree(DATA / f"hand_{mount}", ignore_errors=True)
+        made = session_folder(mount, HAND_EYE_SEED, DATA)
+        made.rename(DATA / f"hand_{mount}")
 
 
 SAMPLES = DATA / "sample_bundles"
@@ -218,10 +198,12 @@ def _finished(student: str, seed: int) -> Submission:
         left, top = left + (width - SAMPLE_PX) // 2, top + (height - SAMPLE_PX) // 2
         window = (left, top, SAMPLE_PX, SAMPLE_PX)
         stacks.append(ck.submission.stack(frames, window, distance_m))
-    table, law = _table(camera, stacks)
+    found, law, own = _table(camera, stacks)
     predicted_mm = 1000 * law.std_m([stack.distance_m for stack in stacks])[0]
+    whole = measured(camera, stacks, found, law, predicted_mm.tolist(), 0.0, 0.060, own)
     return replace(
-        measured(camera, stacks, table, law, predicted_mm.tolist(), 0.0, 0.060),
+        whole,
+        claims=replace(whole.claims, mismatches="left out"),
         student=student,
         made=SAMPLE_MADE,
         versions={"coursekit": "0.1.0"},
@@ -231,9 +213,9 @@ def _finished(student: str, seed: int) -> Submission:
 
 def _table(
     camera: ck.cameras.Camera, stacks: Sequence[Stack]
-) -> tuple[dict[str, Quantity], ck.stereo.NoiseFit]:
-    """The table and the fit of notebook 02."""
-    table, seen = {}, []
+) -> tuple[dict[str, Quantity], ck.stereo.NoiseFit, dict[float, Any]]:
+    """What notebook 02 measures, its fit, and a student's own table of the same."""
+    found, own, seen = {}, {}, []
     for stack in stacks:
         window = (0, 0, SAMPLE_PX, SAMPLE_PX)
         stats = ck.stereo.window_stats(stack.counts, window, camera.depth_scale_m)
@@ -241,9 +223,9 @@ def _table(
         at = f"at_{1000 * stack.distance_m:.0f}_mm"
         bias_mm = 1000 * (stats.depth_m - stack.distance_m)
         std_mm, std_se_mm = 1000 * stats.pixel_std_m, 1000 * stats.pixel_std_error_m
-        table[f"depth_bias_{at}"] = Quantity(bias_mm, "mm", 1000 * stats.depth_error_m, "bias")
-        table[f"depth_std_{at}"] = Quantity(std_mm, "mm", std_se_mm, "noise")
-        table[f"invalid_{at}"] = Quantity(stats.invalid_fraction, "1")
+        found[f"depth_std_{at}"] = Quantity(std_mm, "mm", std_se_mm, "noise")
+        errors = 1000 * stats.depth_error_m, std_se_mm
+        own[stack.distance_m] = (bias_mm, errors[0], std_mm, errors[1], stats.invalid_fraction)
     law = ck.stereo.fit_noise(
         [stack.distance_m for stack in stacks],
         [stats.pixel_std_m for stats in seen],
@@ -253,7 +235,7 @@ def _table(
         camera.depth_scale_m,
         exponent=2,
     )
-    return table, law
+    return found, law, own
 
 
 def _weak(whole: Submission) -> Submission:
