@@ -67,38 +67,7 @@ def _difference(between: Callable[[Any], Any]) -> Step:
     return noise
 
 
-DEPTH_NOISE.add_mistakes(
-    ("power", "linear_in_Z", lambda Z: Z),
-    ("power", "linear_in_Z", lambda Z: 2 * Z),
-    ("power", "cubed", lambda Z: Z**3),
-    ("constant", "millimetres", lambda fx, baseline: fx * baseline * 1000),
-    ("constant", "millimetres", lambda fx, baseline: fx * baseline / 1000),
-    ("constant", "baseline_forgotten", lambda fx, baseline: fx),
-    ("constant", "fx_forgotten", lambda fx, baseline: baseline),
-    ("constant", "constant_forgotten", lambda fx, baseline: 1.0),
-    # The notebook calls the simulated camera's baseline B.
-    ("constant", "other_baseline", lambda fx, baseline: fx * device("D435").unit.baseline_m),
-    ("constant", "other_baseline", lambda fx, baseline: fx * 0.050),
-    ("divide", "multiplied", lambda power, constant: power * constant),
-    ("constant", "baseline_behind_the_fraction", lambda fx, baseline: fx / baseline),
-    ("constant", "focal_length_behind_the_fraction", lambda fx, baseline: baseline / fx),
-    ("divide", "upside_down", lambda power, constant: constant / power),
-    ("noise", "noise_divided", lambda slope, sigma_d, Z: slope / sigma_d),
-    ("noise", "noise_forgotten", lambda slope, sigma_d, Z: slope),
-    ("noise", "root_of_two", lambda slope, sigma_d, Z: math.sqrt(2) * slope * sigma_d),
-    # fx B / (d - sigma_d) - Z; Z - fx B / (d + sigma_d); half of the two together; and the same
-    # with half of sigma_d to each side.
-    ("noise", "difference", _difference(lambda part: 1 - part)),
-    ("noise", "difference", _difference(lambda part: 1 + part)),
-    ("noise", "difference", _difference(lambda part: 1 - part**2)),
-    ("noise", "difference", _difference(lambda part: 1 - (part / 2) ** 2)),
-    ("result", "variance", lambda sigma: sigma**2),
-    ("result", "root", np.sqrt),
-    ("result", "negative", lambda sigma: -sigma),
-)
-DEPTH_NOISE.add_mistakes(
-    ("", "disparity", lambda law: lambda Z, fx, baseline, sigma_d: fx * baseline / Z), alone=True
-)
+DEPTH_NOISE.read_mistakes(globals())
 
 
 # --- robust_depth ---
@@ -251,35 +220,4 @@ def _height_width_swapped(image: Floats, top: int, bottom: int, left: int, right
     return _cut(_inside)(image, top, min(bottom, width), left, min(right, height))
 
 
-ROBUST_DEPTH.add_mistakes(
-    ("read", "u_v_swapped", lambda u, v: (v, u)),
-    ("round", "truncated", int),
-    ("window", "last_missing", lambda v, u, half: (v - half, v + half, u - half, u + half)),
-    ("window", "half_ignored", lambda row, column, half: _window(row, column, 2)),
-    ("window", "half_halved", lambda row, column, half: _window(row, column, half // 2)),
-    ("shortcut", "pixel_alone", _pixel_alone),
-    ("shortcut", "pixel_alone", _pixel_alone_unless_zero),
-    ("cut", "negative_index", _cut(_as_they_come)),
-    ("cut", "negative_index", _cut(_as_they_come, _inside)),
-    ("cut", "negative_index", _cut(_inside, _as_they_come)),
-    ("cut", "negative_index", _cut(lambda a, b, size: np.arange(a, min(b, size)))),
-    ("cut", "negative_end", _cut(lambda a, b, size: slice(max(a, 0), b))),
-    ("cut", "moved_inside", _cut(_moved)),
-    ("cut", "border_repeated", _cut(lambda a, b, size: np.clip(range(a, b), 0, size - 1))),
-    ("cut", "border_lost", _cut(lambda a, b, size: _inside(a, min(b, size - 1), size))),
-    ("cut", "border_lost", _cut(lambda a, b, size: slice(max(a, 0), min(b, size - 1)))),
-    ("cut", "modulo", _cut(lambda a, b, size: np.arange(a, b) % size)),
-    ("cut", "height_width_swapped", _height_width_swapped),
-    ("cut", "border_refused", _cut(lambda a, b, size: slice(a, b if a >= 0 and b <= size else a))),
-    ("zeros", "zeros_counted", lambda pixels: pixels),
-    ("finite", "nan_counted", lambda pixels: pixels),
-    ("finite", "infinity_counted", lambda pixels: pixels[~np.isnan(pixels)]),
-    ("enough", "min_valid_ignored", lambda valid, pixels, min_valid: True),
-    ("enough", "min_valid_fixed", lambda valid, pixels, min_valid: len(valid) >= 5),
-    ("enough", "one_too_strict", lambda valid, pixels, min_valid: len(valid) > min_valid),
-    ("enough", "all_pixels_counted", lambda valid, pixels, min_valid: pixels.size >= min_valid),
-    ("none", "zero_returned", lambda: 0.0),
-    ("middle", "mean", lambda valid: float(np.mean(valid))),
-    ("middle", "one_of_the_middle_two", lambda valid: float(np.sort(valid)[len(valid) // 2])),
-    ("middle", "one_of_the_middle_two", lambda valid: float(np.sort(valid)[(len(valid) - 1) // 2])),
-)
+ROBUST_DEPTH.read_mistakes(globals())

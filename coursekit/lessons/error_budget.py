@@ -47,22 +47,7 @@ SENSITIVITIES = Exercise(
 )
 
 
-SENSITIVITIES.add_mistakes(
-    ("pixel", "distance_forgotten", lambda u, Z, fx, cx: 1 / fx),
-    ("pixel", "not_differentiated", lambda u, Z, fx, cx: (u - cx) * Z / fx),
-    ("pixel", "upside_down", lambda u, Z, fx, cx: fx / Z),
-    ("depth", "centre_forgotten", lambda u, Z, fx, cx: u / fx),
-    ("depth", "other_way", lambda u, Z, fx, cx: (cx - u) / fx),
-    ("depth", "not_differentiated", lambda u, Z, fx, cx: (u - cx) * Z / fx),
-    ("depth", "angle", lambda u, Z, fx, cx: math.atan2(u - cx, fx)),
-    ("depth", "sine", lambda u, Z, fx, cx: (u - cx) / math.hypot(u - cx, fx)),
-    ("leak", "wrong_price", lambda dX_du, dX_dZ, depth_error, Z: dX_du * depth_error),
-    ("leak", "sign_lost", lambda dX_du, dX_dZ, depth_error, Z: abs(dX_dZ * depth_error)),
-    ("leak", "millimetres", lambda dX_du, dX_dZ, depth_error, Z: 1000 * dX_dZ * depth_error),
-    ("leak", "landing_place", lambda dX_du, dX_dZ, depth_error, Z: dX_dZ * (Z + depth_error)),
-    ("order", "all_millimetres", lambda u, Z, leak: np.array([1000 * u, Z, 1000 * leak])),
-    ("order", "exchanged", lambda dX_du, dX_dZ, leak: np.array([dX_dZ, dX_du, leak])),
-)
+SENSITIVITIES.read_mistakes(globals())
 
 
 # --- add_up ---
@@ -161,36 +146,4 @@ def _third_of(toward: Any, value: float) -> float:
     return value if toward is None else abs(toward[0])
 
 
-ADD_UP.add_mistakes(
-    ("kinds", "noise_in_the_bias", lambda rows: (_sorted(rows)[0], rows)),
-    ("kinds", "bias_in_the_noise", lambda rows: (rows, _sorted(rows)[1])),
-    ("along", "not_projected", lambda toward: 1.0),
-    ("along", "direction_sign", lambda toward: 1.0 if toward is None else toward[0]),
-    ("along", "other_axis", lambda toward: 1.0 if toward is None else abs(toward[1])),
-    ("along", "any_way_nothing", lambda toward: 0.0 if toward is None else abs(toward[0])),
-    ("most", "third_of_the_worst", lambda low, high, toward: high * _third_of(toward, 3**-0.5)),
-    ("most", "least_for_most", lambda low, high, toward: low),
-    ("most", "middle_for_most", lambda low, high, toward: (low + high) / 2),
-    ("noise", "noise_added", sum),
-    ("noise", "noise_squared", lambda values: _root(values) ** 2),
-    ("noise", "noise_mean", lambda values: _root(values) / max(len(values), 1) ** 0.5),
-    ("worst", "worst_in_quadrature", _root),
-    ("quadrature", "quadrature_added", sum),
-    ("quadrature", "quadrature_squared", lambda values: _root(values) ** 2),
-    ("square", "mean_squared", lambda low, high: ((low + high) / 2) ** 2),
-    ("square", "largest_squared", lambda low, high: high * high),
-    ("square", "ends_squared", lambda low, high: (low * low + high * high) / 2),
-    ("square", "spread_squared", lambda low, high: (high - low) ** 2 / 12),
-    ("third", "third_forgotten", lambda: 1.0),
-    ("third", "third_rooted", lambda: 3**-0.5),
-    ("third", "half_for_third", lambda: 0.5),
-    ("rigs", "noise_in_the_share", lambda squares, noises: sum(squares) + _root(noises) ** 2),
-    ("sigma", "variance_for_sigma", lambda variance, most: variance),
-    ("sigma", "quadrature_for_sigma", lambda variance, most: _root(most)),
-    ("sigma", "worst_for_sigma", lambda variance, most: sum(most)),
-    ("share", "one_sided", lambda z: _beyond(z) / 2),
-    ("share", "within_for_beyond", lambda z: 1 - _beyond(z)),
-    ("share", "share_in_percent", lambda z: 100 * _beyond(z)),
-    ("share", "root_two_lost", math.erfc),
-    ("order", "sums_exchanged", lambda n, w, q, share: np.array([n, q, w, share])),
-)
+ADD_UP.read_mistakes(globals())

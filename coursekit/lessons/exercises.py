@@ -114,12 +114,20 @@ class Exercise:
 
         One name may come several times: other ways to write the same misconception. What the
         student reads stands under it in the lesson's TOML file: what is wrong, and a question that
-        leads on.
+        leads on. Without a step, the wrong one is made of the whole function, and stands alone.
         """
-        texts = questions.lesson_texts(self.name.partition(".")[0])["mistakes"]
+        texts = self._written("mistakes")
         for step, name, instead in wrong:
             says, ask = (" ".join(text.split()) for text in texts[name])
-            self.mistakes.append(Mistake(name, says, ask, step, instead, alone))
+            self.mistakes.append(Mistake(name, says, ask, step, instead, alone or not step))
+
+    def read_mistakes(self, names: dict[str, Any]) -> None:
+        """Add the wrong steps that stand in the TOML file; names: what their Python may use."""
+        for name, ways in self._written("wrong")[self.function].items():
+            self.add_mistakes(*((step, name, eval(code, names)) for step, code in ways))
+
+    def _written(self, table: str) -> dict[str, Any]:
+        return dict(questions.lesson_texts(self.name.partition(".")[0])[table])
 
     def model(self, *mistakes: Mistake) -> Model:
         """The right function with these mistakes built in."""

@@ -102,31 +102,10 @@ def _places_subtracted(sign_A: float, sign_B: float) -> Step:
 
 _inverse = np.linalg.inv
 MOTION_PAIR.add_mistakes(
-    (
-        "",
-        "elementwise",
-        _in_place_of(lambda gi, gj, bi, bj: (_inverse(gj) * gi, bj * _inverse(bi))),
-    ),
-    ("", "elementwise", _in_place_of(lambda gi, gj, bi, bj: (gj * gi, bj * bi))),
-    ("", "subtracted", _in_place_of(lambda gi, gj, bi, bj: (gj - gi, bj - bi))),
-    ("", "subtracted", _in_place_of(lambda gi, gj, bi, bj: (gi - gj, bi - bj))),
-    ("", "subtracted", _in_place_of(lambda gi, gj, bi, bj: (gi - gj, bj - bi))),
-    *(("", "places_subtracted", _places_subtracted(a, b)) for a in (1, -1) for b in (1, -1)),
+    *(('', 'places_subtracted', _places_subtracted(a, b)) for a in (1, -1) for b in (1, -1)),
     alone=True,
 )
-MOTION_PAIR.add_mistakes(
-    ("read", "gripper_twice", lambda gi, gj, bi, bj: (gi, gj, gi, gj)),
-    ("read", "board_twice", lambda gi, gj, bi, bj: (bi, bj, bi, bj)),
-    ("inverse", "transposed_pose", lambda T: T.T),
-    ("inverse", "translation_not_turned", lambda T: make_transform(T[:3, :3].T, -T[:3, 3])),
-    ("inverse", "not_inverted", lambda T: T),
-    ("A", "motion_in_base", lambda first, second, inverse: second @ inverse(first)),
-    ("A pair", "a_exchanged", lambda i, j: (j, i)),
-    ("B pair", "b_exchanged", lambda i, j: (j, i)),
-    ("B", "motion_in_board", lambda first, second, inverse: inverse(second) @ first),
-    ("order", "both_exchanged", lambda A, B: np.stack([np.linalg.inv(A), np.linalg.inv(B)])),
-    ("order", "b_first", lambda A, B: np.stack([B, A])),
-)
+MOTION_PAIR.read_mistakes(globals())
 
 
 # --- rotation_half ---
@@ -206,15 +185,6 @@ def _mirror_image(a: Floats, b: Floats) -> Floats:
     return mirror
 
 
-ROTATION_HALF.add_mistakes(
-    ("result", "inverse_of_x", lambda R: R.T),
-    ("turn", "mirror_image", _mirror_image),
-    ("turn", "not_a_rotation", lambda a, b: np.linalg.lstsq(b, a, rcond=None)[0].T),
-    ("used", "first_motion_only", lambda a, b: (a[:1], b[:1])),
-    ("result", "negative", lambda R: -R),
-    ("result", "not_scaled", lambda R: R / np.sqrt(3)),
-    ("result", "not_scaled_and_negative", lambda R: -R / np.sqrt(3)),
-)
 
 
 def _eigenvectors(_: Model) -> Model:
@@ -245,13 +215,10 @@ def _nearest(M: Floats) -> Floats:
 
 
 ROTATION_HALF.add_mistakes(
-    ("", "axis_without_sign", _eigenvectors),
-    ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: U @ D @ Vt.T)),
-    ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: Vt @ D @ U.T)),
-    ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: U @ Vt.T)),
-    ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: Vt @ U.T)),
-    ("", "same_frame", lambda _: lambda A, B: A[0] @ B[0].T),
-    ("", "same_frame", lambda _: lambda A, B: (A @ np.swapaxes(B, 1, 2)).mean(axis=0)),
-    ("", "same_frame", lambda _: lambda A, B: _nearest((A @ np.swapaxes(B, 1, 2)).mean(axis=0))),
+    ('turn', 'transposed_factor', _kabsch(lambda U, Vt, D: U @ D @ Vt.T)),
+    ('turn', 'transposed_factor', _kabsch(lambda U, Vt, D: Vt @ D @ U.T)),
+    ('turn', 'transposed_factor', _kabsch(lambda U, Vt, D: U @ Vt.T)),
+    ('turn', 'transposed_factor', _kabsch(lambda U, Vt, D: Vt @ U.T)),
     alone=True,
 )
+ROTATION_HALF.read_mistakes(globals())

@@ -97,21 +97,7 @@ for _name, _axis in _AXIS_MISTAKES.items():
         ("axis", _name, _axis),
         ("shown", _name, lambda residuals, axes, axis=_axis: axis(residuals)),
     )
-REPROJECTION_RMS.add_mistakes(
-    ("both", "both_over_2n", lambda residuals, axes: float(np.sqrt(np.mean(axes**2)))),
-    ("both", "mean_distance", lambda e, axes: float(np.mean(np.linalg.norm(e, axis=1)))),
-    ("both", "added", lambda residuals, axes: float(np.sum(axes))),
-    ("both", "mean_of_axes", lambda residuals, axes: float(np.mean(axes))),
-    ("both", "both_without_root", lambda residuals, axes: float(np.sum(axes**2))),
-    ("both", "norm_of_everything", lambda residuals, axes: float(np.linalg.norm(residuals))),
-    ("whole", "squares_everywhere", lambda residuals, result: result**2),
-    ("whole", "mean_distances_everywhere", _everywhere(lambda e: np.mean(np.abs(e), axis=0))),
-    ("whole", "largest", _everywhere(lambda e: np.max(np.abs(e), axis=0))),
-    ("whole", "median_absolute", _everywhere(lambda e: np.median(np.abs(e), axis=0))),
-    ("whole", "mean_removed", _everywhere(lambda e: np.std(e, axis=0))),
-    ("order", "v_before_u", lambda axes, both: np.array([axes[1], axes[0], both])),
-    ("order", "both_first", lambda axes, both: np.array([both, *axes])),
-)
+REPROJECTION_RMS.read_mistakes(globals())
 
 
 # --- focal_sigma ---
@@ -171,24 +157,4 @@ FOCAL_SIGMA = Exercise(
 )
 
 
-FOCAL_SIGMA.add_mistakes(
-    ("freedom", "nothing_fitted", lambda J, residuals: J.shape[0]),
-    ("freedom", "one_parameter", lambda J, residuals: J.shape[0] - 1),
-    ("freedom", "corners_counted", lambda J, residuals: J.shape[0] / 2 - J.shape[1]),
-    ("noise", "no_noise", lambda residuals, freedom: 1.0),
-    ("noise", "noise_not_squared", lambda e, freedom: math.sqrt(e @ e / freedom)),
-    ("noise", "noise_summed", lambda e, freedom: e @ e),
-    ("noise", "spread_of_residuals", lambda residuals, freedom: np.var(residuals)),
-    ("noise", "spread_of_residuals", lambda residuals, freedom: np.var(residuals, ddof=1)),
-    ("noise", "noise_not_squared", lambda e, freedom: np.sum(np.abs(e)) / freedom),
-    ("noise", "two_dimensional_rms", lambda residuals, freedom: 2 * np.mean(residuals**2)),
-    ("first", "others_known", lambda information: 1.0 / information[0, 0]),
-    ("first", "not_inverted", lambda information: information[0, 0]),
-    ("first", "last_parameter", lambda information: np.linalg.inv(information)[-1, -1]),
-    ("first", "second_parameter", lambda information: np.linalg.inv(information)[1, 1]),
-    ("first", "whole_row", lambda information: abs(np.sum(np.linalg.inv(information)[0]))),
-    ("information", "rows_for_columns", lambda J: np.linalg.pinv(np.linalg.pinv(J @ J.T)[:1, :1])),
-    ("scale", "divided_by_noise", lambda noise, first: first / noise),
-    ("root", "variance", lambda value: value),
-    ("root", "ninety_five", lambda value: 1.96 * math.sqrt(value)),
-)
+FOCAL_SIGMA.read_mistakes(globals())

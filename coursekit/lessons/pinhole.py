@@ -183,45 +183,7 @@ def _distortion_of_centred_uv(points: Floats, normalise: Step, bend: Step, to_pi
     return u + cx, v + cy
 
 
-PROJECT.add_mistakes(
-    ("normalise", "no_division", lambda X, Y, Z: (X, Y, 1.0)),
-    ("normalise", "no_division", lambda X, Y, Z: (X, Y, Z)),
-    ("normalise", "divided_by_range", _divided_by_range),
-    ("normalise", "centre_divided", lambda X, Y, Z: (X / Z, Y / Z, 1.0 / Z)),
-    ("normalise", "upside_down", lambda X, Y, Z: (Z / X, Z / Y, 1.0)),
-    ("normalise", "y_up", lambda X, Y, Z: (X / Z, -Y / Z, 1.0)),
-    ("to_pixels", "y_up", _pixels_by(lambda fx, fy, cx, cy: (fx, -fy, cx, cy))),
-    ("to_pixels", "fx_fy_swapped", _pixels_by(lambda fx, fy, cx, cy: (fy, fx, cx, cy))),
-    ("to_pixels", "fx_for_both", _pixels_by(lambda fx, fy, cx, cy: (fx, fx, cx, cy))),
-    ("to_pixels", "centre_before_scale", _centre_first),
-    ("to_pixels", "K_transposed", _K_transposed),
-    ("to_pixels", "cx_cy_swapped", _pixels_by(lambda fx, fy, cx, cy: (fx, fy, cy, cx))),
-    ("to_pixels", "principal_point_forgotten", _pixels_by(lambda fx, fy, *_: (fx, fy, 0.0, 0.0))),
-    ("to_pixels", "principal_point_subtracted", _pixels_by(_centre_turned)),
-    ("read", "p1_p2_swapped", lambda k1, k2, p1, p2, k3: (k1, k2, p2, p1, k3)),
-    ("read", "k3_before_p1", lambda k1, k2, p1, p2, k3: (k1, k2, p2, k3, p1)),
-    ("read", "r6_missing", lambda k1, k2, p1, p2, k3: (k1, k2, p1, p2, 0.0)),
-    ("read", "tangential_missing", lambda k1, k2, p1, p2, k3: (k1, k2, 0.0, 0.0, k3)),
-    ("bend", "factor_2_missing", _bent(cross=1)),
-    ("bend", "factor_2_missing", _bent(square=1)),
-    ("bend", "factor_2_missing", _bent(cross=1, square=1)),
-    ("bend", "x_overwritten", _x_overwritten),
-    ("bend", "tangential_after_radial", _tangential_after_radial),
-    ("bend", "one_missing", _bent(one=0)),
-    ("bend", "r_for_r2", _bent((0.5, 1, 1.5))),
-    ("bend", "r_for_r2", _bent((0.5, 1, 1.5), tangential=0.5)),
-    ("bend", "r2_for_r", _bent((2, 4, 6))),
-    ("bend", "r2_for_r", _bent((2, 4, 6), tangential=2)),
-    ("bend", "r2_for_r", _bent((1, 4, 6))),
-    ("image", "bent_before_division", _bent_before_division),
-    ("image", "distortion_in_pixels", _distortion_in_pixels),
-    ("image", "distortion_in_pixels", _distortion_of_centred_uv),
-    ("columns", "output_swapped", lambda u, v: np.stack([v, u], axis=1)),
-    ("columns", "rounded", lambda u, v: np.rint(np.stack([u, v], axis=1))),
-    ("columns", "rounded", lambda u, v: np.trunc(np.stack([u, v], axis=1))),
-    ("columns", "half_pixel", lambda u, v: np.stack([u, v], axis=1) + 0.5),
-    ("columns", "half_pixel", lambda u, v: np.stack([u, v], axis=1) - 0.5),
-)
+PROJECT.read_mistakes(globals())
 
 
 # --- deproject ---
@@ -328,28 +290,6 @@ def _along_ray(x: Floats, y: Floats, w: Any, depth: Floats) -> Any:
     return _scale(x, y, w, depth / np.hypot(w, np.hypot(x, y)))
 
 
-DEPROJECT.add_mistakes(
-    ("rays", "inverse_missing", lambda u, v, *lens: (*_to_pixels(u, v, 1.0, *lens), 1.0)),
-    ("rays", "inverse_transposed", _transposed(divided=False)),
-    ("rays", "inverse_transposed", _transposed(divided=True)),
-    ("rays", "principal_point_forgotten", _rays_by(lambda fx, fy, *_: (fx, fy, 0.0, 0.0))),
-    ("rays", "principal_point_added", _rays_by(_centre_turned)),
-    ("rays", "brackets_missing", lambda u, v, fx, fy, cx, cy: (u - cx / fx, v - cy / fy, 1.0)),
-    ("rays", "times_focal_length", _rays_by(lambda fx, fy, cx, cy: (1 / fx, 1 / fy, cx, cy))),
-    ("rays", "fx_fy_swapped", _rays_by(lambda fx, fy, cx, cy: (fy, fx, cx, cy))),
-    ("rays", "fx_for_both", _rays_by(lambda fx, fy, cx, cy: (fx, fx, cx, cy))),
-    ("rays", "cx_cy_swapped", _rays_by(lambda fx, fy, cx, cy: (fx, fy, cy, cx))),
-    ("rays", "input_swapped", lambda u, v, *lens: _to_normalised(v, u, *lens)),
-    ("rays", "y_up", _rays_by(lambda fx, fy, cx, cy: (fx, -fy, cx, cy))),
-    ("rays", "half_pixel", lambda u, v, *lens: _to_normalised(u + 0.5, v + 0.5, *lens)),
-    ("rays", "half_pixel", lambda u, v, *lens: _to_normalised(u - 0.5, v - 0.5, *lens)),
-    ("scale", "depth_along_ray", _along_ray),
-    ("scale", "millimetres", lambda x, y, w, depth: _scale(x, y, w, 1000 * depth)),
-    ("scale", "millimetres", lambda x, y, w, depth: _scale(x, y, w, depth / 1000)),
-    ("scale", "not_scaled", lambda x, y, w, depth: (x, y, w * depth)),
-    ("scale", "divided_by_depth", lambda x, y, w, depth: (x / depth, y / depth, w * depth)),
-    ("scale", "depth_forgotten", lambda x, y, w, depth: (x, y, w * np.ones_like(depth))),
-)
 
 
 # The coefficients and the equation: what goes wrong in the first exercise does so in this one. But
@@ -390,11 +330,7 @@ def _overwritten(rounds: int) -> Step:
     return unbend
 
 
-DEPROJECT.add_mistakes(
-    ("unbend", "distorted_again", lambda x, y, bend, *dist: bend(x, y)),
-    ("unbend", "one_step", _iterate(1)),
-    ("unbend", "one_step", _divide(1)),
-)
+DEPROJECT.read_mistakes(globals())
 
 # With more rounds than these, all cases agree. Of each long family a few are tried in pairs, too.
 for _name, _family, _every, _in_pairs in (
