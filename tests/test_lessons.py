@@ -128,13 +128,14 @@ def test_two_mistakes_are_called_more_than_one(exercise: Exercise) -> None:
     steps = list(exercise.steps)
     alone = {}  # numbers of each mistake by itself
     pairs = itertools.permutations([m for m in exercise.mistakes if not m.alone], 2)
-    for a, b in itertools.islice(pairs, None, None, 1 if NIGHTLY else 3):
-        if steps.index(a.step) >= steps.index(b.step):
+    for a, b in itertools.islice(pairs, None, None, 1 if NIGHTLY else 7):
+        if steps.index(a.step) >= steps.index(b.step) or a.name == b.name:
             continue
         pair = exercise.model(a, b)
         verdict = exercise.judge(pair)
-        assert verdict.kind == "wrong"
-        if "more than one mistake" in verdict.headline:
+        assert verdict.kind in ("wrong", "raised")  # what is no pose has no inverse
+        if "more than one mistake" in repr(verdict) or verdict.named in (None, "constant"):
+            assert verdict.named or verdict.kind == "raised"
             continue
         both = answered(pair, exercise.cases)
         for mistake in exercise.mistakes:

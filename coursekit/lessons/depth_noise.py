@@ -11,7 +11,7 @@ import numpy as np
 
 from coursekit.arrays import Floats
 from coursekit.lessons.exercises import Exercise, Model, Step
-from coursekit.specifications import device
+from coursekit.specifications import device  # noqa: F401  a wrong step in the TOML file uses it
 
 Bounds = tuple[int, int, int, int]  # first row, the one after the last; the same for columns
 

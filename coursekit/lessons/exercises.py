@@ -21,10 +21,8 @@ from __future__ import annotations
 import ast
 import inspect
 import itertools
-import re
 import traceback
 import warnings
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
@@ -124,7 +122,9 @@ class Exercise:
     def read_mistakes(self, names: dict[str, Any]) -> None:
         """Add the wrong steps that stand in the TOML file; names: what their Python may use."""
         for name, ways in self._written("wrong")[self.function].items():
-            self.add_mistakes(*((step, name, eval(code, names)) for step, code in ways))
+            self.add_mistakes(
+                *((step, name, eval(" ".join(code.split()), names)) for step, code in ways)
+            )
 
     def _written(self, table: str) -> dict[str, Any]:
         return dict(questions.lesson_texts(self.name.partition(".")[0])[table])
@@ -218,7 +218,10 @@ class Exercise:
                 return self._say("wrong", text, self._given(args))
         return self._judged(values, expected, formal)
 
-    def _right(self) -> Verdict:
+    def _right(self, formal: list[Mistake]) -> Verdict:
+        if formal:
+            right = f"The numbers are right.{self._later}"
+            return self._one(formal[0], right) if len(formal) == 1 else self._several(formal[0])
         count = len(self.cases)
         if self.part_of and self.part_of.core:
             core, others = self.part_of.core, len(self.part_of.cases) - count
@@ -232,63 +235,63 @@ class Exercise:
     ) -> Verdict:
         """The verdict on results of the right shape; formal: what else is wrong with them."""
         agree = [self._agrees(v, e) for v, e in zip(values, expected, strict=True)]
-        if all(agree) and formal:
-            right = f"The numbers are right.{self._later}"
-            return self._one(formal[0], right) if len(formal) == 1 else self._several(formal[0])
         if all(agree):
-            return self._right()
+            return self._right(formal)
         count = f"{sum(agree)} of {self._all_cases} agree.{self._later}"
         first = agree.index(False)
         evidence = self._evidence(first, values[first], expected[first])
         if formal:
             return self._several(formal[0], count, evidence)
         relation = self._relation(values, expected)
-        told = relation and relation[0] in ("runs_away", "constant")
+        mistakes = self._found(values, relation in ("runs_away", "constant"))
+        if len({m.name for m in mistakes}) > 1:
+            return self._several(self._seen_in(first, mistakes, expected[first]), count, evidence)
+        if self.core and not mistakes:  # what is wrong there may hide behind the rest
+            of_core = [i for i, args in enumerate(self.cases) if self.is_core(args)]
+            ours, wanted = ([of[i] for i in of_core] for of in (values, expected))
+            verdict = self._core_alone()._judged(ours, wanted, [])
+            if verdict.named:
+                return verdict
+        if relation and not mistakes:
+            mistakes = (_device(relation, "your result", "", replace),)
+        if mistakes:
+            return self._one(mistakes[0], count, evidence)
+        return self._say("wrong", f"not right yet. {count}", evidence, BY_HAND)
+
+    def _found(self, values: list[Floats], told: bool) -> tuple[Mistake, ...]:
+        """The first mistakes that give these values; told: without the device's."""
         for mistakes in self._combinations():
             if told and mistakes[-1].device:
                 break
             if self._explains(mistakes, values):
-                if len(mistakes) > 1:
-                    seen = self._seen_in(first, mistakes, expected[first])
-                    return self._several(seen, count, evidence)
-                return self._one(mistakes[0], count, evidence)
-        if self.core:  # what goes wrong there may hide behind the rest
-            rows = zip(values, expected, map(self.is_core, self.cases), strict=True)
-            of_core = [(value, want) for value, want, core in rows if core]
-            verdict = self._core_alone()._judged(*map(list, zip(*of_core, strict=True)), [])
-            if verdict.named:
-                return verdict
-        if relation:
-            return self._one(_device(*relation, "", replace), count, evidence)
-        text = f"not right yet. {count}"
-        return self._say("wrong", text, evidence, *self._right_parts(values, expected), BY_HAND)
+                return mistakes
+        return ()
 
-    def _relation(self, values: list[Floats], expected: list[Floats]) -> tuple[str, str] | None:
+    def _relation(self, values: list[Floats], expected: list[Floats]) -> str | None:
         """What can be said of numbers that no model gives: they run away, or are proportional."""
-        if all(np.array_equal(v, values[0], equal_nan=True) for v in values):
-            return "constant", "your result"
         both = list(zip(values, expected, strict=True))
-        if self.per_row and all(self._agrees_but_for_rows(v, e) for v, e in both):
-            return "rows_lost", "your result"
-        if expected[0].shape == (3, 3) and all(
-            self._agrees(v, e) or (self._agrees(v @ v.T, np.eye(3)) and np.linalg.det(v) < 0)
-            for v, e in both
-        ):
-            return "mirrored", "your result"
-        if not self.nan_answers and not all(
-            (np.abs(v) <= 1e6 * (1 + np.abs(e).max())).all() for v, e in both
-        ):
-            return "runs_away", "your result"
-        factors = [float(np.vdot(e, v) / np.vdot(e, e)) for v, e in both]
-        first, off = factors[0], self.tolerance / 10
-        if not first or not all(
-            abs(abs(k) - abs(first)) < 1e-6 * abs(first) and np.allclose(v, k * e, 1e-6, off)
-            for k, (v, e) in zip(factors, both, strict=True)
-        ):
-            return None
-        if len({k > 0 for k in factors}) == 1:
-            return "factor", f"{first:.5g}"
-        return ("signs", "") if abs(abs(first) - 1) < 1e-6 else ("factor_and_signs", f"{first:.5g}")
+        factors = np.array([np.vdot(e, v) / np.vdot(e, e) for v, e in both])
+        k = abs(factors[0])
+        straight = k > 0 and np.allclose(np.abs(factors), k, 1e-6, 0)
+        straight &= all(
+            np.allclose(v, f * e, 1e-6, self.tolerance / 10)
+            for f, (v, e) in zip(factors, both, strict=True)
+        )
+        square = expected[0].shape == (3, 3)
+        holds = {
+            "constant": all(np.array_equal(v, values[0], equal_nan=True) for v in values),
+            "rows_lost": self.per_row and all(self._agrees_but_for_rows(v, e) for v, e in both),
+            "mirrored": square and all(self._agrees(v, e) or self._mirrors(v) for v, e in both),
+            "runs_away": not self.nan_answers
+            and any(not (np.abs(v) <= 1e6 * (1 + np.abs(e).max())).all() for v, e in both),
+            "signs": straight and abs(k - 1) < 1e-6 and len(set(np.sign(factors))) > 1,
+            "factor_and_signs": straight and len(set(np.sign(factors))) > 1,
+            "factor": straight,
+        }
+        return next((kind for kind, true in holds.items() if true), None)
+
+    def _mirrors(self, matrix: Floats) -> bool:
+        return self._agrees(matrix @ matrix.T, np.eye(3)) and bool(np.linalg.det(matrix) < 0)
 
     def _agrees_but_for_rows(self, value: Floats, want: Floats) -> bool:
         """Whether of several rows some are right, and all others nothing: 0 or NaN."""
@@ -298,19 +301,6 @@ class Exercise:
         return any(right) and all(
             r or not np.nan_to_num(v).any() for r, v in zip(right, value, strict=True)
         )
-
-    def _right_parts(self, values: list[Floats], expected: list[Floats]) -> list[str]:
-        """Says which columns or numbers of the result are right in all cases, if some are."""
-        if min(e.ndim for e in expected) < 1 + bool(self.per_row):
-            return []
-        split = [[np.moveaxis(a, -bool(self.per_row), 0) for a in of] for of in (values, expected)]
-        pairs = (zip(v, e, strict=True) for v, e in zip(*split, strict=True))
-        right = [all(self._agrees(v, e) for v, e in part) for part in zip(*pairs, strict=True)]
-        if not any(right):
-            return []
-        good = _listed(ORDINALS[i] for i, fine in enumerate(right) if fine)
-        kind = "columns" if self.per_row else "parts"
-        return [f"Of the {kind} of your result the {good} agrees in every case, the others do not."]
 
     def _seen_in(self, case: int, mistakes: tuple[Mistake, ...], want: Floats) -> Mistake:
         """The first of several mistakes that by itself shows in this case."""
@@ -339,7 +329,7 @@ class Exercise:
         return self._say("wrong", text, *lines, mistake.ask, named=mistake.name)
 
     def _several(self, first: Mistake, *lines: str) -> Verdict:
-        text = f"more than one mistake. Look first at this: {first.says}."
+        text = f"{MORE_THAN_ONE}{first.says}."
         return self._say("wrong", text, *lines, first.ask, named=f"several, first {first.name}")
 
     def _combinations(self) -> Iterator[tuple[Mistake, ...]]:
@@ -356,7 +346,9 @@ class Exercise:
         single, double = self._edits
         yield from ((m,) for m in single)
         yield from ((m,) for m in double)
-        common = [m for m in single if not m.step and m.name in COMMON and "result" in m.says]
+        common = [
+            m for m in single if not m.step and m.name in FOUND["common"] and "result" in m.says
+        ]
         yield from itertools.product(listed, common)
 
     def _explains(self, mistakes: tuple[Mistake, ...], values: list[Floats]) -> bool:
@@ -429,6 +421,7 @@ def _nothing() -> None:
     return None
 
 
+MORE_THAN_ONE = "more than one mistake. Look first at this: "
 NO_RETURN = (
     "Printing or keeping a result does not give it back: `return` does. And the template's own "
     "`return None` has to go."
@@ -495,44 +488,14 @@ def _as_numbers(value: Any) -> Floats | None:
 # --- the general device ---
 
 Edit = Callable[[Any], Any]
-Place = tuple[Any, Any]  # a node of a syntax tree, or a list of them, and a field or an index of it
-Way = tuple[tuple[str, int], ...]
-Swap = tuple[Place, ast.AST]
-
+Way = tuple[str | int, ...]
+FOUND = questions.lesson_texts("exercises")
 EDITS: dict[str, Edit] = {
-    "negative": np.negative,
-    "absolute": np.abs,
-    "reciprocal": lambda v: 1 / np.asarray(v),
-    "twice": lambda v: 2 * v,
-    "half": lambda v: v / 2,
-    "root_of_two": lambda v: np.sqrt(2) * v,
-    "root_of_two_missing": lambda v: v / np.sqrt(2),
-    "thousand": lambda v: 1000 * v,
-    "thousandth": lambda v: v / 1000,
-    "hundred": lambda v: 100 * v,
-    "hundredth": lambda v: v / 100,
-    "degrees": np.degrees,
-    "radians": np.radians,
-    "squared": np.square,
-    "rooted": np.sqrt,
-    "angle": np.arctan,
-    "sine": lambda v: v / np.sqrt(1 + np.square(v)),
-    "cosine": lambda v: 1 / np.sqrt(1 + np.square(v)),
-    "tangent": np.tan,
-    "truncated": np.trunc,
-    "rounded": np.rint,
-    "one_more": lambda v: v + 1,
-    "one_less": lambda v: v - 1,
-    "zero": np.zeros_like,
-    "one": np.ones_like,
-    "first_only": lambda v: np.broadcast_to(v[:1], v.shape),
-    "backwards": lambda v: v[::-1],
-    "transposed": lambda v: np.swapaxes(v, -1, -2),
-    "inverted": np.linalg.inv,
-    "normalised": lambda v: v / np.linalg.norm(v),
+    kind: eval(f"lambda v: {formula}", {"np": np}) for kind, formula in FOUND["edits"].items()
 }
-COMMON = ("negative", "twice", "half", "thousand", "hundred", "truncated", "exchanged", "copied")
 ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh")
+NUMERIC = (int, float, np.generic, np.ndarray)
+MOST_SITES = 45  # a step with more of them is not tried with two edits
 
 
 def _all_edits(exercise: Exercise) -> tuple[list[Mistake], list[Mistake]]:
@@ -540,52 +503,38 @@ def _all_edits(exercise: Exercise) -> tuple[list[Mistake], list[Mistake]]:
     args, steps = exercise.cases[-1], exercise.steps
     seen: dict[str, tuple[tuple[Any, ...], Any]] = {}
 
-    def watched(name: str) -> Step:
-        def step(*values: Any) -> Any:
-            seen[name] = values, steps[name](*values)
-            return seen[name][1]
-
-        return step
+    def watched(name: str, *values: Any) -> Any:
+        seen[name] = values, steps[name](*values)
+        return seen[name][1]
 
     def parts(result: Any) -> Any:  # of one case: its rows have columns, or it has a few parts
         array = np.asarray(result)
         return array if exercise.per_row or not array.ndim else tuple(array)
 
-    result = parts(exercise.build({name: watched(name) for name in steps})(*args))
-    names = [f"`{name}`" for name in inspect.signature(exercise.model()).parameters]
-    found, pairs = [], []
+    result = parts(exercise.build({name: partial(watched, name) for name in steps})(*args))
+    inputs = [f"`{name}`" for name in inspect.signature(exercise.model()).parameters]
+    found: list[tuple[str, str, str, Step]] = []
     for kind, where, edit in _edits_of(result, "your result"):
         found.append((kind, where, "", lambda f, e=edit: lambda *a: e(parts(f(*a)))))
-    for name, step in steps.items():
-        for count, (kind, where, wrong) in _rewritten(step):
-            (found if count == 1 else pairs).append((kind, where, name, wrong))
-    for kind, where, edit in _edits_of(args, names):
+    rewritten = [(name, edit) for name, step in steps.items() for edit in _rewritten(step)]
+    found += [(kind, where, name, new) for name, (n, kind, where, new) in rewritten if n == 1]
+    for kind, where, edit in _edits_of(args, inputs):
         found.append((kind, where, "", lambda f, e=edit: lambda *a: f(*e(a))))
-    for kind, where, edit in _scaled(args, names, result, "your result"):
-        found.append((kind, where, "", lambda f, e=edit: lambda *a: e(a, parts(f(*a)))))
+    for kind, where, by in _factors(args, inputs, result):
+        found.append((kind, where, "", lambda f, by=by: lambda *a: by(a, parts(f(*a)))))
     for name, (values, given) in seen.items():
         step, own = steps[name], _argument_names(steps[name], len(values))
-        made = f"what is made of {_listed(own)}"
-        for kind, where, edit in _edits_of(given, made, deep=False):
+        for kind, where, edit in _edits_of(given, f"what is made of {_listed(own)}", deep=False):
             found.append((kind, where, name, lambda *a, e=edit, f=step: e(f(*a))))
         for kind, where, edit in _edits_of(values, own, deep=False):
             found.append((kind, where, name, lambda *a, e=edit, f=step: f(*e(a))))
-        for kind, where, edit in _scaled(values, own, given, made):
-            found.append((kind, where, name, lambda *a, e=edit, f=step: e(a, f(*a))))
-    return [_device(*edit) for edit in found], [_device(*edit, several=True) for edit in pairs]
+    pairs = [(kind, where, name, new) for name, (n, kind, where, new) in rewritten if n == 2]
+    return [_device(*edit) for edit in found], [_device(*edit, MORE_THAN_ONE) for edit in pairs]
 
 
-def _device(kind: str, where: str, step: str, wrong: Step, several: bool = False) -> Mistake:
-    says, ask = (" ".join(text.split()) for text in _kinds()[kind])
-    says = says.replace("WHERE", where)
-    if several:
-        says = f"more than one mistake. Look first at this: {says}"
-    return Mistake(kind, says, ask, step, wrong, device=True)
-
-
-@cache
-def _kinds() -> dict[str, list[str]]:
-    return dict(questions.lesson_texts("exercises")["kinds"])
+def _device(kind: str, where: str, step: str, wrong: Step, before: str = "") -> Mistake:
+    says, ask = (" ".join(text.split()) for text in FOUND["kinds"][kind])
+    return Mistake(kind, before + says.replace("WHERE", where), ask, step, wrong, device=True)
 
 
 def _listed(names: Iterable[str]) -> str:
@@ -594,119 +543,79 @@ def _listed(names: Iterable[str]) -> str:
 
 
 def _argument_names(step: Step, count: int) -> list[str]:
-    try:
-        parameters = inspect.signature(step).parameters.values()
-    except ValueError:  # some functions written in C say none
-        return ["the input"] * count
-    own = [f"`{p.name}`" for p in parameters if p.kind is not p.VAR_POSITIONAL]
-    rest = [f"`{p.name}`" for p in parameters if p.kind is p.VAR_POSITIONAL]
-    return (own + rest * count)[:count]
-
-
-# Edits of a value: of all of it, and of its parts. Each is a kind, where it is, and what it does.
+    code = getattr(step, "__code__", None)
+    names = [f"`{name}`" for name in code.co_varnames] if code else []
+    return (names + ["the input"] * count)[:count]
 
 
 def _edits_of(
     value: Any, named: str | list[str], deep: bool = True
 ) -> Iterator[tuple[str, str, Edit]]:
-    """named: what the value is called, or each part of a tuple; not deep: only a tuple has parts."""
+    """Edits of all of a value and of its parts: a kind, where it is, and what it does.
+
+    named: what the value is called, or each part of a tuple; not deep: only tuples have parts.
+    """
     whole = named if isinstance(named, str) else _listed(named)
-    if isinstance(value, (int, float, np.generic, np.ndarray)):
+    if isinstance(value, NUMERIC):
         yield from ((kind, whole, edit) for kind, edit in EDITS.items())
     parts = _parts(value, named) if deep or isinstance(value, tuple) else []
-    for label, index, part in parts:
+    arrays = [part for part in parts if isinstance(part[2], (np.generic, np.ndarray))]
+    like = len(arrays) > 1 and len({part[2].shape for part in arrays}) == 1
+    for label, indices, part in [
+        *((label, [i], part) for label, i, part in parts),
+        *([(whole, [i for _, i, _ in arrays], arrays[0][2])] if like else []),
+    ]:
         for kind, where, edit in _edits_of(part, label, deep):
-            yield kind, where, partial(_at, [index], edit)
-    arrays = [(i, part) for _, i, part in parts if isinstance(part, (np.generic, np.ndarray))]
-    if len(arrays) > 1 and len({part.shape for _, part in arrays}) == 1:
-        for kind, where, edit in _edits_of(arrays[0][1], whole, deep):
-            yield kind, where, partial(_at, [i for i, _ in arrays], edit)
+            yield kind, where, partial(_put, [(i, i) for i in indices], edit)
     for (a, i, x), (b, j, y) in itertools.permutations(parts, 2):
-        if np.shape(x) == np.shape(y) and not callable(x):
-            yield "copied", _listed((a, b)), partial(_taken, [(i, j)])
-            yield "exchanged", _listed((a, b)), partial(_taken, [(i, j), (j, i)])
+        if isinstance(x, NUMERIC) and isinstance(y, NUMERIC) and np.shape(x) == np.shape(y):
+            yield "copied", _listed((a, b)), partial(_put, [(i, j)], lambda v: v)
+            yield "exchanged", _listed((a, b)), partial(_put, [(i, j), (j, i)], lambda v: v)
 
 
 def _parts(value: Any, named: str | list[str]) -> list[tuple[str, Any, Any]]:
     """What each part is called, its index and itself: of a tuple, of columns, of a pose."""
     labels = named if isinstance(named, list) else []
     indices: list[Any] = []
+    array: tuple[int, ...] = value.shape if isinstance(value, np.ndarray) else ()
     if isinstance(value, tuple):
-        kind = "part" if any(map(np.ndim, value)) else "number"
+        kind = "part" if any(isinstance(v, np.ndarray) and v.ndim for v in value) else "number"
         labels = labels or [f"the {n} {kind} of {named}" for n in ORDINALS]
         indices = list(range(len(value)))
-    elif isinstance(value, np.ndarray) and value.shape == (4, 4):
+    elif array == (4, 4):
         labels = [f"the {part} of {named}" for part in ("translation", "rotation", "last row")]
         indices = [(slice(3), 3), (slice(3), slice(3)), 3]
-    elif isinstance(value, np.ndarray) and value.ndim == 2 and value.shape[1] < min(4, len(value)):
+    elif len(array) == 2 and array[1] < min(4, array[0]):
         labels = [f"the {n} column of {named}" for n in ORDINALS]
-        indices = [(..., i) for i in range(value.shape[1])]
-    return [(label, i, value[i]) for label, i in zip(labels, indices)]  # noqa: B905
+        indices = [(..., i) for i in range(array[1])]
+    return [(label, i, value[i]) for label, i in zip(labels, indices, strict=False)]
 
 
-def _scaled(
-    inputs: tuple[Any, ...], names: list[str], value: Any, named: str
-) -> Iterator[tuple[str, str, Callable[..., Any]]]:
-    """Edits that multiply or divide a value, or a part of it, by one of the inputs."""
-    indices = [index for _, index, _ in _parts(value, named)] or [None]
-    for (i, given), index in itertools.product(enumerate(inputs), indices):
-        if isinstance(given, (float, np.generic)) or np.ndim(given) == 1:
-            for kind, by in (("factor_too_many", np.multiply), ("factor_missing", np.divide)):
-                if index is None:
-                    yield kind, names[i], lambda a, v, i=i, by=by: by(v, a[i])
-                else:
+def _put(places: list[tuple[Any, Any]], edit: Edit, value: Any) -> Any:
+    """The value with an edit of what stands at the second of each two places at the first."""
+    new = list(value) if isinstance(value, tuple) else np.array(value, float)
+    for i, j in places:
+        new[i] = edit(value[j])
+    return tuple(new) if isinstance(value, tuple) else new
+
+
+def _factors(
+    args: tuple[Any, ...], names: list[str], result: Any
+) -> Iterator[tuple[str, str, Step]]:
+    """Edits by which the result, or a part of it, is multiplied or divided by an input."""
+    for i, (name, given) in enumerate(zip(names, args, strict=False)):
+        if isinstance(given, (float, np.ndarray)) and np.ndim(given) < 2:
+            for _, n, _ in _parts(result, "") or [("", ..., result)]:
+                for kind, by in (("factor_too_many", np.multiply), ("factor_missing", np.divide)):
                     yield (
                         kind,
-                        names[i],
-                        lambda a, v, i=i, by=by, n=index: _at([n], lambda x: by(x, a[i]), v),
+                        name,
+                        lambda a, v, i=i, by=by, n=n: _put([(n, n)], lambda x: by(x, a[i]), v),
                     )
 
 
-def _at(indices: list[Any], edit: Edit, value: Any) -> Any:
-    new = list(value) if isinstance(value, tuple) else np.array(value, float)
-    for i in indices:
-        new[i] = edit(value[i])
-    return tuple(new) if isinstance(value, tuple) else new
-
-
-def _taken(pairs: list[tuple[Any, Any]], value: Any) -> Any:
-    new = list(value) if isinstance(value, tuple) else np.array(value, float)
-    for i, j in pairs:
-        new[i] = value[j]
-    return tuple(new) if isinstance(value, tuple) else new
-
-
-# Edits of the source of a step.
-
-OPERATORS: dict[type[ast.operator], dict[str, type[ast.operator]]] = {
-    ast.Add: {"subtracted": ast.Sub, "product_for_sum": ast.Mult},
-    ast.Sub: {"added": ast.Add},
-    ast.Mult: {"divided": ast.Div, "sum_for_product": ast.Add},
-    ast.Div: {"multiplied": ast.Mult, "difference_for_quotient": ast.Sub},
-    ast.Pow: {"power_as_product": ast.Mult},
-    ast.MatMult: {"elementwise": ast.Mult},
-}
-# Functions that are taken for each other, by family.
-FUNCTIONS = (
-    ("mean", "median", "sum", "max", "min", "std", "var"),
-    ("sin", "cos", "tan", "arctan", "arcsin", "arctan2", "hypot"),
-    ("inv", "transpose"),
-    ("sqrt", "square", "abs"),
-    ("round", "int"),
-)
-COMPARED: dict[type[ast.cmpop], tuple[type[ast.cmpop], ...]] = {
-    ast.GtE: (ast.Gt, ast.Eq),
-    ast.Gt: (ast.GtE,),
-    ast.LtE: (ast.Lt,),
-    ast.Lt: (ast.LtE,),
-    ast.Eq: (ast.NotEq,),
-    ast.NotEq: (ast.Eq, ast.Gt),
-}
-MOST_SITES = 45  # a step with more of them is not tried with two edits
-
-
 @cache
-def _rewritten(step: Step) -> list[tuple[int, tuple[str, str, Step]]]:
+def _rewritten(step: Step) -> list[tuple[int, str, str, Step]]:
     """The step with one edit of its source, or the like in several places; then with two.
 
     Before each stands 1 or 2. A step without a source has none.
@@ -714,36 +623,30 @@ def _rewritten(step: Step) -> list[tuple[int, tuple[str, str, Step]]]:
     tree = _source(step)
     if tree is None:
         return []
-    space = step.__globals__ | inspect.getclosurevars(step).nonlocals
+    space = {**step.__globals__, **inspect.getclosurevars(step).nonlocals}
     names = {n.arg for n in ast.walk(tree) if isinstance(n, ast.arg)}
     names |= {n.id for n in ast.walk(tree) if isinstance(n, ast.Name) and type(n.ctx) is ast.Store}
-    sites, groups = [], defaultdict(list)
-    for place, node, path in _walk(tree):
-        around = node if isinstance(node, ast.expr) and _named_in(node) else place[0]
+    sites: list[tuple[int, str, str, dict[int, ast.AST]]] = []
+    groups: dict[Any, tuple[str, str, dict[int, ast.AST]]] = {}
+    for node, around, path in _walk(tree):
+        fields = tuple(field for field in path if isinstance(field, str))
+        beside = tuple(field for field in path if field not in ("left", "right"))
         for kind, detail, new in _alternatives(node, names):
-            where = _named_in(around) if isinstance(around, ast.AST) else "the code"
-            if kind == "name":
-                where = detail[1]
-            elif kind == "function_dropped":
-                where = f"`{ast.unparse(node.func).rpartition('.')[2]}` of {where}"
-            sites.append((kind, where or "the code", [(place, new)]))
-            beside = tuple(step for step in path if step[0] not in ("left", "right"))
-            for like in ((), tuple(name for name, _ in path), beside, where):
-                groups[kind, detail, like].append((where, (place, new)))
-    sites = [*_copied_lines(tree), *sites]
-    pairs = []
-    if len(sites) <= MOST_SITES:
-        pairs = [
-            (kind, where, a + b) for (kind, where, a), (*_, b) in itertools.combinations(sites, 2)
-        ]
-    for (kind, *_), swaps in groups.items():
-        if len(swaps) > 1:
-            sites.append((kind, swaps[0][0], [swap for _, swap in swaps]))
-    found = [(1, "bracket", said, _compiled(new, space)) for said, new in _unbracketed(tree)]
-    for count, edits in ((1, sites), (2, pairs)):
-        for kind, where, swaps in edits:
-            found.append((count, kind, where, _compiled(tree, space, swaps)))
-    return [(count, (kind, said, new)) for count, kind, said, new in found if new is not None]
+            where = _named_in(node) or _named_in(around)
+            if kind == "function_dropped":
+                where = f"`{detail}` of {where}"
+            where = detail[1] if kind == "name" else where
+            sites.append((1, kind, where, {id(node): new}))
+            for like in ((), fields, beside, where):
+                groups.setdefault((kind, detail, like), (kind, where, {}))[2][id(node)] = new
+    pairs = itertools.combinations(sites if len(sites) <= MOST_SITES else [], 2)
+    several = [(1, *group) for group in groups.values() if len(group[2]) > 1]
+    double = [(2, kind, where, a | b) for (_, kind, where, a), (*_, b) in pairs]
+    edits = [
+        (n, kind, where, _compiled(_rebuilt(tree, swaps), space))
+        for n, kind, where, swaps in sites + several + double
+    ]
+    return [edit for edit in edits if edit[3] is not None]
 
 
 @cache
@@ -767,86 +670,60 @@ def _source(step: Step) -> ast.Lambda | ast.FunctionDef | None:
     return None
 
 
-def _walk(holder: ast.AST, path: Way = ()) -> Iterator[tuple[Place, ast.AST, Way]]:
-    """Each node: its place, itself and the way to it, fields with the number in a list of nodes."""
+def _walk(holder: ast.AST, path: Way = ()) -> Iterator[tuple[ast.AST, ast.AST, Way]]:
+    """Each node, the one that holds it, and the way to it: fields, and places in a list."""
     for name, child in ast.iter_fields(holder):
         for i, part in enumerate(child if isinstance(child, list) else [child]):
             if isinstance(part, ast.AST) and not isinstance(part, ast.arguments):
-                place = (child, i) if isinstance(child, list) else (holder, name)
-                yield place, part, (*path, (name, i))
-                yield from _walk(part, (*path, (name, i)))
+                way = (*path, name, i) if isinstance(child, list) else (*path, name)
+                yield part, holder, way
+                yield from _walk(part, way)
 
 
-def _alternatives(node: ast.AST, names: set[str]) -> Iterator[tuple[str, Any, ast.AST]]:
-    """What may be written in a node's place: the kind of edit, what tells it from others, the new."""
+def _other_operators(node: Any) -> Iterator[tuple[str, Any, ast.AST]]:
+    for kind, old, other in FOUND["operators"]:
+        new = getattr(ast, other)()
+        if isinstance(node, ast.BinOp) and type(node.op).__name__ == old:
+            yield kind, other, ast.BinOp(node.left, new, node.right)
+        if isinstance(node, ast.Compare) and type(node.ops[0]).__name__ == old:
+            yield kind, other, ast.Compare(node.left, [new], node.comparators)
+    if isinstance(node, ast.BinOp):
+        left, op, right = node.left, node.op, node.right
+        yield "dropped", ast.dump(right), left
+        yield "dropped", ast.dump(left), right
+        yield "turned_round", type(op), ast.BinOp(right, op, left)
+        if isinstance(op, ast.Mult):
+            yield "divided", "turned", ast.BinOp(right, ast.Div(), left)
+        if isinstance(left, ast.BinOp) and _rank(left.op) < _rank(op):  # (a + b) * c
+            yield "bracket", 0, ast.BinOp(left.left, left.op, ast.BinOp(left.right, op, right))
+        if isinstance(right, ast.BinOp) and _rank(right.op) < _rank(op) + isinstance(op, ast.Div):
+            yield "bracket", 0, ast.BinOp(ast.BinOp(left, op, right.left), right.op, right.right)
+
+
+def _alternatives(node: Any, names: set[str]) -> Iterator[tuple[str, Any, ast.AST]]:
+    """What may stand in a node's place: the kind of edit, what tells it from others, the node."""
+    yield from _other_operators(node)
     match node:
-        case ast.BinOp(left, op, right):
-            for kind, other in OPERATORS.get(type(op), {}).items():
-                yield kind, None, ast.BinOp(left, other(), right)
-                if other is ast.Div:
-                    yield kind, "turned", ast.BinOp(right, other(), left)
-            yield "dropped", ast.dump(right), left
-            yield "dropped", ast.dump(left), right
-            if isinstance(op, (ast.Sub, ast.Div, ast.MatMult)):
-                yield "turned_round", type(op), ast.BinOp(right, op, left)
-        case ast.Constant(value) if type(value) in (int, float):
-            for other in (value + 1, value - 1, -value):
-                yield "number", (value, other), ast.Constant(other)
+        case ast.Constant(int() | float() as value) if not isinstance(value, bool):
+            for number in (value + 1, value - 1, -value):
+                yield "number", (value, number), ast.Constant(number)
         case ast.Name(name, ast.Load()) if name in names:
             for other in sorted(names - {name}):
                 yield "name", (name, f"`{other}`"), ast.Name(other, ast.Load())
         case ast.Call(function, [first, *_] as arguments, keywords):
-            yield "function_dropped", ast.dump(function), first
-            name = getattr(function, "attr", getattr(function, "id", ""))
-            for other in (n for f in FUNCTIONS if name in f for n in f if n != name):
-                new = ast.parse(ast.unparse(function)[: -len(name)] + other, mode="eval").body
+            *module, name = ast.unparse(function).split(".")
+            yield "function_dropped", name, first
+            for other in (n for f in FOUND["functions"] if name in f for n in f if n != name):
+                new = ast.parse(".".join((*module, other)), mode="eval").body
                 yield "function", (name, other), ast.Call(new, arguments, keywords)
         case ast.Attribute(value, "T"):
-            yield "transpose_missing", None, value
+            yield "transpose_missing", 0, value
         case ast.UnaryOp(_, operand):
-            yield "sign_missing", None, operand
-        case ast.Compare(left, [op], rights):
-            for other in COMPARED.get(type(op), ()):
-                yield "comparison", None, ast.Compare(left, [other()], rights)
+            yield "sign_missing", 0, operand
 
 
-def _copied_lines(tree: ast.AST) -> Iterator[tuple[str, str, list[Swap]]]:
-    """A line that repeats another one of the like form, and is not adapted everywhere."""
-    for node in ast.walk(tree):
-        lines = getattr(node, "elts", None) or getattr(node, "body", None)
-        for a, b in itertools.permutations(lines if isinstance(lines, list) else [], 2):
-            ours, theirs = (list(_walk(ast.Module([line], []))) for line in (a, b))
-            if [type(x) for _, x, _ in ours] == [type(y) for _, y, _ in theirs]:
-                swaps = [
-                    (place, x)
-                    for (_, x, _), (place, y, _) in zip(ours, theirs, strict=True)
-                    if isinstance(x, (ast.Name, ast.Constant)) and ast.dump(x) != ast.dump(y)
-                ][:5]
-                for n in range(1, len(swaps) + 1):
-                    for some in itertools.combinations(swaps, n):
-                        yield "line_copied", _named_in(*(x for _, x in some)), list(some)
-
-
-def _unbracketed(tree: ast.AST) -> Iterator[tuple[str, ast.AST]]:
-    """The source without one, two or all of its brackets."""
-    text, opened, brackets = ast.unparse(tree), [], []
-    for i, sign in enumerate(text):
-        if sign == "(":
-            opened.append(i)
-        elif sign == ")":
-            start = opened.pop()
-            if not re.match(r"[\w)\]]", text[start - 1 : start] or " "):
-                brackets.append((start, i))
-    chosen = [c for n in (1, 2, len(brackets)) for c in itertools.combinations(brackets, n)]
-    for some in dict.fromkeys(c for c in chosen if c):
-        gone = {i for pair in some for i in pair}
-        try:
-            new = ast.parse("".join(" " if i in gone else s for i, s in enumerate(text))).body[0]
-        except SyntaxError:
-            continue
-        new = new.value if isinstance(new, ast.Expr) else new
-        if type(new) is type(tree) and ast.dump(new) != ast.dump(tree):
-            yield _named_in(ast.parse(text[some[0][0] : some[0][1] + 1])), new
+def _rank(op: ast.operator) -> int:
+    return 0 if isinstance(op, (ast.Add, ast.Sub)) else 1 + isinstance(op, ast.Pow)
 
 
 def _named_in(*nodes: ast.AST) -> str:
@@ -858,31 +735,26 @@ def _named_in(*nodes: ast.AST) -> str:
     return _listed(found[:3]) if found else ""
 
 
-def _compiled(tree: Any, space: dict[str, Any], swaps: Iterable[Swap] = ()) -> Step | None:
-    """The function that a lambda or a definition makes with some of its nodes replaced; None for
-    what is no Python."""
-    old = [((holder, key), _put(holder, key, new)) for (holder, key), new in swaps]
-    own: dict[str, Step] = {}
-    body = (
-        ast.Assign([ast.Name("step", ast.Store())], tree) if isinstance(tree, ast.Lambda) else tree
-    )
+def _rebuilt(node: Any, swaps: Mapping[int, ast.AST]) -> Any:
+    """A copy of a syntax tree in which some nodes are others."""
+    if id(node) in swaps:
+        return swaps[id(node)]
+    if isinstance(node, list):
+        return [_rebuilt(part, swaps) for part in node]
+    if not isinstance(node, ast.AST):
+        return node
+    return type(node)(**{name: _rebuilt(part, swaps) for name, part in ast.iter_fields(node)})
+
+
+def _compiled(tree: Any, space: dict[str, Any]) -> Any:
+    """The function that a lambda or a definition makes; None for an edit that is no Python."""
+    own: dict[str, Any] = {}
+    if isinstance(tree, ast.Lambda):
+        tree = ast.Assign([ast.Name("step", ast.Store())], tree)
     try:
         exec(
-            compile(ast.fix_missing_locations(ast.Module([body], [])), "<edit>", "exec"), space, own
+            compile(ast.fix_missing_locations(ast.Module([tree], [])), "<edit>", "exec"), space, own
         )
     except SyntaxError:
         return None
-    finally:
-        for (holder, key), node in reversed(old):
-            _put(holder, key, node)
     return next(iter(own.values()))
-
-
-def _put(holder: Any, key: Any, new: ast.AST) -> ast.AST:
-    """Sets a node in its place and gives the one that stood there."""
-    if isinstance(holder, list):
-        holder[key], new = new, holder[key]
-        return new
-    old = getattr(holder, key)
-    setattr(holder, key, new)
-    return old

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -85,26 +84,6 @@ MOTION_PAIR = Exercise(
 )
 
 
-def _in_place_of(motions: Callable[..., Any]) -> Step:
-    """A mistake in both motions at once: what is made of the four poses instead."""
-    return lambda _: lambda *poses: np.stack(motions(*poses))
-
-
-def _places_subtracted(sign_A: float, sign_B: float) -> Step:
-    def wrong(gi: Floats, gj: Floats, bi: Floats, bj: Floats) -> Pair:
-        return (
-            make_transform(gj[:3, :3].T @ gi[:3, :3], sign_A * (gi - gj)[:3, 3]),
-            make_transform(bj[:3, :3] @ bi[:3, :3].T, sign_B * (bi - bj)[:3, 3]),
-        )
-
-    return _in_place_of(wrong)
-
-
-_inverse = np.linalg.inv
-MOTION_PAIR.add_mistakes(
-    *(('', 'places_subtracted', _places_subtracted(a, b)) for a in (1, -1) for b in (1, -1)),
-    alone=True,
-)
 MOTION_PAIR.read_mistakes(globals())
 
 
@@ -185,18 +164,6 @@ def _mirror_image(a: Floats, b: Floats) -> Floats:
     return mirror
 
 
-
-
-def _eigenvectors(_: Model) -> Model:
-    """The axes as `np.linalg.eig` gives them, and Kabsch's rotation between them."""
-
-    def axis(R: Floats) -> Floats:
-        values, vectors = np.linalg.eig(R)
-        return np.real(vectors[:, np.argmin(np.abs(values - 1))])
-
-    return lambda R_A, R_B: _turn(*(np.array([axis(R) for R in of]) for of in (R_A, R_B)))
-
-
 def _kabsch(product: Callable[[Floats, Floats, Floats], Floats]) -> Step:
     """Kabsch's method with another product of U, V^T and the matrix that makes it a rotation."""
 
@@ -209,16 +176,4 @@ def _kabsch(product: Callable[[Floats, Floats, Floats], Floats]) -> Step:
     return turn
 
 
-def _nearest(M: Floats) -> Floats:
-    U, _, Vt = np.linalg.svd(M)
-    return U @ Vt
-
-
-ROTATION_HALF.add_mistakes(
-    ('turn', 'transposed_factor', _kabsch(lambda U, Vt, D: U @ D @ Vt.T)),
-    ('turn', 'transposed_factor', _kabsch(lambda U, Vt, D: Vt @ D @ U.T)),
-    ('turn', 'transposed_factor', _kabsch(lambda U, Vt, D: U @ Vt.T)),
-    ('turn', 'transposed_factor', _kabsch(lambda U, Vt, D: Vt @ U.T)),
-    alone=True,
-)
 ROTATION_HALF.read_mistakes(globals())

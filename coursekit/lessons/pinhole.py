@@ -290,8 +290,6 @@ def _along_ray(x: Floats, y: Floats, w: Any, depth: Floats) -> Any:
     return _scale(x, y, w, depth / np.hypot(w, np.hypot(x, y)))
 
 
-
-
 # The coefficients and the equation: what goes wrong in the first exercise does so in this one. But
 # without its 1 the radial factor has no inverse that an iteration would find.
 
