@@ -120,13 +120,67 @@ def test_a_bowed_board_spoils_fx_and_not_the_rms() -> None:
     assert abs(result.intrinsics.fx - LENS.fx) > 5 * result.sigma("fx")
 
 
+X, Y = (a.ravel() for a in np.meshgrid(np.linspace(-0.1, 0.1, 9), np.linspace(-0.06, 0.06, 6)))
+
+
+def predict(f: float, Z: float, tilt: float) -> np.ndarray:
+    """The notebook's board of three unknowns."""
+    depth = Z + X * np.sin(tilt)
+    return np.concatenate([f * X * np.cos(tilt) / depth, f * Y / depth])
+
+
+def test_three_facts_give_f_and_its_sigma_goes_as_one_over_the_tilt_squared() -> None:
+    for tilt_deg, ratio in ((10, 1.07), (40, 1.30)):  # at the same Z
+        near, *_, far = predict(600, 0.5, np.radians(tilt_deg))[-9:]  # v along the lower edge
+        assert near / far == pytest.approx(ratio, abs=0.01)
+        assert (near - far) / (near + far) / 0.1 == pytest.approx(
+            np.sin(np.radians(tilt_deg)) / 0.5
+        )
+
+    def sigma_px(tilt_deg: float, free: int) -> float:
+        at, steps = np.array([600, 0.5, np.radians(tilt_deg)]), 1e-6 * np.eye(3)[:free]
+        J = np.stack([(predict(*(at + h)) - predict(*(at - h))) / 2e-6 for h in steps], axis=1)
+        return float(lesson.FOCAL_SIGMA.model()(J, np.full(108, 0.1)))
+
+    assert sigma_px(2, 3) / sigma_px(4, 3) == pytest.approx(4, rel=0.03)
+    assert sigma_px(2, 3) / sigma_px(8, 3) == pytest.approx(16, rel=0.08)
+    assert sigma_px(2, 2) / sigma_px(4, 2) == pytest.approx(2, rel=0.01)  # the tilt known
+    assert sigma_px(2, 3) == pytest.approx(162 * np.sqrt(108 / 105), abs=1)
+
+
+def test_the_corners_of_p_accept_both_cameras_and_those_of_q_only_one() -> None:
+    of = {
+        "P": corner_session(BOARD, LENS, seed=27, effects=Effects(max_tilt_deg=3))[0],
+        "Q": corner_session(BOARD, LENS, seed=22)[0],
+    }
+    K = {name: ck.intrinsics.calibrate(views, BOARD) for name, views in of.items()}
+    rms = {
+        (k, c): ck.intrinsics.rms_under(K[k].intrinsics, of[c], BOARD.points)
+        for k in of
+        for c in of
+    }
+    assert {pair: f"{value:.3f}" for pair, value in rms.items()} == {
+        ("P", "P"): "0.108", ("Q", "P"): "0.108", ("Q", "Q"): "0.107", ("P", "Q"): "0.355",
+    }  # fmt: skip
+    assert rms["P", "P"] == pytest.approx(K["P"].rms_px, rel=1e-3)
+
+
+def test_halves_tell_bow_and_shutter_from_noise_and_share_the_bias() -> None:
+    rooms = {"bow": Effects(bow_m=1e-3), "shutter": Effects(readout_s=0.02, speed_m_s=0.1)}
+    rooms |= {"healthy": Effects(), "blur": Effects(blur_px=3), "one": Effects(spoiled_px=3)}
+    both = {
+        name: ck.intrinsics.halves(corner_session(BOARD, LENS, 5, effects=effects)[0], BOARD)
+        for name, effects in rooms.items()
+    }
+    assert {name: h.noise_p_value < 1e-6 for name, h in both.items()} == {
+        "bow": True, "shutter": True, "healthy": False, "blur": False, "one": False,
+    }  # fmt: skip
+    assert all(h.p_value > 0.01 for h in both.values())  # the stated sigmas count the views
+    off = [half.value("fx") - LENS.fx for half in (both["bow"].first, both["bow"].second)]
+    assert off == pytest.approx([-24, -12], abs=0.6)
+
+
 def test_the_smallest_rms_is_that_of_scipys_fit() -> None:
-    X, Y = (a.ravel() for a in np.meshgrid(np.linspace(-0.1, 0.1, 9), np.linspace(-0.06, 0.06, 6)))
-
-    def predict(f: float, Z: float, tilt: float) -> np.ndarray:
-        depth = Z + X * np.sin(tilt)
-        return np.concatenate([f * X * np.cos(tilt) / depth, f * Y / depth])
-
     noise = np.random.default_rng(0).normal(0, 0.1, 2 * X.size)
     for tilt in (0.0, 5.0, 20.0, 45.0):
         seen = predict(600, 0.5, np.radians(tilt)) + noise
