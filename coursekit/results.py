@@ -57,7 +57,7 @@ class Origin:
 
     color: what it reports of its own lens, nothing.
 
-    >>> Origin("photographs, 1280 x 960 px").source
+    >>> Origin("photographs in my_photos").source
     'recorded'
     """
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from itertools import compress
 from typing import Any
 
@@ -55,16 +55,6 @@ DEPTH_NOISE = Exercise(
     describe=_describe_depth_noise,
     show=lambda row: ", ".join(f"{v:.7g}" for v in np.ravel(row)),
 )
-
-
-def _difference(between: Callable[[Any], Any]) -> Step:
-    """A difference of depths, which is the law's noise / between(noise / Z)."""
-
-    def noise(slope: Any, sigma_d: float, Z: Any) -> Any:
-        law = slope * sigma_d
-        return law / between(law / Z)
-
-    return noise
 
 
 DEPTH_NOISE.read_mistakes(globals())
@@ -196,28 +186,6 @@ ROBUST_DEPTH = Exercise(
     show=lambda depth: "NaN" if np.isnan(depth) else f"{float(depth):.5f}",
     nan_answers=True,
 )
-
-
-def _pixel_alone(image: Floats, row: int, column: int) -> Any:
-    height, width = image.shape
-    inside = 0 <= row < height and 0 <= column < width
-    return image[row, column] if inside and 0 < image[row, column] < math.inf else None
-
-
-def _pixel_alone_unless_zero(image: Floats, row: int, column: int) -> Any:
-    height, width = image.shape
-    known = -height <= row < height and -width <= column < width  # -9 counts from the far end
-    return image[row, column] if known and image[row, column] > 0 else None
-
-
-def _moved(start: int, stop: int, size: int) -> slice:
-    first = min(max(start, 0), size - (stop - start))
-    return slice(first, first + stop - start)
-
-
-def _height_width_swapped(image: Floats, top: int, bottom: int, left: int, right: int) -> Any:
-    height, width = image.shape
-    return _cut(_inside)(image, top, min(bottom, width), left, min(right, height))
 
 
 ROBUST_DEPTH.read_mistakes(globals())

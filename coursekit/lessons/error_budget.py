@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -61,10 +62,17 @@ def _build_sums(steps: Mapping[str, Step]) -> Model:
         along = steps["along"]
         noises = [high * along(toward) for _, high, toward, _ in noise]
         most = [steps["most"](low, high, toward) * along(toward) for low, high, toward, _ in bias]
-        parts = [steps["third"]() if row[2] is None else along(row[2]) ** 2 for row in bias]
-        squares = [steps["square"](*row[:2]) * part for row, part in zip(bias, parts, strict=True)]
-        sigma = steps["sigma"](steps["rigs"](squares, noises), most)
-        sums = steps["noise"](noises), steps["worst"](most), steps["quadrature"](most)
+        squares, others = (
+            [
+                steps["square"](low, high) * steps["part"](toward, along)
+                for low, high, toward, _ in of
+            ]
+            for of in (bias, noise)
+        )
+        variance = steps["rigs"](squares, noises, others)
+        summed = steps["summed"](most, noises)
+        sums = steps["noise"](noises), steps["worst"](summed), steps["quadrature"](summed)
+        sigma = steps["sigma"](variance, most)
         return steps["order"](*sums, steps["share"](tolerance / sigma if sigma else math.inf))
 
     return add_up
@@ -77,6 +85,10 @@ def _sorted(rows: Rows) -> tuple[Rows, Rows]:
 
 def _along(toward: Any) -> float:
     return 1.0 if toward is None else abs(toward[0])
+
+
+def _part(toward: Any, along: Step, third: float = 1 / 3) -> float:
+    return third if toward is None else float(along(toward)) ** 2
 
 
 def _root(values: list[float]) -> float:
@@ -112,8 +124,9 @@ ADD_UP = Exercise(
         "worst": sum,
         "quadrature": _root,
         "square": lambda low, high: (low * low + low * high + high * high) / 3,
-        "third": lambda: 1 / 3,
-        "rigs": lambda squares, noises: sum(squares),
+        "part": _part,
+        "rigs": lambda squares, noises, others: sum(squares),
+        "summed": lambda most, noises: most,
         "sigma": lambda variance, most: math.sqrt(variance),
         "share": _beyond,
         "order": lambda *sums: np.array(sums),

@@ -79,24 +79,6 @@ def _everywhere(measure: Step) -> Step:
     return whole
 
 
-# In the numbers of the two axes, whether or not the 2-D number is made of them.
-_AXIS_MISTAKES: dict[str, Step] = {
-    "mean_removed": lambda e: np.std(e, axis=0),
-    "divided_by_n_minus_1": lambda e: np.sqrt(np.sum(e**2, axis=0) / (len(e) - 1)),
-    "mean_absolute": lambda e: np.mean(np.abs(e), axis=0),
-    "signed_mean": lambda e: np.mean(e, axis=0),
-    "no_root": lambda e: np.mean(e**2, axis=0),
-    "summed": lambda e: np.sqrt(np.sum(e**2, axis=0)),
-    "axis_over_2n": lambda e: np.sqrt(np.sum(e**2, axis=0) / (2 * len(e))),
-    "largest": lambda e: np.max(np.abs(e), axis=0),
-    "median_absolute": lambda e: np.median(np.abs(e), axis=0),
-    "wrong_axis": lambda e: np.sqrt(np.mean(e**2, axis=1))[:2],
-}
-for _name, _axis in _AXIS_MISTAKES.items():
-    REPROJECTION_RMS.add_mistakes(
-        ("axis", _name, _axis),
-        ("shown", _name, lambda residuals, axes, axis=_axis: axis(residuals)),
-    )
 REPROJECTION_RMS.read_mistakes(globals())
 
 

@@ -130,57 +130,9 @@ PROJECT = Exercise(
 )
 
 
-def _divided_by_range(X: Floats, Y: Floats, Z: Floats) -> Any:
-    length = np.sqrt(X * X + Y * Y + Z * Z)
-    return X / length, Y / length, 1.0
-
-
 def _pixels_by(numbers: Step) -> Step:
     """`_to_pixels` with other numbers in the place of fx, fy, cx and cy."""
     return lambda x, y, w, *lens: _to_pixels(x, y, w, *numbers(*lens))
-
-
-def _centre_turned(fx: float, fy: float, cx: float, cy: float) -> Any:
-    return fx, fy, -cx, -cy
-
-
-def _K_transposed(x: Floats, y: Floats, w: Any, fx: float, fy: float, cx: float, cy: float) -> Any:
-    third = cx * x + cy * y + w
-    return fx * x / third, fy * y / third
-
-
-def _centre_first(x: Floats, y: Floats, w: Any, fx: float, fy: float, cx: float, cy: float) -> Any:
-    return fx * (x + cx * w), fy * (y + cy * w)
-
-
-def _x_overwritten(x: Floats, y: Floats, *dist: float) -> Any:
-    new, bent_y = _bent()(x, y, *dist)
-    return new, bent_y + 2 * dist[3] * (new - x) * y  # in 2 p2 xy it is no longer x
-
-
-def _tangential_after_radial(x: Floats, y: Floats, *dist: float) -> Any:
-    k1, k2, p1, p2, k3 = dist
-    r2 = x * x + y * y
-    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-    x, y = x * radial, y * radial
-    dx, dy = 2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    return x + dx, y + dy
-
-
-def _bent_before_division(points: Floats, normalise: Step, bend: Step, to_pixels: Step) -> Any:
-    x, y = bend(*points[:2])
-    return to_pixels(x / points[2], y / points[2], 1.0)
-
-
-def _distortion_in_pixels(points: Floats, normalise: Step, bend: Step, to_pixels: Step) -> Any:
-    return bend(*to_pixels(*normalise(*points)))
-
-
-def _distortion_of_centred_uv(points: Floats, normalise: Step, bend: Step, to_pixels: Step) -> Any:
-    cx, cy = to_pixels(0.0, 0.0, 1.0)
-    u, v = to_pixels(*normalise(*points))
-    u, v = bend(u - cx, v - cy)
-    return u + cx, v + cy
 
 
 PROJECT.read_mistakes(globals())
@@ -274,20 +226,6 @@ DEPROJECT = Exercise(
 def _rays_by(numbers: Step) -> Step:
     """`_to_normalised` with other numbers in the place of fx, fy, cx and cy."""
     return lambda u, v, *lens: _to_normalised(u, v, *numbers(*lens))
-
-
-def _transposed(divided: bool) -> Step:
-    """The inverse of K from the wrong side; divided: the third coordinate is made 1 again."""
-
-    def rays(u: Floats, v: Floats, fx: float, fy: float, cx: float, cy: float) -> Any:
-        third = 1 - cx / fx * u - cy / fy * v
-        return (u / fx / third, v / fy / third, 1.0) if divided else (u / fx, v / fy, third)
-
-    return rays
-
-
-def _along_ray(x: Floats, y: Floats, w: Any, depth: Floats) -> Any:
-    return _scale(x, y, w, depth / np.hypot(w, np.hypot(x, y)))
 
 
 # The coefficients and the equation: what goes wrong in the first exercise does so in this one. But
