@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -15,6 +18,7 @@ from coursekit.lessons import CHECKPOINTS
 from coursekit.lessons import intrinsics as lesson
 from coursekit.plots import intrinsics as figures
 from coursekit.simulation.corner_sessions import Effects, corner_session
+from tools import build_notebooks
 
 BOARD = ck.boards.Board("charuco", squares=(9, 6), square_m=0.025)
 CHECKERBOARD = ck.boards.Board("checkerboard", squares=(10, 7), square_m=0.025)
@@ -192,3 +196,26 @@ def test_the_smallest_rms_is_that_of_scipys_fit() -> None:
                 for a in (0.05, 0.4, 0.8)
             )
             assert rms[k] == pytest.approx(np.sqrt(4 * cost / seen.size), rel=1e-3)
+
+
+def test_photographs_count_from_their_folder_to_the_file_that_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "my_photos"
+    folder.mkdir()
+    for number in range(6):
+        shutil.copy(ck.specifications.DATA / f"intrinsics_session/view_0{number}.jpg", folder)
+    monkeypatch.setenv("COURSEKIT_RESULTS", str(tmp_path / "results"))
+    notebook = build_notebooks.read(build_notebooks.NOTEBOOKS / "03_intrinsics.ipynb")
+    source = {c["id"]: build_notebooks.joined(c["source"]) for c in notebook["cells"]}
+    own = source["capture"].replace("my_photos = None", f"my_photos = {str(folder)!r}")
+    camera = ck.open_camera("simulated", seed=7)
+    names = {"ck": ck, "np": np, "camera": camera, "board": BOARD, "my_fx_px": (600, 620)}
+    cells = map(source.get, ("views-figure", "fit", "factory-code", "reveal", "save"))
+    for cell in (own, *cells):
+        exec(str(cell), names)
+    said = capsys.readouterr().out
+    assert "come without a factory's K" in said
+    assert "Nobody knows this lens's truth" in said
+    kept = ck.results.load("03_intrinsics")
+    assert (kept.source, kept.camera) == ("recorded", f"photographs in {folder}")
