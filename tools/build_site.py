@@ -38,6 +38,7 @@ CORRECTIONS = ROOT / "data" / "corrections.md"
 FORMATS = ROOT / "data" / "formats.md"
 
 WIDE_PX = 600  # a figure wider than this scrolls by itself on a phone, rather than shrink
+COLLAPSED = re.compile(r"<details><summary>(.*?)</summary>(.*?)</details>", re.DOTALL)
 IN_WORDS = '<details class="alt">'
 MINUTES = re.compile(r"Core: about (\d+) minutes")
 OBJECTIVES = re.compile(r"^\*\*Afterwards you can\*\*\n+(.+?)\s*\Z", re.MULTILINE | re.DOTALL)
@@ -143,7 +144,11 @@ def _slug(heading: str) -> str:
 
 def markdown(page: Page, text: str) -> str:
     """Markdown as HTML; the page notes its headings, and what it links to."""
-    html = str(MarkdownWithMath(renderer=Renderer(page)).render(text))
+    before, *collapsed = COLLAPSED.split(text)
+    html = str(MarkdownWithMath(renderer=Renderer(page)).render(before))
+    for says, inside, after in zip(collapsed[::3], collapsed[1::3], collapsed[2::3], strict=True):
+        html += _closed("reveal", markdown(page, says), markdown(page, inside.strip()))
+        html += markdown(page, after)
     return PUNCTUATED.sub(r'<span class="together">\g<0></span>', html)
 
 

@@ -18,7 +18,8 @@ from matplotlib.figure import Figure
 
 from coursekit.checks import want
 
-# Okabe-Ito, its two lightest darker for 3:1 on white: distinguishable with any colour vision; the same thing has the same colour everywhere.
+# Okabe-Ito, its two lightest darker for 3:1 on white: distinguishable with any colour vision; the
+# same thing has the same colour everywhere.
 COLORS = {
     "model": "#0072B2",  # what theory, a specification or a fit says
     "measured": "#D55E00",  # what was measured, or what a slider did
