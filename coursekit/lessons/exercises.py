@@ -18,6 +18,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -67,7 +68,8 @@ class Exercise:
     result has rows and the first `per_row` arguments have the same, one row of them is shown;
     otherwise (a result that is one number, say) the whole case. Results agree within `tolerance`
     (in `unit`) or 1e-9 of their size, and NaN with NaN. Where `nan_answers`, NaN is an answer
-    like any other; otherwise a wrong model that comes to NaN or infinity has overflowed. An
+    like any other; otherwise a wrong model that comes to NaN or infinity has overflowed. ways:
+    other right answers, what each does and the steps that do it; `way` is what the model does. An
     attempt that leaves out what is beyond the `core` is judged by the core cases alone: by an
     exercise that has only those, and is `part_of` this one.
     """
@@ -82,6 +84,8 @@ class Exercise:
     describe: Callable[[tuple[Any, ...]], str]
     show: Callable[[Floats], str]
     nan_answers: bool = False
+    way: str = ""
+    ways: list[tuple[str, dict[str, Step]]] = field(default_factory=list)
     core: Core | None = None
     mistakes: list[Mistake] = field(default_factory=list)
     part_of: Exercise | None = field(default=None, repr=False)
@@ -116,6 +120,16 @@ class Exercise:
 
     def judge(self, function: Callable[..., Any]) -> Verdict:
         """The verdict on a learner's function, without noting it."""
+        verdicts = (exercise._judge(function) for exercise in (self, *self._others))
+        return min(verdicts, key=lambda v: (v.kind != "right", not v.named, "," in (v.named or "")))
+
+    @cached_property
+    def _others(self) -> list[Exercise]:
+        """The exercise as those see it who answer it in another right way."""
+        ways = self.ways
+        return [replace(self, way=way, steps=self.steps | own, ways=[]) for way, own in ways]
+
+    def _judge(self, function: Callable[..., Any]) -> Verdict:
         if not callable(function):
             return self._say("not attempted", f"got a {type(function).__name__}, not a function.")
         runs = [_run(function, args) for args in self.cases]
@@ -183,7 +197,8 @@ class Exercise:
             core, others = self.part_of.core, len(self.part_of.cases) - count
             text = f"the core is right: all {count} cases {core.which} agree."
             return self._say("core right", f"{text} Deeper: the other {others} use {core.rest}.")
-        text = f"right. All {count} cases agree to {self.tolerance:g} {self.unit}."
+        way = f", {self.way}" if self.way else ""
+        text = f"right{way}. All {count} cases agree to {self.tolerance:g} {self.unit}."
         return self._say("right", text)
 
     def _judged(

@@ -477,18 +477,12 @@ def _drift_models(n: int) -> tuple[Floats, Floats, Floats, Floats, Integers]:
 class AveragingCurve:
     """What averaging N frames buys.
 
-    counts (K,): N = 1, 2, 4, ... std_m (K,): std over time of the mean of N frames; errors_m (K,):
-    their standard errors. ideal_m (K,): std_m[0] / sqrt(N), for independent frames. n_frames: all
-    there are. effective_frames: how many independent ones they are worth, and its interval.
-    gain: how much quieter the mean of all frames is than one; sqrt(n_frames) at best.
+    n_frames: all there are. effective_frames: how many independent ones they are worth, and its
+    interval. gain: how much quieter the mean of all frames is than one; sqrt(n_frames) at best.
     floor_m: the pattern that every frame repeats, RMS over the pixels about a plane; None for a
     series without pixels.
     """
 
-    counts: Integers
-    std_m: Floats
-    errors_m: Floats
-    ideal_m: Floats
     n_frames: int
     effective_frames: float
     effective_frames_interval: Interval
@@ -508,7 +502,7 @@ class AveragingCurve:
 
 
 def averaging_curve(series_m: ArrayLike) -> AveragingCurve:
-    """The std of the mean of N frames against N.
+    """What the mean of N frames gains over one, and what stays in each pixel.
 
     series_m: (N,) values of one pixel or of a window's mean, or (N, h, w) depths of a window on a
     smooth surface, m, NaN invalid (pixels not valid in every frame are left out).
@@ -533,8 +527,6 @@ def averaging_curve(series_m: ArrayLike) -> AveragingCurve:
     if pixels.shape[1] == 0:
         raise ValueError("series_m: no pixel is valid in every frame")
     deviation = pixels - pixels.mean(axis=0)
-    counts = 2 ** np.arange(int(math.log2(n // 4)) + 1)
-    std = np.sqrt([_means(deviation, c).var(axis=0, ddof=1).mean() for c in counts])
     effective, interval = effective_frames(deviation)
     floor = None
     if values.ndim == 3:
@@ -542,22 +534,12 @@ def averaging_curve(series_m: ArrayLike) -> AveragingCurve:
         noise = np.square(own).sum() / own.shape[1] / (n - 1) / (n / _correlation_time(own))
         floor = math.sqrt(max(off_plane(values.mean(axis=0)[None]) ** 2 - noise, 0.0))
     return AveragingCurve(
-        counts=counts,
-        std_m=std,
-        errors_m=std / np.sqrt(2 * (n // counts - 1)),
-        ideal_m=std[0] / np.sqrt(counts),
         n_frames=n,
         effective_frames=effective,
         effective_frames_interval=interval,
         gain=math.sqrt(effective),
         floor_m=floor,
     )
-
-
-def _means(values: Floats, count: Any) -> Floats:
-    """Means of consecutive blocks of `count` frames: (N // count, ...)."""
-    blocks = len(values) // count
-    return values[: blocks * count].reshape(blocks, count, *values.shape[1:]).mean(axis=1)
 
 
 # --- means, planes and errors, where NaN is invalid ---
