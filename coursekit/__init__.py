@@ -59,7 +59,7 @@ if TYPE_CHECKING:
         stereo,
         submission,
     )
-    from coursekit.cameras import open_camera, place
+    from coursekit.cameras import my_unit, open_camera, place
     from coursekit.cameras.capture import capture
     from coursekit.lessons import check, checkpoint, evidence
     from coursekit.lessons.overview import progress
@@ -69,6 +69,7 @@ if TYPE_CHECKING:
 
 _FUNCTIONS = {
     "capture": "coursekit.cameras.capture",
+    "my_unit": "coursekit.cameras",
     "open_camera": "coursekit.cameras",
     "place": "coursekit.cameras",
     "check": "coursekit.lessons",

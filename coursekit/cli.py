@@ -138,7 +138,7 @@ def _board(options: argparse.Namespace) -> None:
         fields["marker_m"] = options.marker_mm / 1000
     board = ck.boards.Board(options.kind, options.squares, options.square_mm / 1000, **fields)
     path = ck.boards.save_sheet(board, options.out, options.paper, overwrite=options.overwrite)
-    print(f"Wrote {path}: {ck.boards.sheet.caption(board)}.")
+    print(f"Wrote {path}: {ck.boards.caption(board)}.")
     print("Print at 100 %, check that the bar measures 100 mm, and glue it flat to glass.")
     print(f"In Python: {board!r}")
 

@@ -14,9 +14,8 @@ from PIL import Image
 from test_boards import not_found, photograph, random_poses, shot, view, write
 
 import coursekit.boards.detector
-from coursekit.boards import Board, detect, detect_all
+from coursekit.boards import Board, caption, detect, detect_all
 from coursekit.boards.find import on_plane
-from coursekit.boards.sheet import caption
 
 CASES = Path(os.environ.get("COURSEKIT_REAL_DATA", "none")).parent / "cases"
 APRIL = "DICT_APRILTAG_36H11"

@@ -10,7 +10,7 @@ import nbformat
 import pytest
 
 from tools import build_notebooks
-from tools.build_notebooks import WIDGET_VIEW, code_cells, problems, read
+from tools.build_notebooks import WIDGET_VIEW, code_cells, joined, problems, read
 
 SOURCES = {
     "setup": "import os\nimport coursekit as ck",
@@ -34,7 +34,9 @@ def toy(sources, path):
         if name in build_notebooks.PARTS:
             cell.metadata["coursekit"] = {"exercise": "half", "part": name}
         if name == "answer":
-            cell.metadata["jupyter"] = {"source_hidden": True}
+            cell.metadata["jupyter"] = {"outputs_hidden": True}  # not as it should be
+        if name == "sum":
+            cell.metadata["tags"] = ["answers", "answers-source"]
         notebook.cells.append(cell)
     path.parent.mkdir(exist_ok=True)
     nbformat.write(notebook, path)
@@ -97,8 +99,12 @@ def test_what_changes_from_run_to_run_is_not_stored(built):
     cells = code_cells(notebook)
     assert [cell["execution_count"] for cell in cells] == [1, 2, 3, 4, 5, 6]
     assert not any("execution" in cell["metadata"] for cell in cells)
-    (question,) = cell_of(notebook, "question")["outputs"]
+    hidden = {"source_hidden": True, "outputs_hidden": True}
+    assert cell_of(notebook, "sum")["metadata"]["jupyter"] == hidden
+    assert cell_of(notebook, "answer")["metadata"]["tags"] == ["hide-input"]
+    question, said = cell_of(notebook, "question")["outputs"]
     assert sorted(question["data"]) == ["text/html", "text/plain"]
+    assert joined(said["data"]["text/html"]) == ""
     (stream,) = cell_of(notebook, "check")["outputs"]
     assert stream["text"] == ["one\n", "two\n"]
     assert cell_of(notebook, "sum")["outputs"][0]["text"] == ["0.476 m, camera simulated\n"]
@@ -197,13 +203,22 @@ FLAWS = [
     (change("answer", outputs=output("1")), "cell answer: an answer cell prints something"),
     (
         change("answer", metadata=TAG),
-        "cell answer: an answer cell is not hidden (metadata jupyter.source_hidden)",
+        "cell answer: what its tags hide is not hidden (metadata tags and jupyter)",
     ),
     (
         change("answer", source=["def half_answer(x):\n", "    return x / 2"]),
         "cell answer: an answer cell does not begin with a comment, which is all that a learner "
         "sees of it",
     ),
+    (
+        change("sum", metadata={"tags": ["answers"]}),
+        "cell sum: what its tags hide is not hidden (metadata tags and jupyter)",
+    ),
+    (
+        change("sum", metadata={"tags": ["answers-source"]}),
+        "cell sum: is tagged 'answers-source' without 'answers'",
+    ),
+    (change("sum", outputs=[]), "cell sum: is tagged 'answers' and has no output"),
     (change("check", metadata={}), "exercise 'half' has 0 check cells, want 1"),
     (change("stub", source=["half = None"]), "cell stub: does not define half()"),
     (
@@ -316,4 +331,4 @@ def test_nbval_fails_on_one_changed_digit_and_passes_what_is_stripped_as_well(bu
         "02_toy.ipynb::Cell 4"
     ]
     assert "0.477 m" in run.stdout
-    assert len(problems(stripped)) == len(SOURCES) - 1
+    assert len(problems(stripped)) == len(SOURCES)  # and no answer

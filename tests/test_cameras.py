@@ -429,10 +429,46 @@ def test_the_environment_variable_names_the_camera_of_auto(monkeypatch, tabletop
         open_camera()
 
 
+def test_what_the_factory_says_is_the_reference_of_notebook_01():
+    path = ck.specifications.DATA / "reference_results" / "01_pinhole.json"
+    stored = ck.results.read(path).quantities
+    del stored["one_pixel_at_450_mm"]
+    assert open_camera("simulated").factory_values() == stored
+
+
 @pytest.mark.parametrize("which", ["", "bogus", 7, None, b"a.db3", "Simulated"])
 def test_nonsense_is_refused_with_what_is_wanted(which):
     with pytest.raises(ValueError, match=r'^which: got .*, want "auto", "simulated", a serial'):
         open_camera(which)
+
+
+def test_a_name_makes_a_unit_of_ones_own(monkeypatch, tmp_path):
+    monkeypatch.setenv("COURSEKIT_RESULTS", str(tmp_path / "results"))
+    monkeypatch.setenv("COURSEKIT_CAMERA", "simulated")
+    assert (ck.my_unit(), ck.my_unit(), open_camera().seed) == (7, 7, 7)
+    assert not (tmp_path / "results").exists()
+    mine = ck.my_unit("José Müller")
+    assert mine == ck.my_unit("  jose MÜLLER ") == ck.my_unit() == open_camera().seed == 60769597
+    assert open_camera("simulated", seed=8).seed == 8
+    assert open_camera().reveal() != open_camera(seed=7).reveal()
+    others = {ck.my_unit(f"Student {n}") for n in range(200)}
+    assert len(others) == 200
+    assert min(others) > 9_999_999  # far from the seeds that notebooks count up from
+
+
+def test_a_damaged_unit_says_what_to_do(monkeypatch, tmp_path):
+    monkeypatch.setenv("COURSEKIT_RESULTS", str(tmp_path))
+    for damaged in ("", "[]", "{}", '{"seed": "7"}', '{"seed": -1}', '{"seed": 7.5}'):
+        (tmp_path / "unit.json").write_text(damaged, encoding="utf-8")
+        with pytest.raises(ValueError, match=r'^unit\.json in results/ is .* ck\.my_unit\("your'):
+            open_camera("simulated")
+    assert open_camera("simulated", seed=7).seed == 7
+    assert ck.my_unit("Ada") == ck.my_unit()
+    for nameless in (" ", "!?"):
+        with pytest.raises(ValueError, match=r"^name: got .*, want one with letters"):
+            ck.my_unit(nameless)
+    with pytest.raises(ValueError, match=r"^name: got int, want str"):
+        ck.my_unit(7)
 
 
 def test_opening_the_simulated_camera_loads_no_hardware_library():

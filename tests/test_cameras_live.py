@@ -308,15 +308,14 @@ def test_without_the_library_auto_is_simulated_and_says_why(no_library):
     assert camera.source == "simulated"
     assert repr(camera).startswith(
         "Simulated D435, seed 7: no real camera in use.\nThe reason: pyrealsense2 is not "
-        "installed, so neither a RealSense nor a recording can be opened"
+        "installed, so no RealSense can be opened and nothing recorded"
     )
     assert "requirements-camera.txt" in repr(camera)
 
 
-@pytest.mark.parametrize("which", [SERIAL, "a.db3"])
-def test_without_the_library_a_named_camera_says_what_to_do(no_library, which):
-    with pytest.raises(LibraryMissing, match=r"requirements-camera\.txt.*simulated camera works"):
-        open_camera(which)
+def test_without_the_library_a_named_camera_says_what_to_do(no_library):
+    with pytest.raises(LibraryMissing, match=r"requirements-camera\.txt.*simulated camera work"):
+        open_camera(SERIAL)
 
 
 def test_without_the_library_nothing_is_recorded(no_library, tmp_path):

@@ -460,15 +460,21 @@ def test_the_numbers_of_the_checkpoints() -> None:
 
 
 def test_the_widget_commits() -> None:
-    field, button, said = panel(CHECKPOINTS["pinhole.half_size"]).children
+    said: list[str] = []
+    field, button = panel(CHECKPOINTS["pinhole.half_size"], said.append).children
     button.click()
-    assert "Choose or type" in said.value
+    assert "Choose or type" in said[-1]
     field.value = "A"
     button.click()
-    assert "not this one" in said.value
+    assert "not this one" in said[-1]
     field.value = "C"
     button.click()
-    assert "right" in said.value
+    assert "right" in said[-1]
+    assert CHECKPOINTS["pinhole.half_size"]._before().startswith("<details><summary>You have")
+    field, _ = panel(PITCH, said.append).children
+    field.value = "2000"
+    field._handle_custom_msg({"event": "submit"}, [])  # the key Enter
+    assert "right" in said[-1]
     kinds = [a["kind"] for a in questions.read_attempts()["pinhole.half_size"]]
     assert kinds == ["wrong", "right"]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import html
 from types import SimpleNamespace
 
 import numpy as np
@@ -147,8 +148,10 @@ def test_point_cloud_shows_what_is_near_from_the_side_if_there_is_anything() -> 
     near[200:280, 300:500] = 0.45
     cases = ((near, (0.45, 0.45), True), (np.full_like(near, 0.9), (0.9, 0.9), False))
     for depth, shown, says in cases:
-        solid, above = pinhole.point_cloud(geometry.deproject_image(depth, D435.depth)).axes
+        solid, above, _ = pinhole.point_cloud(geometry.deproject_image(depth, D435.depth)).axes
         (dots,) = solid.collections
+        if says:  # one colour, one depth
+            assert dots.get_clim() == above.collections[0].get_clim() == pytest.approx((0.45, 0.9))
         z = np.asarray(dots._offsets3d[1])
         assert (z.min(), z.max()) == pytest.approx(shown)
         assert ("Z < 0.6 m" in solid.get_title()) == says
@@ -163,7 +166,7 @@ def test_the_spot_has_room_on_the_sensor() -> None:
         assert sensor.get_xlim()[0] < spot < sensor.get_xlim()[1] < 1.5
 
 
-def test_drag_draws_its_start_and_follows_a_slider() -> None:
+def test_drag_draws_its_start_and_follows_a_slider(monkeypatch) -> None:
     drag = plots.drag(
         pinhole.similar_triangles, focal_length_mm=(1, 4, 1.93), depth_m=(0.35, 1.2, 0.45)
     )
@@ -175,8 +178,13 @@ def test_drag_draws_its_start_and_follows_a_slider() -> None:
     depth.value = 0.5
     assert depth.value == 0.5
     assert image.value != before
-    bundle, _ = drag._repr_mimebundle_()
-    assert bundle["text/plain"] == pinhole.similar_triangles(1.93, 0.45).alt
+    shown: list = []
+    monkeypatch.setattr("IPython.display.display", lambda data, **_: shown.append(data))
+    drag._ipython_display_()
+    figure, words = shown
+    assert figure["text/plain"] == pinhole.similar_triangles(1.93, 0.45).alt
+    assert html.escape(figure["text/plain"]) in words["text/html"]
+    assert html.escape(figure["text/plain"]) in before
 
 
 @pytest.mark.parametrize("slider", [(1, 2), (2, 1, 1.5), (1, 2, 3), (1, 1, 1)])

@@ -262,13 +262,17 @@ def test_answers_are_collapsed_and_nowhere_else(pages):
             assert answer.summary.text == joined(cell["source"]).splitlines()[0].lstrip("# ")
             answer.decompose()
         assert "_answer(" not in page.text
-        assert not page.select("details:not(.answer) pre")
+        assert not page.select("details:not(.answer, .reveal) pre")
 
 
-def test_a_hidden_source_is_collapsed():
-    cell = code_cell({"output_type": "stream", "text": "x"}, jupyter={"source_hidden": True})
-    html = build_site.cell_html(a_page(), cell)
-    assert html.startswith('<details class="answer"><summary>An answer</summary>')
+@pytest.mark.parametrize("tags", [["answers"], ["answers", "answers-source"]])
+def test_what_answers_a_prediction_is_collapsed(tags):
+    cell = code_cell({"output_type": "stream", "text": "the answer"}, tags=tags)
+    page = BeautifulSoup(build_site.cell_html(a_page(), cell), "html.parser")
+    closed = page.select("details.reveal")
+    assert len(closed) == len(tags)
+    assert [d.has_attr("open") for d in closed] == [False] * len(tags)
+    assert ("the answer" in closed[-1].text, "show()" in closed[0].text) == (True, len(tags) > 1)
 
 
 def test_every_checkpoint_keeps_its_explanation_closed(pages):
@@ -276,7 +280,7 @@ def test_every_checkpoint_keeps_its_explanation_closed(pages):
     for name, checkpoint in ck.lessons.CHECKPOINTS.items():
         assert text.count(f'ck.checkpoint("{name}").answer(') == 1, name
         assert checkpoint.explanation().headline.split(":")[0] in text.replace("&amp;", "&")
-    closed = [d for p in pages.values() for d in p.select(".output details")]
+    closed = [d for p in pages.values() for d in p.select(".output > details")]
     assert len(closed) == len(ck.lessons.CHECKPOINTS)
     assert not any(details.has_attr("open") for details in closed)
 

@@ -38,9 +38,20 @@ FIXED = {
     "OPENCV_FOR_THREADS_NUM": "1",
     "VECLIB_MAXIMUM_THREADS": "1",
 }
-METADATA = {
-    "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
-    "language_info": {"name": "python"},
+METADATA = {  # as a kernel says it, less its version
+    "kernelspec": {
+        "display_name": "Python 3 (ipykernel)",
+        "language": "python",
+        "name": "python3",
+    },
+    "language_info": {
+        "codemirror_mode": {"name": "ipython", "version": 3},
+        "file_extension": ".py",
+        "mimetype": "text/x-python",
+        "name": "python",
+        "nbconvert_exporter": "python",
+        "pygments_lexer": "ipython3",
+    },
 }
 PER_RUN = {"collapsed", "ExecuteTime", "execution", "scrolled", "trusted"}  # cell metadata
 WIDGET_VIEW = "application/vnd.jupyter.widget-view+json"
@@ -49,6 +60,8 @@ NOTHING: frozenset[str] = frozenset()
 LONGEST_CELL = 15
 CELL_TIMEOUT_S = 600
 PARTS = ("stub", "check", "answer")
+# Tags of a code cell: its outputs, or its source too, answer what the text asked to predict
+ANSWERS, ANSWERS_SOURCE = "answers", "answers-source"
 ADDRESS = re.compile(r"0x[0-9a-fA-F]{8,}")
 MACHINE_PATH = re.compile(r"(?<![\w.:/<])(?:/[\w.+-]+/[\w.+-]+|[A-Z]:\\)[^\s<>'\"]*")
 
@@ -154,12 +167,30 @@ def normalise(notebook: Notebook) -> None:
         cell["metadata"] = {k: v for k, v in cell["metadata"].items() if k not in PER_RUN}
     for count, cell in enumerate(code_cells(notebook), 1):
         cell["execution_count"] = count
+        hide(cell)
         for output in cell["outputs"]:
             if output["output_type"] == "execute_result":
                 output["execution_count"] = count
             if "data" in output:
                 output["data"].pop(WIDGET_VIEW, None)
                 output["metadata"].pop(WIDGET_VIEW, None)
+
+
+def hide(cell: Cell) -> None:
+    """Collapse what gives an answer away: for JupyterLab, and by tags for Jupyter Book."""
+    metadata = cell["metadata"]
+    tags = [tag for tag in metadata.get("tags", []) if tag not in ("hide-input", "hide-output")]
+    shown = {k: v for k, v in metadata.get("jupyter", {}).items() if k[-7:] != "_hidden"}
+    if role(cell)[1] == "answer" or ANSWERS_SOURCE in tags:
+        tags.append("hide-input")
+        shown["source_hidden"] = True
+    if ANSWERS in tags:
+        tags.append("hide-output")
+        shown["outputs_hidden"] = True
+    for key, value in (("tags", tags), ("jupyter", shown)):
+        metadata.pop(key, None)
+        if value:
+            metadata[key] = value
 
 
 def read(path: Path) -> Notebook:
@@ -200,6 +231,7 @@ def problems(path: Path) -> list[str]:
     found = [*_of_the_file(path, notebook), *_of_exercises(notebook)]
     for count, cell in enumerate(code_cells(notebook), 1):
         said = [*_of_execution(cell, count), *_of_outputs(cell), *_of_source(cell)]
+        said += _of_what_is_hidden(cell)
         found += [f"cell {cell.get('id', count)}: {text}" for text in said]
     return [f"{path.stem}: {text}" for text in found]
 
@@ -258,10 +290,20 @@ def _of_source(cell: Cell) -> Iterator[str]:
         return
     if cell["outputs"]:
         yield "an answer cell prints something"  # it would be shown open after Run All
-    if not cell["metadata"].get("jupyter", {}).get("source_hidden"):
-        yield "an answer cell is not hidden (metadata jupyter.source_hidden)"
     if not source.startswith("#"):
         yield "an answer cell does not begin with a comment, which is all that a learner sees of it"
+
+
+def _of_what_is_hidden(cell: Cell) -> Iterator[str]:
+    tags = cell["metadata"].get("tags", [])
+    if ANSWERS in tags and not cell["outputs"]:
+        yield f"is tagged {ANSWERS!r} and has no output"
+    if ANSWERS_SOURCE in tags and ANSWERS not in tags:
+        yield f"is tagged {ANSWERS_SOURCE!r} without {ANSWERS!r}"
+    as_it_should_be = {**cell, "metadata": {**cell["metadata"]}}
+    hide(as_it_should_be)
+    if cell["metadata"] != as_it_should_be["metadata"]:
+        yield "what its tags hide is not hidden (metadata tags and jupyter)"
 
 
 def _of_exercises(notebook: Notebook) -> Iterator[str]:

@@ -27,7 +27,7 @@ from nbconvert.filters.highlight import Highlight2HTML
 from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
 
 from tools import reference
-from tools.build_notebooks import ROOT, Cell, find, joined, read, role
+from tools.build_notebooks import ANSWERS, ANSWERS_SOURCE, ROOT, Cell, find, joined, read, role
 from tools.mathematics import mathml
 
 SITE = ROOT / "build" / "site"
@@ -38,6 +38,7 @@ CORRECTIONS = ROOT / "data" / "corrections.md"
 FORMATS = ROOT / "data" / "formats.md"
 
 WIDE_PX = 600  # a figure wider than this scrolls by itself on a phone, rather than shrink
+IN_WORDS = '<details class="alt">'
 PROGRESS_BAR = re.compile(r"\s*\d+%\|")
 MINUTES = re.compile(r"Core: about (\d+) minutes")
 OBJECTIVES = re.compile(r"^\*\*Afterwards you can\*\*\n+(.+?)\s*\Z", re.MULTILINE | re.DOTALL)
@@ -182,10 +183,19 @@ def cell_html(page: Page, cell: Cell) -> str:
     if cell["cell_type"] == "markdown":
         return markdown(page, source)
     shown = code_html(source)
-    if role(cell)[1] == "answer" or cell["metadata"].get("jupyter", {}).get("source_hidden"):
-        says = escape(source.splitlines()[0].lstrip("# "))
-        shown = f'<details class="answer"><summary>{says}</summary>\n{shown}</details>\n'
-    return shown + "".join(output_html(page, cell, output) for output in cell["outputs"])
+    tags = cell["metadata"].get("tags", [])
+    if role(cell)[1] == "answer":
+        shown = _closed("answer", escape(source.splitlines()[0].lstrip("# ")), shown)
+    elif ANSWERS_SOURCE in tags:
+        shown = _closed("reveal", "The code, which says something of the answer", shown)
+    outputs = "".join(output_html(page, cell, output) for output in cell["outputs"])
+    if ANSWERS in tags:
+        outputs = _closed("reveal", "What comes out: decide first, then open it", outputs)
+    return shown + outputs
+
+
+def _closed(kind: str, says: str, content: str) -> str:
+    return f'<details class="{kind}"><summary>{says}</summary>\n{content}</details>\n'
 
 
 def output_html(page: Page, cell: Cell, output: dict[str, Any]) -> str:
@@ -195,7 +205,10 @@ def output_html(page: Page, cell: Cell, output: dict[str, Any]) -> str:
     data = output.get("data", {"text/plain": output.get("text", "")})
     text = joined(data.get("text/plain", ""))
     if "text/html" in data:
-        return f'<div class="output">{joined(data["text/html"])}</div>\n'
+        html = joined(data["text/html"])
+        if not html or html.startswith(IN_WORDS):  # a figure's words are its alternative text here
+            return ""
+        return f'<div class="output">{html}</div>\n'
     if "image/png" in data:
         return _figure(page, cell, output)
     if not text or PROGRESS_BAR.match(text):

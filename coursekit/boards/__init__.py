@@ -9,6 +9,7 @@ from coursekit.boards.board import (
     Detection,
     Detections,
     Skipped,
+    caption,
+    save_sheet,
 )
 from coursekit.boards.detector import detect, detect_all
-from coursekit.boards.sheet import save_sheet

@@ -7,22 +7,27 @@ from pathlib import Path
 
 from coursekit.cameras import conventions
 from coursekit.cameras.camera import Camera, place
+from coursekit.cameras.files import ImageFolder, RecordedSet, RosBag, play
 from coursekit.cameras.frames import CameraError, Frame, Frames
 from coursekit.cameras.librealsense import LibraryMissing, connected_realsenses
-from coursekit.cameras.realsense import ImageFolder, RealSense, RecordedSet
+from coursekit.cameras.realsense import RealSense
 from coursekit.cameras.recording import INDEX, INTRINSICS
-from coursekit.cameras.simulated import SimulatedCamera
+from coursekit.cameras.simulated import PLUG_IN, SimulatedCamera, my_unit
 
-__all__ = ["Camera", "CameraError", "Frame", "Frames", "conventions", "open_camera", "place"]
+__all__ = [
+    "Camera", "CameraError", "Frame", "Frames", "conventions", "my_unit", "open_camera", "place",
+]  # fmt: skip
 
 VARIABLE = "COURSEKIT_CAMERA"
 CAMERA_NAMES = (
-    'want "auto", "simulated", a serial number, the path of a .db3 or .bag recording, '
+    'want "auto", "simulated", a serial number, the path of a .db3, .bag or .mcap recording, '
     "or a folder of them or of depth images"
 )
 
 
-def open_camera(which: str | os.PathLike[str] = "auto", infrared: bool = False) -> Camera:
+def open_camera(
+    which: str | os.PathLike[str] = "auto", infrared: bool = False, seed: int | None = None
+) -> Camera:
     """The camera that `which` names, open and ready.
 
     which: "simulated"; the path of a .db3 or .bag recording, of a folder that `Camera.record_set`
@@ -30,7 +35,9 @@ def open_camera(which: str | os.PathLike[str] = "auto", infrared: bool = False) 
     number (digits) of a RealSense; or "auto", which is what the environment variable
     COURSEKIT_CAMERA names, else the first RealSense on USB, else the
     simulated camera. infrared: whether a live camera is to give its two infrared images with each
-    frame; the others give them when they have them. Raises ValueError when `which` is none of
+    frame; the others give them when they have them. seed: which simulated camera, a whole number;
+    None for your own, `my_unit()`. Another seed is another unit of the same model, with errors of
+    its own; real cameras and recordings have none. Raises ValueError when `which` is none of
     these, and CameraError with what to do when the camera or file does not open: a RealSense that
     is plugged in but does not work is never replaced silently.
 
@@ -42,12 +49,12 @@ def open_camera(which: str | os.PathLike[str] = "auto", infrared: bool = False) 
     if isinstance(which, str) and which == "auto":
         which, argument = os.environ.get(VARIABLE, "auto"), VARIABLE
         if which == "auto":
-            return _connected_or_simulated(infrared)
+            return _connected_or_simulated(infrared, seed)
     if isinstance(which, os.PathLike):
         return _recording(Path(which))
     if isinstance(which, str):
         if which == "simulated":
-            return SimulatedCamera()
+            return _simulated(seed)
         if which.isdecimal():
             return _live(which, infrared)
         path = Path(which)
@@ -56,12 +63,16 @@ def open_camera(which: str | os.PathLike[str] = "auto", infrared: bool = False) 
     raise ValueError(f"{argument}: got {which!r}, {CAMERA_NAMES}")
 
 
-def _connected_or_simulated(infrared: bool) -> Camera:
+def _simulated(seed: int | None, advice: str = PLUG_IN) -> Camera:
+    return SimulatedCamera(seed=my_unit() if seed is None else seed, advice=advice)
+
+
+def _connected_or_simulated(infrared: bool, seed: int | None) -> Camera:
     try:
         serials = connected_realsenses()
     except LibraryMissing as missing:
-        return SimulatedCamera(advice=f"The reason: {missing}.")
-    return RealSense(min(serials), infrared=infrared) if serials else SimulatedCamera()
+        return _simulated(seed, f"The reason: {missing}.")
+    return RealSense(min(serials), infrared=infrared) if serials else _simulated(seed)
 
 
 def _live(serial: str, infrared: bool) -> Camera:
@@ -78,6 +89,8 @@ def _live(serial: str, infrared: bool) -> Camera:
 def _recording(path: Path) -> Camera:
     path = path.expanduser()
     if not path.is_dir():
-        return RealSense(path=path)
+        return play(path)
+    if (path / "metadata.yaml").exists():  # what `ros2 bag record` makes
+        return RosBag(path)
     images = (path / INTRINSICS).exists() or any(path.glob("*.png"))
     return ImageFolder(path) if images and not (path / INDEX).exists() else RecordedSet(path)

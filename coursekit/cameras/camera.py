@@ -15,6 +15,7 @@ from coursekit import checks
 from coursekit.cameras import recording
 from coursekit.cameras.frames import CameraError, Description, Frame, Frames
 from coursekit.geometry import Intrinsics
+from coursekit.results import Quantity
 
 
 @dataclass(frozen=True)
@@ -103,6 +104,22 @@ class Camera(Description, ABC):
             f"nobody knows the true geometry of the {self.name}: only a camera that "
             'open_camera("simulated") opened can reveal it'
         )
+
+    def factory_values(self) -> dict[str, Quantity]:
+        """What the device says of itself, for `results.save`: nobody has told how uncertain it is.
+
+        depth_fx to color_cy, depth_width and depth_height in px; the baseline in mm.
+        """
+        says = {}
+        for name, lens in (("depth", self.depth), ("color", self.color)):
+            for entry in ("fx", "fy", "cx", "cy") if lens else ():
+                value, note = getattr(lens, entry), "factory, sigma not given"
+                says[f"{name}_{entry}"] = Quantity(value, "px", None, "bias", note)
+        for name, size in zip(("width", "height"), self.depth.size, strict=True):
+            says[f"depth_{name}"] = Quantity(size, "px")
+        if self.baseline_m is not None:
+            says["baseline"] = Quantity(1000 * self.baseline_m, "mm", None, "bias", "factory")
+        return says
 
     def frames(self, n: int = 1, progress: bool = True) -> Frames:
         """The next n frames; of a recording always its first n.
@@ -209,6 +226,17 @@ def place(camera: Camera, name: str, distance_m: float) -> Iterator[Camera]:
     """
     camera.place(name, distance_m)
     yield camera
+
+
+def camera_line(camera: Camera, where: str, without: str) -> str:
+    """A camera's figures in a line; without: what is said of a baseline that it does not have."""
+    depth, color, baseline_m = camera.depth, camera.color, camera.baseline_m
+    colour = f"colour {color.width}x{color.height}" if color else "no colour"
+    baseline = without if baseline_m is None else f"{1000 * baseline_m:.1f} mm"
+    return (
+        f"{camera.name} ({where}): depth {depth.width}x{depth.height}, {colour}, "
+        f"baseline {baseline}, depth unit {1000 * camera.depth_scale_m:g} mm"
+    )
 
 
 def _lens_text(lens: Intrinsics) -> str:

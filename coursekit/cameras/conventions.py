@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +19,7 @@ from coursekit.cameras.recording import realsense_intrinsics
 from coursekit.geometry import Intrinsics
 from coursekit.specifications import DATA
 
+Function = Callable[..., Any]
 VENDOR_MODELS = DATA / "vendor_models.json"
 POINTS = 2000
 # A 640x480 camera with fx != fy, p1 != p2 and every coefficient in use, so that nothing cancels.
@@ -41,45 +44,66 @@ class Agreement:
     """One distortion model in librealsense, the largest of many points, px.
 
     project_px: its projection against `geometry.project`. round_trip_px: its own deprojection,
-    projected again, against the pixel it started from.
+    projected again, against the pixel it started from. yours_px, yours_mm: its projection and
+    deprojection against a learner's; None where these give no such array.
     """
 
     model: str
     coefficients: str
     project_px: float
     round_trip_px: float
+    yours_px: float | None = None
+    yours_mm: float | None = None
 
     def __str__(self) -> str:
-        errors = f"{self.project_px:8.3f} px {self.round_trip_px:8.3f} px"
-        return f"{self.model:23} {self.coefficients:22} {errors}"
+        yours = [(self.yours_px, "px"), (self.yours_mm, "mm")]
+        columns = [(self.project_px, "px"), (self.round_trip_px, "px"), *yours]
+        texts = ["-" if size is None else f"{size:.3f} {unit}" for size, unit in columns]
+        return f"{self.model:22} {self.coefficients:21}" + "".join(f"{t:>12}" for t in texts)
 
 
-def measure() -> list[Agreement]:
+def measure(*yours: Function) -> list[Agreement]:
     """Each distortion model of librealsense, over random points all over the image.
 
-    Raises LibraryMissing without pyrealsense2.
+    yours: a learner's project and deproject. Raises LibraryMissing without pyrealsense2.
     """
     rng = np.random.default_rng(1)
     pixels = rng.uniform([0, 0], [CAMERA.width - 1, CAMERA.height - 1], (POINTS, 2))
     depths = rng.uniform(0.2, 4.0, POINTS)
-    return [_measure(model, name, pixels, depths) for model, name in CASES]
+    return [_measure(model, name, pixels, depths, *yours) for model, name in CASES]
 
 
-def _measure(model: str, name: str, pixels: Floats, depths: Floats) -> Agreement:
+def _measure(model: str, name: str, pixels: Floats, depths: Floats, *yours: Function) -> Agreement:
     rs = load_librealsense()
     camera = Intrinsics(**CAMERA.to_dict() | {"model": model, "coeffs": COEFFS[name]})
-    theirs = realsense_intrinsics(rs, camera)
-    points = geometry.deproject(pixels, depths, camera.K, camera.dist)
+    theirs, lens = realsense_intrinsics(rs, camera), (camera.K, camera.dist)
+    points = geometry.deproject(pixels, depths, *lens)
     projected = np.array([rs.rs2_project_point_to_pixel(theirs, p) for p in points.tolist()])
     seen = zip(projected.tolist(), depths.tolist(), strict=True)
-    back = [rs.rs2_deproject_pixel_to_point(theirs, uv, z) for uv, z in seen]
+    back = np.array([rs.rs2_deproject_pixel_to_point(theirs, uv, z) for uv, z in seen])
     again = np.array([rs.rs2_project_point_to_pixel(theirs, p) for p in back])
-    ours = geometry.project(points, camera.K, camera.dist)
-    return Agreement(model, name, _largest(projected - ours), _largest(again - projected))
+    ours = geometry.project(points, *lens)
+    own = Agreement(model, name, _longest(projected - ours), _longest(again - projected))
+    if not yours:
+        return own
+    project, deproject = yours
+    mm = largest(1000 * back, lambda *a: 1000 * deproject(*a), projected, depths, *lens)
+    return replace(own, yours_px=largest(projected, project, points, *lens), yours_mm=mm)
 
 
-def _largest(difference: Floats) -> float:
-    return float(np.linalg.norm(difference, axis=1).max())
+def largest(right: Floats, function: Function, first: Floats, *others: Any) -> float | None:
+    """The largest distance between the rows of a learner's function and the right ones (n, k).
+
+    None where it is not written yet, or gives no such array. `first` is passed as a copy.
+    """
+    try:
+        return _longest(function(first.copy(), *others) - right)
+    except Exception:  # whatever a function that is half written raises
+        return None
+
+
+def _longest(differences: Floats) -> float:
+    return float(np.linalg.norm(differences, axis=1).max())
 
 
 def stored() -> list[Agreement]:
@@ -87,10 +111,10 @@ def stored() -> list[Agreement]:
     return [Agreement(**row) for row in results.read_json(VENDOR_MODELS)["rows"]]
 
 
-def table() -> tuple[list[Agreement], str]:
-    """The rows, measured here or else the stored ones, and a sentence that says which."""
+def table(*yours: Function) -> tuple[list[Agreement], str]:
+    """The rows of `measure`, or else the stored ones, and a sentence that says which."""
     try:
-        return measure(), "measured on this computer"
+        return measure(*yours), "measured on this computer"
     except LibraryMissing:
         return stored(), "stored: pyrealsense2 is not installed here"
 
@@ -98,4 +122,5 @@ def table() -> tuple[list[Agreement], str]:
 def store() -> None:
     """Measure and write data/vendor_models.json (called by tools/make_data.py)."""
     note = f"coursekit.cameras.conventions, pyrealsense2 {version('pyrealsense2')}"
-    results.write_json(VENDOR_MODELS, {"source": note, "rows": [asdict(row) for row in measure()]})
+    rows = [{k: v for k, v in asdict(row).items() if v is not None} for row in measure()]
+    results.write_json(VENDOR_MODELS, {"source": note, "rows": rows})

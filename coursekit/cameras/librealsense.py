@@ -47,9 +47,10 @@ def load_librealsense() -> ModuleType:
         import pyrealsense2
     except ModuleNotFoundError:
         raise LibraryMissing(
-            "pyrealsense2 is not installed, so neither a RealSense nor a recording can be opened: "
+            "pyrealsense2 is not installed, so no RealSense can be opened and nothing recorded: "
             "`pip install -r requirements-camera.txt` installs it on x86-64 Linux and Windows; "
-            "there is none for macOS and most ARM computers, where the simulated camera works"
+            "there is none for macOS and most ARM computers, where recordings and the simulated "
+            "camera work"
         ) from None
     except ImportError as error:
         raise LibraryMissing(

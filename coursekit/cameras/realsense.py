@@ -1,8 +1,4 @@
-"""RealSense cameras on USB, recordings of them, and what a folder holds: a set of recordings, or
-depth images of any other camera.
-
-Cameras and recordings are one class, because librealsense plays both.
-"""
+"""RealSense cameras on USB and recordings of them: one class, because librealsense plays both."""
 
 from __future__ import annotations
 
@@ -18,14 +14,13 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from coursekit import checks, results, specifications
+from coursekit import specifications
 from coursekit.arrays import AnyArray, Image
 from coursekit.cameras import recording
-from coursekit.cameras.camera import Camera
-from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Description, Frame
+from coursekit.cameras.camera import Camera, camera_line
+from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Frame
 from coursekit.cameras.librealsense import device_info, load_librealsense, start_problem
 from coursekit.geometry import Intrinsics, make_transform
-from coursekit.words import counted
 
 DEPTH_SIZE, COLOR_SIZE = (848, 480), (640, 480)
 WARM_UP_FRAMES = 30  # automatic exposure settles in about a second
@@ -168,10 +163,12 @@ class RealSense(Camera):
         rs, device, sensor = self._rs, self._profile.get_device(), self._depth_sensor()
         self.name = device_info(rs, device, "name") or "RealSense"
         self.serial = device_info(rs, device, "serial_number")
-        self.depth_scale_m = _decimal(sensor.get_depth_scale())
+        self.depth_scale_m = shortest_decimal(sensor.get_depth_scale())
         self.baseline_m = None
         if sensor.supports(rs.option.stereo_baseline):
-            self.baseline_m = _decimal(sensor.get_option(rs.option.stereo_baseline)) / 1000.0
+            self.baseline_m = (
+                shortest_decimal(sensor.get_option(rs.option.stereo_baseline)) / 1000.0
+            )
         profiles = {p.stream_type(): p for p in self._profile.get_streams()}
         depth = profiles[rs.stream.depth].as_video_stream_profile()
         self.depth = Intrinsics.from_realsense(depth.get_intrinsics())
@@ -186,7 +183,7 @@ class RealSense(Camera):
 
     def __repr__(self) -> str:
         where = f"recording {self._path.name}" if self._path else f"live, serial {self.serial}"
-        return _described(self, where, "unknown")
+        return camera_line(self, where, "unknown")
 
     # --- frames --------------------------------------------------------------------------------
 
@@ -485,17 +482,6 @@ def _pixels(infrared: tuple[Any, ...]) -> tuple[Image, Image] | None:
     return left, right
 
 
-def _described(camera: Camera, where: str, without: str) -> str:
-    """A camera's figures in a line; without: what is said of a baseline that it does not have."""
-    depth, color, baseline_m = camera.depth, camera.color, camera.baseline_m
-    colour = f"colour {color.width}x{color.height}" if color else "no colour"
-    baseline = without if baseline_m is None else f"{1000 * baseline_m:.1f} mm"
-    return (
-        f"{camera.name} ({where}): depth {depth.width}x{depth.height}, {colour}, "
-        f"baseline {baseline}, depth unit {1000 * camera.depth_scale_m:g} mm"
-    )
-
-
 def _rgb_converter(form: str) -> Callable[[AnyArray], Image]:
     """The function that makes (h, w, 3) RGB of a colour image in librealsense's format `form`."""
     slices: dict[str, Any] = {"rgb8": np.s_[..., :3], "rgba8": np.s_[..., :3]}
@@ -514,7 +500,7 @@ def _two_bytes_a_pixel(image: AnyArray) -> Image:
     return np.ascontiguousarray(image).view(np.uint8).reshape(*image.shape[:2], 2)
 
 
-def _decimal(value: float) -> float:
+def shortest_decimal(value: float) -> float:
     """The shortest decimal number that is the same in float32: 0.001, not 0.0010000000475."""
     return float(str(np.float32(value)))
 
@@ -528,120 +514,3 @@ def specified(name: str) -> specifications.Device | None:
     devices = (d for d in specifications.device_names() if re.search(rf"\b{d}", name))
     found = next(devices, None)
     return specifications.device(found) if found else None
-
-
-# --- folders --------------------------------------------------------------------------------------
-
-
-class RecordedSet(Camera):
-    """The recordings in a folder that `record_set` wrote, as one camera; the first is open.
-
-    Raises CameraError for a folder without a set, and for recordings that do not open.
-    """
-
-    can_place = True
-
-    def __init__(self, folder: Path) -> None:
-        self._index = recording.Index.read(folder)
-        self._turn_to(self._index.scenes[0])
-
-    def _turn_to(self, scene: recording.RecordedScene, before: RealSense | None = None) -> None:
-        """Open a recording, and say what it says; CameraError if another camera took it."""
-        played = RealSense(path=self._index.folder / scene.file)
-        if before is not None and played.serial != before.serial:
-            played.close()
-            raise CameraError(
-                f"{scene.file} was recorded by another camera ({played.serial}, not "
-                f"{before.serial}): record one set with one camera"
-            )
-        if before is not None:
-            before.close()
-        self._played, self._scene = played, scene
-        for name in set(Description.__annotations__) - {"can_place"}:
-            setattr(self, name, getattr(played, name))
-
-    def __repr__(self) -> str:
-        return (
-            f"{self.name} (recorded set {self._index.folder.name}, now {self._scene}), "
-            f"which holds {self._index}"
-        )
-
-    def place(self, name: str, distance_m: float) -> None:
-        recording.check_distance(distance_m)
-        scene = next((s for s in self._index.scenes if s.is_at(name, distance_m)), None)
-        if scene is None:
-            raise CameraError(
-                f"the set {self._index.folder.name} has no {name} at {distance_m:.3f} m: it holds "
-                f"{self._index}"
-            )
-        if scene != self._scene:
-            self._turn_to(scene, before=self._played)
-
-    def lock(self) -> str:
-        return self._played.lock()
-
-    def close(self) -> None:
-        self._played.close()
-
-    def stream(self) -> Generator[Frame, None, None]:
-        return self._played.stream()
-
-
-class ImageFolder(Camera):
-    """Depth images of any camera in a folder: 16-bit PNGs, in the order of the numbers in their
-    names, beside an intrinsics.json.
-
-    That file holds the fields of `Intrinsics` and depth_scale_m (metres a count), and may hold
-    baseline_m (of a stereo camera), name and frames_per_s. There is no colour. Raises CameraError
-    for a folder without both, or with a file that is damaged.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        path, self._what = folder / recording.INTRINSICS, f"the folder {folder.name}"
-        numbers = re.compile(r"(\d+)")  # a text's odd parts: img_2 comes before img_10
-        self._images = sorted(
-            folder.glob("*.png"),
-            key=lambda png: [int(t) if i % 2 else t for i, t in enumerate(numbers.split(png.stem))],
-        )
-        if not self._images or not path.exists():
-            missing = recording.INTRINSICS if self._images else "16-bit PNGs"
-            raise CameraError(
-                f"{self._what} lacks {missing}: to be a camera it holds 16-bit PNGs of depth and "
-                f"{recording.INTRINSICS} with width, height, fx, fy, cx, cy (px) and depth_scale_m"
-            )
-        try:
-            given = results.read_json(path)
-            self.depth_scale_m = recording.check_depth_scale(given.pop("depth_scale_m", None))
-            self.baseline_m = given.pop("baseline_m", None)
-            if self.baseline_m is not None:
-                self.baseline_m = checks.positive("baseline_m", self.baseline_m)
-            self.name = str(given.pop("name", "Depth camera"))
-            rate = given.pop("frames_per_s", FRAMES_PER_S)
-            self._frames_per_s = checks.positive("frames_per_s", rate)
-            self.depth = Intrinsics(**given)
-        except (TypeError, ValueError) as error:
-            raise CameraError(f"{path} cannot be used ({error}): correct it") from error
-        self.source, self.serial, self.color, self.T_color_depth = "recorded", "", None, None
-
-    def __repr__(self) -> str:
-        return _described(self, f"{self._what}, {counted(len(self._images), 'image')}", "none")
-
-    def stream(self) -> Generator[Frame, None, None]:
-        import cv2
-
-        size = (self.depth.height, self.depth.width)
-        for number, path in enumerate(self._images, start=1):
-            data = np.fromfile(path, np.uint8)  # imread takes no accents on Windows
-            image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
-            if image is None or image.dtype != np.uint16 or image.shape != size:
-                got = "no image" if image is None else f"{image.dtype} {image.shape}"
-                wanted = f"16-bit grey of {size}, as {recording.INTRINSICS} says"
-                raise CameraError(f"{path} is {got}: want {wanted}")
-            depth, time_s = image.astype(np.uint16), number / self._frames_per_s
-            yield Frame(depth, None, self.depth_scale_m, time_s, number, self.depth)
-
-    def lock(self) -> str:
-        return "Images in a folder cannot be changed: exposure and focus are as they were."
-
-    def close(self) -> None:
-        pass  # no file stays open

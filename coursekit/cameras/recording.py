@@ -21,7 +21,11 @@ from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Description, Fra
 from coursekit.cameras.librealsense import load_librealsense
 from coursekit.geometry import Intrinsics
 
-FILE_STARTS = {".db3": b"SQLite format 3\0", ".bag": b"#ROSBAG V2.0\n"}
+FILE_STARTS = {
+    ".db3": b"SQLite format 3\0",
+    ".bag": b"#ROSBAG V2.0\n",
+    ".mcap": b"\x89MCAP0\r\n",
+}
 EYES = ("left", "right")
 STREAMS = {  # by our name: librealsense's kind and format, bytes a pixel, index and id
     "depth": ("depth", "z16", 2, 0, 0),
@@ -42,7 +46,7 @@ def check_recording(path: Path) -> None:
     """CameraError with what to do when `path` is no recording, before librealsense opens it."""
     if path.suffix not in FILE_STARTS:
         raise CameraError(
-            f"{path} is no recording: its name must end in .db3 or .bag, in lower case"
+            f"{path} is no recording: its name must end in .db3, .bag or .mcap, in lower case"
         )
     if not path.exists():
         raise CameraError(f"there is no file {path}: check the name and the folder")
@@ -62,13 +66,33 @@ def check_recording(path: Path) -> None:
             f"{path} is not a {path.suffix} recording, though its name says so: "
             "open a file that a RealSense program or camera.record() wrote"
         )
-    topics = _topics_of_db3(path) if path.suffix == ".db3" else _topics_of_bag(path)
-    if topics and not any(topic.lower().startswith(OWN_TOPICS) for topic in topics):
-        shown = min(topics, key=lambda topic: ("depth" not in topic, "info" in topic, topic))
-        raise CameraError(
-            f"{path} is a recording of ROS topics ({shown} ...), which librealsense cannot play: "
-            "record with `coursekit record` or realsense-viewer"
-        )
+    _topics(path)  # which says when it is truncated
+
+
+def is_of_ros(path: Path) -> bool:
+    """Whether a recording is of ROS topics, none of them librealsense's own."""
+    topics = _topics(path)
+    return path.suffix == ".mcap" or (
+        bool(topics) and not any(topic.lower().startswith(OWN_TOPICS) for topic in topics)
+    )
+
+
+def without_depth(path: Path, topics: Sequence[str]) -> CameraError:
+    """What is wrong with a recording of ROS topics that hold no depth images."""
+    shown = min(
+        topics, key=lambda topic: ("depth" not in topic, "info" in topic, topic), default=""
+    )
+    return CameraError(
+        f"{path} is a recording of ROS topics ({shown} ...) without depth images (16UC1 or 32FC1) "
+        "and their camera_info, which is what the course plays: record those two topics, or "
+        "record with `coursekit record` or realsense-viewer"
+    )
+
+
+def _topics(path: Path) -> list[str]:
+    """The topics of a recording; CameraError when it is cut short."""
+    readers = {".db3": _topics_of_db3, ".bag": _topics_of_bag}
+    return readers[path.suffix](path) if path.suffix in readers else []
 
 
 def _truncated(path: Path, there: int, wanted: int) -> CameraError:

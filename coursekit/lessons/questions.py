@@ -11,6 +11,7 @@ import html
 import math
 import re
 import tomllib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -21,6 +22,7 @@ from coursekit import results
 EXAMPLES = "0.37 or 150"  # of numbers, and no checkpoint's answer
 LENGTHS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 LETTERS = "ABCDEFGH"
+OTHERWISE = "*If you answered otherwise*"
 
 
 @dataclass(frozen=True)
@@ -76,17 +78,43 @@ class Checkpoint:
 
     def explanation(self) -> Verdict:
         """The verdict on the right answer, which says why every other one is wrong."""
+        right = self.judge(self.solution())
+        why, *others = right.lines
+        return replace(right, lines=(why, OTHERWISE, *others))
+
+    def solution(self) -> Any:
+        """The right answer."""
         raise NotImplementedError
 
-    def _repr_mimebundle_(self, **kwargs: Any) -> dict[str, Any]:
-        widget: dict[str, Any] = panel(self)._repr_mimebundle_(**kwargs)
+    def without_kernel(self) -> str:
+        """What a page shows on which nothing runs, as HTML."""
         call = f'ck.checkpoint("{self.name}").answer({self.example})'
-        without_kernel = (
+        return (
             f"<em>Run this cell to answer here, or call <code>{call}</code>.</em>"
             "<details><summary>Reading without a kernel? Decide first, then open the answer."
             f"</summary>{self.explanation()._repr_html_()}</details>"
         )
-        return widget | {"text/plain": repr(self), "text/html": without_kernel}
+
+    def _ipython_display_(self) -> None:
+        """Two outputs: the widget, and what is said back, which is still there when that is not."""
+        from IPython.display import DisplayHandle, display
+
+        said = DisplayHandle()
+        shown = panel(self, lambda text: said.update({"text/html": text}, raw=True))
+        # ipywidgets 7 has no such method: then there is the text
+        widget: dict[str, Any] = getattr(shown, "_repr_mimebundle_", dict)()
+        without = {"text/plain": repr(self), "text/html": self.without_kernel()}
+        display(widget | without, raw=True)
+        said.display({"text/html": self._before()}, raw=True)
+
+    def _before(self) -> str:
+        """What was said when this was answered last, collapsed; empty if that has not been."""
+        given = [a["answer"] for a in read_attempts().get(self.name, [])]
+        if not given:
+            return ""
+        verdict = self.judge(given[-1])
+        answered = f"You have answered this one before ({html.escape(verdict.kind)})."
+        return f"<details><summary>{answered}</summary>{verdict._repr_html_()}</details>"
 
 
 @dataclass(frozen=True, repr=False)
@@ -124,15 +152,18 @@ class Choice(Checkpoint):
         headline = f"{letter}, {chosen.text}: right."
         return Verdict(self.name, "right", headline, (chosen.why, *others))
 
-    def explanation(self) -> Verdict:
-        return self.judge(next(k for k, o in self.lettered().items() if o.right))
+    def solution(self) -> str:
+        return next(k for k, o in self.lettered().items() if o.right)
 
     def input_widget(self) -> Any:
         import ipywidgets
 
-        labels = [(f"{k}. {o.text}", k) for k, o in self.lettered().items()]
         return ipywidgets.RadioButtons(
-            options=labels, value=None, layout=ipywidgets.Layout(width="max-content")
+            options=list(self.lettered()),  # their texts stand above
+            value=None,
+            description="Your answer",
+            orientation="horizontal",
+            layout=ipywidgets.Layout(width="max-content"),
         )
 
 
@@ -185,13 +216,15 @@ class Number(Checkpoint):
     def _close(self, number: float, value: float) -> bool:
         return math.isclose(number, value, rel_tol=self.tolerance, abs_tol=1e-12)
 
-    def explanation(self) -> Verdict:
-        return self.judge(self.value)
+    def solution(self) -> float:
+        return self.value
 
     def input_widget(self) -> Any:
         import ipywidgets
 
-        return ipywidgets.Text(placeholder=f"a number ({self.unit})")
+        says = f"Your answer ({self.unit})" if self.unit != "1" else "Your answer"
+        style = {"description_width": "initial"}
+        return ipywidgets.Text(placeholder="a number", description=says, style=style)
 
 
 def _readings(given: Any, unit: str) -> list[float]:
@@ -216,25 +249,22 @@ def _readings(given: Any, unit: str) -> list[float]:
     return [number for number in numbers if math.isfinite(number) and factor]
 
 
-def panel(checkpoint: Checkpoint) -> Any:
-    """The widget: input, a button that commits, and the verdict below."""
+def panel(checkpoint: Checkpoint, say: Callable[[str], None]) -> Any:
+    """The widget: input, and a button that commits; `say` shows what is said back, as HTML."""
     import ipywidgets
 
     field = checkpoint.input_widget()
     button = ipywidgets.Button(description="Commit", tooltip="Commit this answer")
-    # What the student did here before, in the widget only: stored outputs never show it.
-    before = "<em>You have answered this one before ({}).</em>"
-    kinds = [html.escape(a["kind"]) for a in read_attempts().get(checkpoint.name, [])]
-    said = ipywidgets.HTML(before.format(kinds[-1]) if kinds else "")
 
-    def commit(_: Any) -> None:
-        if field.value in (None, ""):
-            said.value = "<em>Choose or type an answer first.</em>"
-        else:
-            said.value = checkpoint.answer(field.value)._repr_html_()
+    def commit(*_: Any) -> None:
+        said = "<em>Choose or type an answer first.</em>"
+        if field.value not in (None, ""):
+            said = checkpoint.answer(field.value)._repr_html_()
+        say(f'<div role="alert">{said}</div>')  # which is read out
 
     button.on_click(commit)
-    return ipywidgets.VBox([field, button, said])
+    field.on_msg(lambda _, told, __: commit() if told.get("event") == "submit" else None)  # Enter
+    return ipywidgets.VBox([field, button])
 
 
 @cache

@@ -81,14 +81,17 @@ def pixel_grid(principal: tuple[float, float] = (3.3, 2.2)) -> LessonFigure:
     centres = geometry.pixel_grid(columns, rows).reshape(-1, 2)
     ax.plot(*centres.T, ".", color=COLORS["ink"], ms=4, label="pixel centres")
     ax.plot(0, 0, "s", color=COLORS["model"], ms=9, label="(0, 0)")
+    middle = (columns - 1) / 2, (rows - 1) / 2
+    ax.plot(*middle, "x", color=COLORS["truth"], ms=11, mew=3, label=f"middle {middle}")
     ax.plot(*principal, "+", color=COLORS["measured"], ms=16, mew=3,
             label=f"principal point {principal}")  # fmt: skip
     ax.set(xlim=(-0.8, columns - 0.2), ylim=(rows - 0.2, -0.8), aspect="equal")
     ax.set(xlabel="u (px), to the right", ylabel="v (px), down")
-    fig.legend(loc="outside lower center", ncols=3)
+    fig.legend(loc="outside lower center", ncols=2)
     return fig.saying(
         f"A grid of {columns} by {rows} pixels. The origin (0, 0) is the centre of the top-left "
-        f"pixel; the principal point, {principal}, falls between pixel centres."
+        f"pixel, the middle of the image is {middle}; the principal point, {principal}, is "
+        "elsewhere, between pixel centres."
     )
 
 
@@ -140,11 +143,12 @@ def field_of_view(depth: Intrinsics, color: Intrinsics | None, distance_m: float
         width = 1000 * (right - left)
         text = f"{label}: {camera.hfov_deg:.1f}°, {width:.0f} mm wide at {distance_m:.2f} m"
         far = 1.25
-        ax.fill([0, left * far, right * far], [0, distance_m * far, distance_m * far],
-                color=COLORS[name], alpha=0.35, label=text)  # fmt: skip
+        wedge = [0, left * far, right * far], [0, distance_m * far, distance_m * far]
+        ax.fill(*wedge, color="white")  # or the inner wedge would have the colours of both
+        ax.fill(*wedge, color=COLORS[name], alpha=0.35, label=text)
         texts.append(text)
-    ax.axhline(distance_m, color=COLORS["ink"], lw=1, ls="--")
-    ax.plot([0, 0], [0, 1.25 * distance_m], color=COLORS["ink"], lw=1)
+    ax.axhline(distance_m, color=COLORS["ink"], lw=1, ls="--", label=f"Z = {distance_m:.2f} m")
+    ax.plot([0, 0], [0, 1.25 * distance_m], color=COLORS["ink"], lw=1, label="optical axis")
     ax.set(xlabel="X (m)", ylabel="Z (m)", aspect="equal", ylim=(0, 1.25 * distance_m))
     fig.legend(loc="outside lower center", ncols=2)
     return fig.saying("Fields of view from above. " + "; ".join(texts) + ".")
@@ -181,6 +185,8 @@ def displacement(lenses: Mapping[str, Intrinsics]) -> LessonFigure:
     texts = []
     for ax, (name, lens) in zip(axes, lenses.items(), strict=True):
         shift, size = displacement_px(lens)
+        edge, corner = edge_and_corner(size)
+        longer = 10 if corner < 20 else 1
         shown = ax.imshow(
             np.maximum(size, DISPLACEMENT_PX[0]),
             extent=(-0.5, lens.width - 0.5, lens.height - 0.5, -0.5),
@@ -190,9 +196,10 @@ def displacement(lenses: Mapping[str, Intrinsics]) -> LessonFigure:
         some = slice(step // 2, None, step)
         grid, arrows = geometry.pixel_grid(*lens.size)[some, some], shift[some, some]
         ax.quiver(*np.moveaxis(grid, -1, 0), *np.moveaxis(arrows, -1, 0), angles="xy",
-                  scale_units="xy", scale=1, color="white", width=0.005)  # fmt: skip
-        edge, corner = edge_and_corner(size)
-        ax.set_title(f"{name}\nedge {edge:.1f} px, corner {corner:.1f} px", fontsize=10)
+                  scale_units="xy", scale=1 / longer, color="white", width=0.005)  # fmt: skip
+        arrows_are = "true to scale" if longer == 1 else f"{longer} times too long"
+        title = f"{name}: edge {edge:.1f} px, corner {corner:.1f} px\narrows {arrows_are}"
+        ax.set_title(title, fontsize=10)
         image_axes(ax, *lens.size)
         texts.append(f"{name}, {edge:.1f} px at an edge, {corner:.1f} px in a corner")
     bar = fig.colorbar(shown, ax=axes, label="displacement (px)", shrink=0.6)
@@ -220,16 +227,18 @@ def edge_and_corner(size: Floats) -> tuple[float, float]:
 
 def frame(shot: Frame) -> LessonFigure:
     """The depth image, and the colour image where there is one, as the camera delivers them."""
-    images = 1 if shot.color is None else 2
-    fig, axes = panels(images, images, 4.6 * images, 3.3)
     depth = np.where(shot.depth_m > 0, shot.depth_m, np.nan)
+    height, width = depth.shape
+    wide = [1.2 * width / height]  # with room for the colour bar
+    if shot.color is not None:
+        wide.append(shot.color.shape[1] / shot.color.shape[0])
+    fig, axes = panels(len(wide), len(wide), 2.5 * sum(wide) + 0.9, 3.0, width_ratios=wide)
     shown = axes[0].imshow(depth, vmin=np.nanquantile(depth, 0.01), vmax=_far(depth))
     fig.colorbar(shown, ax=axes[0], label="depth Z (m)", shrink=0.8)
     axes[0].set(title="depth (white: no depth)", xlabel="u (px)", ylabel="v (px)")
     if shot.color is not None:
         axes[1].imshow(shot.color)
         axes[1].set(title="colour", xlabel="u (px)", ylabel="v (px)")
-    height, width = depth.shape
     return fig.saying(
         f"Depth image of {width} by {height} pixels, half of them nearer than "
         f"{np.nanmedian(depth):.2f} m, {np.isnan(depth).mean():.0%} of it without depth"
@@ -258,10 +267,13 @@ def point_cloud(points: NDArray[np.float32]) -> LessonFigure:
     some = np.random.default_rng(0).permutation(len(near))[:30_000]  # a stride makes moiré
     fig = figure(9.0, 4.2)
     fig.set_layout_engine("none")  # the 3-D axes reserve far more room than they use
-    _solid(fig.add_axes((0.0, 0.0, 0.48, 0.94), projection="3d"), near[some])
-    above = fig.add_axes((0.57, 0.14, 0.41, 0.74))
+    colors = {"vmin": cloud[:, 2].min(), "vmax": cloud[:, 2].max()}
+    _solid(fig.add_axes((0.05, 0.0, 0.45, 0.94), projection="3d"), near[some], colors)
+    above = fig.add_axes((0.55, 0.14, 0.34, 0.74))
     flat = cloud[np.abs(cloud[:, 1]) < SLICE_M]
-    above.scatter(flat[:, 0], flat[:, 2], s=1.5, c=flat[:, 2], linewidths=0)
+    dots = above.scatter(flat[:, 0], flat[:, 2], s=1.5, c=flat[:, 2], linewidths=0, **colors)
+    bar = fig.add_axes((0.91, 0.2, 0.015, 0.6), label="<colorbar>")
+    fig.colorbar(dots, cax=bar, label="depth Z (m)")
     above.plot(0, 0, "v", color=COLORS["ink"], ms=9)
     above.annotate("camera", (0, 0), (8, 4), textcoords="offset points")
     side = 0.6 * float(cloud[:, 2].max())
@@ -270,20 +282,20 @@ def point_cloud(points: NDArray[np.float32]) -> LessonFigure:
     above.set_title(f"from above, |Y| < {1000 * SLICE_M:.0f} mm")
     low, high = cloud.min(axis=0), cloud.max(axis=0)
     return fig.saying(
-        f"Point cloud of {len(cloud)} points, X from {low[0]:.2f} to {high[0]:.2f} m, Z from "
-        f"{low[2]:.2f} to {high[2]:.2f} m, and a slice of {len(flat)} points from above."
+        f"Point cloud of {len(cloud)} points (false matches left out), X from {low[0]:.2f} to "
+        f"{high[0]:.2f} m, Z from {low[2]:.2f} to {high[2]:.2f} m, and a slice of {len(flat)} "
+        "points from above."
     )
 
 
-def _solid(ax: Any, cloud: NDArray[np.float32]) -> None:
+def _solid(ax: Any, cloud: NDArray[np.float32], colors: Mapping[str, float]) -> None:
     ax.scatter(cloud[:, 0], cloud[:, 2], -cloud[:, 1], s=2, c=cloud[:, 2], linewidths=0,
-               depthshade=False)  # fmt: skip
+               depthshade=False, **colors)  # fmt: skip
     end = f", Z < {NEAR_M:.1f} m" if cloud[:, 2].max() < NEAR_M else ""
-    ax.set(xlabel="X (m)", zlabel="-Y (m)")
+    ax.set(xlabel="X (m)", ylabel="Z (m)", zlabel="-Y (m)")
     ax.set_title(f"from beside the camera{end}", y=0.9)
     ax.xaxis.labelpad = ax.yaxis.labelpad = ax.zaxis.labelpad = 12
-    ax.set_ylabel("Z (m)")
     ax.locator_params(nbins=4)
     ax.locator_params(axis="y", nbins=2)
-    ax.view_init(elev=18, azim=-70)
+    ax.view_init(elev=18, azim=-110)
     ax.set_box_aspect(np.maximum(np.ptp(cloud[:, [0, 2, 1]], axis=0), 0.05), zoom=0.85)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import base64
+import html
 import io
 import math
+import struct
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -67,6 +69,18 @@ class LessonFigure(Figure):
     def _repr_mimebundle_(self, **_: Any) -> tuple[dict[str, str], dict[str, Any]]:
         image = base64.b64encode(self.png()).decode("ascii")
         return {"image/png": image, "text/plain": self.alt}, {"image/png": {"alt": self.alt}}
+
+    def _ipython_display_(self) -> None:
+        show(self._repr_mimebundle_(), "The figure in words", self.alt)
+
+
+def show(bundle: tuple[dict[str, Any], dict[str, Any]], says: str, alt: str) -> None:
+    """A figure in a notebook and, as JupyterLab gives it no text alternative, its words below."""
+    from IPython.display import display
+
+    display(bundle[0], metadata=bundle[1], raw=True)
+    words = f"<summary>{says}</summary>{html.escape(alt)}"
+    display({"text/html": f'<details class="alt">{words}</details>'}, raw=True)
 
 
 Draw = Callable[..., LessonFigure]
@@ -164,13 +178,11 @@ class Draggable:
                 style={"description_width": "11em"},
                 layout=ipywidgets.Layout(width="32em"),
             )
-        first = self.start()
-        image = ipywidgets.Image(value=first.png(), format="png")
-        image.layout.max_width = "100%"
+        image = ipywidgets.HTML(_picture(self.start()))  # ipywidgets.Image has no alternative text
 
         def redraw(_: Any) -> None:
             drawn = self.draw(**{name: field.value for name, field in fields.items()})
-            image.value = drawn.png()
+            image.value = _picture(drawn)
 
         for field in fields.values():
             field.observe(redraw, names="value")
@@ -179,9 +191,22 @@ class Draggable:
     def __repr__(self) -> str:
         return self.start().alt
 
-    def _repr_mimebundle_(self, **kwargs: Any) -> tuple[dict[str, Any], dict[str, Any]]:
-        data, metadata = self.start()._repr_mimebundle_()
-        return self.widget()._repr_mimebundle_(**kwargs) | data, metadata
+    def _ipython_display_(self) -> None:
+        first = self.start()
+        data, metadata = first._repr_mimebundle_()
+        # ipywidgets 7 has no such method: then there is the picture
+        widget: dict[str, Any] = getattr(self.widget(), "_repr_mimebundle_", dict)()
+        show((widget | data, metadata), "The figure in words, as it is drawn first", first.alt)
+
+
+def _picture(drawn: LessonFigure) -> str:
+    """A figure as HTML, with its text alternative; it keeps its place while it is drawn again."""
+    png = drawn.png()
+    width, height = struct.unpack(">II", png[16:24])
+    source = base64.b64encode(png).decode("ascii")
+    size = f"width: {width}px; max-width: 100%; aspect-ratio: {width}/{height}"
+    address, words = f"data:image/png;base64,{source}", html.escape(drawn.alt)
+    return f'<img src="{address}" alt="{words}" decoding="sync" style="{size}">'
 
 
 def label(name: str) -> str:

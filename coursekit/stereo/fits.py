@@ -374,6 +374,18 @@ class BiasFit(LawFit):
         half = self._half_band([z, z**2 / product] if free else [z])
         return bias, bias - half, bias + half
 
+    @property
+    def law(self) -> tuple[Floats, Floats]:
+        """(s, o) of the bias s Z - o Z^2 / (fx B), to first order, and their covariance (2, 2).
+
+        s: `scale_error`; o in px, 0 where one distance could not tell. The covariance is wide
+        enough that 1.96 standard deviations are the 95 % of `interval`.
+        """
+        n = min(len(self.theta), 1 + ("disparity_offset_px" in self.names))
+        known, theta = np.zeros((2, 2)), np.array([self.scale_error, *self.theta[1:n], 0.0])[:2]
+        known[:n, :n] = self.covariance[:n, :n] * (self.quantile() / 1.96) ** 2
+        return theta, known * [[1, -1], [-1, 1]]
+
     def __repr__(self) -> str:
         low, high = (100 * v for v in self.scale_error_interval)
         text = f"scale error {100 * self.scale_error:+.2f} % (95 %: {low:+.2f} to {high:+.2f})"
