@@ -69,6 +69,8 @@ def _parser() -> argparse.ArgumentParser:
     the.add_argument("--frames", type=int, default=1, metavar="N", help="averaged there")
     choices = ("bias", "noise")
     the.add_argument("--dominates", type=str.lower, choices=choices, help="which error, there")
+    says = "what your own table does with samples far from all others of their pixel"
+    the.add_argument("--mismatches", choices=("kept", "left out"), help=says)
     words = the.add_mutually_exclusive_group()
     words.add_argument("--paragraph", default="", metavar="TEXT", help="three sentences: why")
     words.add_argument("--paragraph-file", metavar="FILE", help="a text file that holds them")
@@ -154,7 +156,8 @@ def _submit(options: argparse.Namespace) -> None:
                 "Notepad: plain text, encoding UTF-8) and try again"
             ) from None
     claims = options.distance, options.dominates, paragraph, options.frames
-    handed = ck.submit(options.student, *claims, options.folder, options.overwrite)
+    where = options.folder, options.overwrite, options.mismatches
+    handed = ck.submit(options.student, *claims, *where)
     if handed.path is None:
         raise ValueError(str(handed))
     print(handed)

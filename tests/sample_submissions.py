@@ -246,6 +246,8 @@ def mistaken(seed: int = 0) -> dict[str, tuple[str, Submission]]:
         "variance": ("std", std**2),
         "spatial": ("std", 1e3 * m.stats.spatial_std_m),
         "mixed": ("std", float(np.nanstd(z))),
+        "middle_pixel": ("std", float(z[:, 20, 20].std(ddof=1))),
+        "rounded": ("std", float(f"{std:.0e}")),
         "one_pixel": ("std_se", std / 198**0.5),
         "close": ("std_se", 1.7 * row.depth_std_se_mm),
         "percent": ("invalid", 100 * invalid),

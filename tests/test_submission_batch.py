@@ -154,7 +154,7 @@ def test_every_hostile_bundle_is_a_row_with_its_reason(tmp_path):
         (folder / f"{i:03d}.zip").write_bytes(data)
     summary = graded(folder, out, workers=2)
     assert (summary.graded, summary.refused, summary.failed) == (0, len(cases), 0)
-    assert len(cases) == 194
+    assert len(cases) == 195
     assert [row["status"] for row in table(out)] == [f"not graded: {reason}" for reason, _ in cases]
 
 

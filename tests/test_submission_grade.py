@@ -45,7 +45,7 @@ def not_right(items) -> list[str]:
 # --- honest work ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(200 if MANY > 1 else 20))
 def test_honest_work_gets_full_points_and_no_flag(seed):
     result = grade(honest(seed, of_camera={"depth_scale_m": (1e-3, 1e-4)[seed % 2]}))
     assert not_right(result.items) == []
@@ -107,9 +107,10 @@ def test_a_number_is_right_exactly_within_its_tolerance(topic, i):
     assert item(EXACT, topic, at).verdict == "right"
     ends_meet = topic == "sigma_d_interval" and (1 if i == 0 else -1)
     for by in (-0.999, -0.5, 0.1, 0.999):
-        off = by / 10 if by * ends_meet > 0 else by
+        off = by / 10 if by * ends_meet > 0 else by / 1.42 if topic.endswith("_se") else by
         assert item(moved(topic, i, off), topic, at).verdict == "right", by
-    for by in (-1.001, 1.001, -1.5, 1.5, 3, -6, -10, 10, 1e4):
+    below = (-6,) if topic == "bias_se" else (-1.001, -1.5)  # apart from the tape's is right, too
+    for by in (*below, 1.001, 1.5, 3, -10, 10, 1e4):
         one = item(moved(topic, i, by), topic, at)
         assert one.verdict != "right", by
         assert one.points < one.of
@@ -118,7 +119,7 @@ def test_a_number_is_right_exactly_within_its_tolerance(topic, i):
 def test_the_tolerance_is_stated():
     for one in samples.items(EXACT):
         if one.tolerance is not None and one.topic != "exponent":
-            assert re.search(r"\(± \S+ is accepted", one.says), one.says
+            assert re.search(r"\((± \S+|up to 1.4 times as .*) is accepted", one.says), one.says
 
 
 def test_the_exponents_interval_is_compared_too():
@@ -134,15 +135,14 @@ def test_the_exponents_interval_is_compared_too():
 def test_every_number_of_the_plot_counts(field, i):
     values = list(getattr(EXACT.plot, field))
     values[i] *= 1.3
-    assert item(with_part(EXACT, "plot", **{field: tuple(values)}), "plot").points < 6
+    assert item(with_part(EXACT, "plot", **{field: tuple(values)}), "plot").points < 11
 
 
 def test_a_standard_error_counts_with_the_tapes_or_apart_from_it():
     measured = recompute(GOOD).at[1]
     both, apart = measured.bias_se_mm, measured.bias.se
     assert item(with_row(GOOD, 1, depth_bias_se_mm=apart), "bias_se", 1).verdict == "right"
-    between = with_row(GOOD, 1, depth_bias_se_mm=(both + apart) / 2)
-    assert item(between, "bias_se", 1).points < 2
+    assert item(with_row(GOOD, 1, depth_bias_se_mm=2 * both), "bias_se", 1).points < 1
 
 
 # --- mistakes with a name -------------------------------------------------------------------------
@@ -230,15 +230,15 @@ def test_a_prediction_is_right_within_a_factor(factor, mistake):
         assert found.says.endswith("but the prediction is in metres: 1 m is 1000 mm.")
 
 
-def test_no_prediction_is_none_and_keeps_half():
+def test_no_prediction_is_none_and_keeps_little():
     silent = with_part(EXACT, "plot", predicted_mm=None)
     found = item(silent, "plot")
-    assert (found.points, found.verdict, found.mistake) == (3, "partial", "no_prediction")
+    assert (found.points, found.verdict, found.mistake) == (2.2, "partial", "no_prediction")
     assert "without your prediction" in found.says
     assert shortcomings(silent) == (found.says,)
     two = Plot(EXACT.plot.distances_m[:2], EXACT.plot.measured_mm[:2], None)
     found = item(replace(EXACT, plot=two), "plot")
-    assert (found.points, found.mistake) == (2, "no_prediction")
+    assert (found.points, found.mistake) == (1.47, "no_prediction")
     assert found.says.endswith("0.60 m missing and without your prediction.")
     assert student_page(samples.graded(silent), silent)
     assert item(replace(EXACT, plot=Plot((), (), ())), "plot").verdict == "missing"
@@ -257,14 +257,14 @@ def test_a_wrong_std_is_named_once():
 
 THREE = "[0.30, 0.45, 0.60]"
 TYPING_ERRORS = [
-    ("plot = 6 ", "plot = six ", r"rubric.toml: cannot be read: .*line 1\d"),
-    ("plot = 6 ", "plto = 6 ", "rubric.toml: points.plto: is no key .*points.plot is missing"),
-    ("plot = 6 ", "", "rubric.toml: points.plot: is missing|cannot be read"),
-    ("plot = 6 ", "plot = 6\nmore = 1 ", "rubric.toml: points.more: is no key of this file$"),
-    ("plot = 6 ", "plot = '6' ", "rubric.toml: points.plot: got '6', want a number from 0"),
-    ("plot = 6 ", "plot = -6 ", "rubric.toml: points.plot: got -6, want a number from 0"),
-    ("plot = 6 ", "plot = nan ", "rubric.toml: points.plot: got nan, want a number"),
-    ("plot = 6 ", "plot = true ", "rubric.toml: points.plot: got True, want a number"),
+    ("plot = 11", "plot = six ", r"rubric.toml: cannot be read: .*line 2\d"),
+    ("plot = 11", "plto = 6 ", "rubric.toml: points.plto: is no key .*points.plot is missing"),
+    ("plot = 11", "", "rubric.toml: points.plot: is missing|cannot be read"),
+    ("plot = 11", "plot = 11\nmore = 1 ", "rubric.toml: points.more: is no key of this file$"),
+    ("plot = 11", "plot = '6' ", "rubric.toml: points.plot: got '6', want a number from 0"),
+    ("plot = 11", "plot = -6 ", "rubric.toml: points.plot: got -6, want a number from 0"),
+    ("plot = 11", "plot = nan ", "rubric.toml: points.plot: got nan, want a number"),
+    ("plot = 11", "plot = true ", "rubric.toml: points.plot: got True, want a number"),
     ("frames = 100 ", "frames = 99.5 ", "exercise.frames: got 99.5, want a whole number"),
     ("close = 0.5", "close = 1.5", "credit.close: got 1.5, want a number from 0 to 1"),
     ("close = 0.5", "", "rubric.toml: credit.close: is missing"),
@@ -307,13 +307,14 @@ def test_an_empty_bundle_gets_nothing_and_claims_without_raw_depths_are_not_beli
     assert {one.verdict for one in empty.items} == {"missing"}
     assert copies({"one": empty.fingerprint, "two": empty.fingerprint}) == []
     assert grade(replace(GOOD, stacks=())).points <= 3  # the paragraph
-    assert grade(silent).points == 19  # data, and no exponent
+    assert grade(silent).points == 11  # data, and no exponent
 
 
-def test_a_camera_without_a_baseline_is_not_asked_for_sigma_d():
+def test_a_camera_without_a_baseline_loses_what_needs_one():
     blind = with_part(GOOD, "claims", sigma_d_px=None, sigma_d_interval_px=None)
     result = grade(with_part(blind, "camera", baseline_m=None))
-    assert result.points == result.of < 100
+    assert (result.points, result.of) == (93, 100)
+    assert "without the camera's baseline" in not_right(result.items)[0]
 
 
 def test_other_distances_nearby_count_and_further_ones_are_compared_only():

@@ -11,6 +11,7 @@ import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import nbformat
@@ -218,10 +219,12 @@ def _finished(student: str, seed: int) -> Submission:
         left, top = left + (width - SAMPLE_PX) // 2, top + (height - SAMPLE_PX) // 2
         window = (left, top, SAMPLE_PX, SAMPLE_PX)
         stacks.append(ck.submission.stack(frames, window, distance_m))
-    table, law = _table(camera, stacks)
+    found, law, own = _table(camera, stacks)
     predicted_mm = 1000 * law.std_m([stack.distance_m for stack in stacks])[0]
+    whole = measured(camera, stacks, found, law, predicted_mm.tolist(), 0.0, 0.060, own)
     return replace(
-        measured(camera, stacks, table, law, predicted_mm.tolist(), 0.0, 0.060),
+        whole,
+        claims=replace(whole.claims, mismatches="left out"),
         student=student,
         made=SAMPLE_MADE,
         versions={"coursekit": "0.1.0"},
@@ -231,9 +234,9 @@ def _finished(student: str, seed: int) -> Submission:
 
 def _table(
     camera: ck.cameras.Camera, stacks: Sequence[Stack]
-) -> tuple[dict[str, Quantity], ck.stereo.NoiseFit]:
-    """The table and the fit of notebook 02."""
-    table, seen = {}, []
+) -> tuple[dict[str, Quantity], ck.stereo.NoiseFit, dict[float, Any]]:
+    """What notebook 02 measures, its fit, and a student's own table of the same."""
+    found, own, seen = {}, {}, []
     for stack in stacks:
         window = (0, 0, SAMPLE_PX, SAMPLE_PX)
         stats = ck.stereo.window_stats(stack.counts, window, camera.depth_scale_m)
@@ -241,9 +244,9 @@ def _table(
         at = f"at_{1000 * stack.distance_m:.0f}_mm"
         bias_mm = 1000 * (stats.depth_m - stack.distance_m)
         std_mm, std_se_mm = 1000 * stats.pixel_std_m, 1000 * stats.pixel_std_error_m
-        table[f"depth_bias_{at}"] = Quantity(bias_mm, "mm", 1000 * stats.depth_error_m, "bias")
-        table[f"depth_std_{at}"] = Quantity(std_mm, "mm", std_se_mm, "noise")
-        table[f"invalid_{at}"] = Quantity(stats.invalid_fraction, "1")
+        found[f"depth_std_{at}"] = Quantity(std_mm, "mm", std_se_mm, "noise")
+        errors = 1000 * stats.depth_error_m, std_se_mm
+        own[stack.distance_m] = (bias_mm, errors[0], std_mm, errors[1], stats.invalid_fraction)
     law = ck.stereo.fit_noise(
         [stack.distance_m for stack in stacks],
         [stats.pixel_std_m for stats in seen],
@@ -253,7 +256,7 @@ def _table(
         camera.depth_scale_m,
         exponent=2,
     )
-    return table, law
+    return found, law, own
 
 
 def _weak(whole: Submission) -> Submission:

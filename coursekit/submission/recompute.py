@@ -128,6 +128,22 @@ class AtDistance:
         """The same with NaN for mismatches, which `window_stats` leaves out of what it says."""
         return 1e3 * without_mismatches(1e-3 * self.z_mm, self.scale_m)[0]
 
+    @cached_property
+    def kept(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Bias and std, mm, with mismatches kept, each as textbooks pool it: all samples alike, all
+        pixels alike, or only pixels that are always valid. Empty where there is no mismatch."""
+        z = self.z_mm.reshape(len(self.z_mm), -1)
+        z = z[:, np.isfinite(z).sum(axis=0) > 1]
+        if not (self.stats.n_mismatches and z.size):
+            return (), ()
+        level, square = np.nanmean(z, axis=0), np.nanvar(z, axis=0, ddof=1)
+        seen, always = np.isfinite(z).sum(axis=0), np.isfinite(z).all(axis=0)
+        ways = [(seen, seen - 1), (seen > 0, seen > 0), (always, always)]
+        ways = [way for way in ways if way[0].any()]
+        bias = (float(np.average(level, weights=w)) - 1e3 * self.distance_m for w, _ in ways)
+        stds = (math.sqrt(float(np.average(square, weights=w))) for _, w in ways)
+        return tuple(bias), tuple(stds)
+
     def noise_of_mean_mm(self, frames: int) -> float | None:
         """Std of one pixel's mean over `frames` frames, as they correlate in this stack.
 

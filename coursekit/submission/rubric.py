@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from decimal import Decimal
 from functools import partial
 from typing import Literal, NamedTuple
 
@@ -25,6 +26,7 @@ from coursekit.submission.recompute import (
     WHY,
     AtDistance,
     Recomputed,
+    WithError,
     grading_rules,
     recompute,
 )
@@ -33,7 +35,10 @@ from coursekit.words import counted
 Judgement = Literal["right", "partial", "wrong", "missing"]
 
 SAME_DISTANCE_M = 0.005  # a row or a point of the plot belongs to the stack this near
-EXPLAINED_WITHIN = 0.03  # a wrong number is explained by a mistake that gives it to this part
+EXPLAINED_WITHIN = 0.03  # a wrong number is explained by a mistake that gives it to this part,
+EXACTLY = 0.002  # and to this one where the mistake's number is near the right one
+NEAR_RIGHT = 0.15  # of the right number
+ONE_DIGIT = ("bias_se", "std_se", "invalid")  # is enough of these
 
 UNIT_OF = {"sigma_d": " px", "sigma_d_interval": " px", "exponent": "", "invalid": " %"}  # else mm
 
@@ -237,14 +242,18 @@ def _data(asked: _Question, z: float, m: AtDistance | None) -> Item:
     return asked.item("partial", says, "incomplete", min(n / needed, 1.0) * (0.5 if small else 1.0))
 
 
-def _bias(asked: _Question, _: Submission, m: AtDistance, claim: float) -> Item:
+def _bias(asked: _Question, submission: Submission, m: AtDistance, claim: float) -> Item:
     """Mean depth minus the distance by tape, mm; the sign is the commonest mistake."""
     if m.bias is None:
         return _unknown(asked, claim)
-    found, step, z = m.bias.value, 1e3 * m.scale_m, 1e3 * m.distance_m
+    step, z, (kept, _), said = 1e3 * m.scale_m, 1e3 * m.distance_m, m.kept, _said_kept(submission)
     tolerance = _tolerance("bias", m.bias.se)
+    found = _nearest_of(claim, (m.bias.value, *kept) if said else (m.bias.value,))
 
     def mistakes() -> Iterator[_Mistake]:
+        for value in () if said else kept:
+            yield _Mistake("mismatches", value, EXACTLY * abs(value), _mismatches(m))
+        yield _Mistake("middle_pixel", float(m.z_mm[:, *_middle(m)].mean()) - z)
         yield _Mistake("sign", -found, tolerance)
         yield from _other_units(found, tolerance, step)
         yield _Mistake("percent", 100 * found / z, 100 * tolerance / z)
@@ -264,49 +273,53 @@ def _bias_se(asked: _Question, submission: Submission, m: AtDistance, claim: flo
         return _unknown(asked, claim)
     both, apart, tape = m.bias_se_mm, m.bias.se, 1e3 * submission.tape_sigma_m
     n, pixels = m.stats.n_frames, m.stats.n_pixels
-    std = m.std.value if m.std else math.nan
+    stds = (m.std.value if m.std else math.nan, *m.kept[1])
 
     def mistakes() -> Iterator[_Mistake]:
         if tape:
             yield _Mistake("tape_only", tape)
-        yield _Mistake("not_divided", std)
-        for samples in (n, n * pixels):
-            yield _Mistake("independent", std / math.sqrt(samples))
+        for std in stds:
+            yield _Mistake("not_divided", std)
+            for samples in (n, n * pixels):
+                yield _Mistake("independent", std / math.sqrt(samples))
         yield _Mistake("not_divided.window", 1e3 * m.stats.mean_std_m)
+        for std in (1e3 * m.stats.mean_std_m, _std_of_means(m)):
+            yield _Mistake("independent", std / math.sqrt(n))
+        yield _Mistake("independent", float(np.nanstd(m.z_mm)) / math.sqrt(n * pixels))
         for se in (both, apart):
             yield from _other_units(se, 0.1 * se, 1e3 * m.scale_m)
 
-    near = min((both, apart), key=lambda se: abs(claim - se))  # with the tape's, or apart from it
-    tolerance = _error_tolerance("bias_se", apart * apart / near if near else 0.0)
-    item = _judge(asked, claim, near, tolerance, mistakes)
+    near = _nearest_of(claim, (both, apart))  # with the tape's, or apart from it
+    item = _judge_error(asked, claim, near, mistakes)
     if item.verdict == "right" and submission.camera.source == "live" and tape == 0:
         says = SAYS["no_tape"].format(asked.name, _shown("bias_se", claim))
-        return asked.item("partial", says, "no_tape", tolerance=tolerance)
+        return asked.item("partial", says, "no_tape", tolerance=item.tolerance)
     return item
 
 
-def _std(asked: _Question, _: Submission, m: AtDistance, claim: float) -> Item:
-    """The std of one pixel over time, mm, the pixels' variances averaged."""
+def _std(asked: _Question, submission: Submission, m: AtDistance, claim: float) -> Item:
+    """The std of one pixel over time, mm, the pixels' variances averaged.
+
+    With mismatches or without them is right, if it is said which.
+    """
     if m.std is None:
         return _unknown(asked, claim)
-    found, n, stats = m.std.value, m.stats.n_frames, m.stats
-    tolerance = _tolerance("std", m.std.se)
-
-    left_out = counted(stats.n_mismatches, "mismatch", "mismatches")
+    n, stats, (_, kept), out = m.stats.n_frames, m.stats, m.kept, m.std.value
+    said, treatment = _said_kept(submission) and bool(kept), submission.claims.mismatches
+    found = _nearest_of(claim, kept if said else (out,))
+    tolerance = _tolerance("std", m.std.se * (found / out if out else 1.0))
 
     def mistakes() -> Iterator[_Mistake]:
         yield from _other_units(found, tolerance, 1e3 * m.scale_m)
-        known = np.isfinite(m.z_mm)
-        often = known.sum(axis=0) > 1
-        if stats.n_mismatches and often.any():
-            variances = np.nanvar(m.z_mm[:, often], axis=0, ddof=1)
-            value = math.sqrt(float(np.average(variances, weights=known.sum(axis=0)[often] - 1)))
-            yield _Mistake("mismatches", value, 0.02 * value, left_out)
+        way = "mismatches.kept" if said else "mismatches.out" if treatment else "mismatches"
+        for value in (out,) if said else kept:
+            yield _Mistake(way, value, 0.02 * value, _mismatches(m))
+        yield _Mistake("middle_pixel", float(m.z_mm[:, *_middle(m)].std(ddof=min(n - 1, 1))))
         yield _Mistake("unrounded", 1e3 * stats.pixel_std_unrounded_m)
         steady = m.z_mm[:, np.isfinite(m.z_mm).all(axis=0)]
         each = steady.std(axis=0, ddof=1) if n > 1 and steady.size else np.array([math.nan])
         for kind, value in (("mean", each.mean()), ("median", np.median(each))):
-            yield _Mistake("unpooled", float(value), 0.005 * found, kind)
+            yield _Mistake("unpooled", float(value), fact=kind)
         yield _Mistake("of_the_mean", 1e3 * stats.mean_std_m)
         yield _Mistake("standard_error", found / math.sqrt(n))
         yield _Mistake("variance", found**2)
@@ -319,26 +332,54 @@ def _std(asked: _Question, _: Submission, m: AtDistance, claim: float) -> Item:
 
     item = _judge(asked, claim, found, tolerance, mistakes)
     if stats.n_mismatches and item.mistake != "mismatches":
-        item = replace(item, says=f"{item.says[:-1]} ({left_out} left out).")
+        became = "kept, as you say" if said else "left out"
+        item = replace(item, says=f"{item.says[:-1]} ({_mismatches(m)} {became}).")
     return item
+
+
+def _said_kept(submission: Submission) -> bool:
+    return submission.claims.mismatches == "kept"
+
+
+def _mismatches(m: AtDistance) -> str:
+    """ "3 of its samples are mismatches", in short."""
+    return counted(m.stats.n_mismatches, "mismatch", "mismatches")
+
+
+def _std_of_means(m: AtDistance) -> float:
+    """Std of the frames' means with all that is in them, mm."""
+    means = [float(frame[ok].mean()) for frame in m.z_mm if (ok := np.isfinite(frame)).any()]
+    return float(np.std(means, ddof=1)) if len(means) > 1 else math.nan
+
+
+def _middle(m: AtDistance) -> tuple[int, int]:
+    """Row and column of the window's middle pixel."""
+    return m.z_mm.shape[1] // 2, m.z_mm.shape[2] // 2
+
+
+def _nearest_of(claim: float, values: Iterable[float]) -> float:
+    return min(values, key=lambda value: abs(claim - value))
 
 
 def _std_se(asked: _Question, _: Submission, m: AtDistance, claim: float) -> Item:
     """The standard error of that std, mm: std / sqrt(2 dof), dof the effective ones."""
     if m.std is None:
         return _unknown(asked, claim)
-    found, std = m.std.se, m.std.value
-    n, pixels = m.stats.n_frames, m.stats.n_pixels
+    stds = (m.std.value, *m.kept[1])
+    n, pixels, part = m.stats.n_frames, m.stats.n_pixels, m.std.se / (m.std.value or 1.0)
+    found = _nearest_of(claim, (m.std.se, *(std * part for std in m.kept[1])))
 
     def mistakes() -> Iterator[_Mistake]:
-        yield _Mistake("not_divided", std)
-        yield _Mistake("one_pixel", std / math.sqrt(2 * max(n - 1, 1)))
-        yield _Mistake("one_pixel.mean", std / math.sqrt(n))
-        yield _Mistake("independent", std / math.sqrt(2 * n * pixels))
-        yield _Mistake("independent", std / math.sqrt(n * pixels))
+        for std in stds:
+            yield _Mistake("not_divided", std)
+            for dof in (n, max(n - 1, 1)):
+                yield _Mistake("one_pixel", std / math.sqrt(2 * dof))
+            yield _Mistake("one_pixel.mean", std / math.sqrt(n))
+            yield _Mistake("independent", std / math.sqrt(2 * n * pixels))
+            yield _Mistake("independent", std / math.sqrt(n * pixels))
         yield from _other_units(found, 0.1 * found, 1e3 * m.scale_m)
 
-    return _judge(asked, claim, found, _error_tolerance("std_se", found), mistakes)
+    return _judge_error(asked, claim, found, mistakes)
 
 
 def _invalid(asked: _Question, _: Submission, m: AtDistance, claim: float) -> Item:
@@ -376,11 +417,28 @@ def _other_units(found: float, tolerance: float, step_mm: float) -> Iterator[_Mi
 
 
 def _plot(asked: _Question, submission: Submission, found: Recomputed) -> Item:
-    """The student's figure: measured stds as in the raw depths or the table, and a prediction."""
+    """The student's figure, in millimetres; metres throughout cost once."""
     plot = submission.plot
     measured = {m.distance_m: m.std for m in found.at if m.std is not None}
     if plot is None or not plot.distances_m:
         return asked.missing("measured std of depth against the predicted one, at each distance")
+    there = [_nearest(list(measured), z) for z in plot.distances_m]
+    pairs = zip(plot.measured_mm, there, strict=True)
+    shown = [1e3 * mm / (measured[z].value or math.nan) for mm, z in pairs if z is not None]
+    if not shown or not all(0.5 < times < 2 for times in shown):
+        return _points(asked, submission, plot, measured)
+    plot = replace(plot, measured_mm=tuple(1e3 * mm for mm in plot.measured_mm))
+    if plot.predicted_mm and max(plot.predicted_mm) < max(plot.measured_mm) / 50:
+        plot = replace(plot, predicted_mm=tuple(1e3 * mm for mm in plot.predicted_mm))
+    item = _points(asked, submission, plot, measured)
+    says, part = f"{item.says[:-1]}; but all in metres: 1 m is 1000 mm.", item.points / asked.of
+    return asked.item("partial", says, "metres", part * grading_rules()["credit"]["metres"])
+
+
+def _points(
+    asked: _Question, submission: Submission, plot: Plot, measured: dict[float, WithError]
+) -> Item:
+    """Measured stds as in the raw depths or the table, and a prediction; all in mm."""
     wanted = len(grading_rules()["exercise"]["distances_m"])
     absent, wrong, of_table, right = [], [], [], 0
     for z, std in measured.items():
@@ -502,7 +560,13 @@ def _sigma_d_interval(asked: _Question, submission: Submission, found: Recompute
         return _no_law(asked, None if claim is None else claim[0], found)
     if claim is None:
         return asked.missing("a number without one says nothing of how well it fits")
-    return _judge_interval(asked, claim, law.sigma_d_interval_px, law, 0)
+    stated = submission.claims.sigma_d_px or 0.0
+    unit = next((f for f in (1e3, 1e-3) if 0.8 < stated / (f * law.sigma_d_px) < 1.25), 1.0)
+    low, high = claim
+    item = _judge_interval(asked, (low / unit, high / unit), law.sigma_d_interval_px, law, 0)
+    if unit != 1.0:
+        item = replace(item, says=f"{item.says[:-1]} (in px; the unit is counted with sigma_d).")
+    return item
 
 
 def _exponent(asked: _Question, submission: Submission, found: Recomputed) -> Item:
@@ -558,7 +622,8 @@ def _judge_interval(
     of half the interval's width."""
     topic, rule = asked.topic, grading_rules()["tolerance"]
     half = (found[1] - found[0]) / 2
-    tolerance = rule["standard_errors"] * rule["error_of_an_error"] * half + _half_digit(topic)
+    digits = max(_rounding(topic, end) for end in claim)
+    tolerance = rule["standard_errors"] * rule["error_of_an_error"] * half + digits
     unit = UNIT_OF[topic]
     one, two = (" to ".join(_digits(topic, end) for end in ends) for ends in (claim, found))
     accepted = f"{_accepted(topic, tolerance)} for each end"
@@ -577,7 +642,8 @@ def _judge_interval(
     others = [("one_sigma", about(se)) for se in (wide, narrow)]
     others.append(("not_widened", about(1.96 * narrow)))
     for mistake, ends in sorted(others, key=lambda other: _apart(claim, other[1])):
-        if _apart(claim, ends) <= 0.1 * (ends[1] - ends[0]) + _half_digit(topic):
+        explained = 0.1 * (ends[1] - ends[0]) + _half_digit(topic)
+        if _apart(claim, ends) <= min(explained, off / 4):
             says = f"{says}: wrong because {WHY[mistake]}."
             return asked.item("partial", says, mistake, tolerance=tolerance)
     if off <= rule["near"] * tolerance:
@@ -594,10 +660,10 @@ def _apart(one: Interval, two: Interval) -> float:
 
 
 def _no_law(asked: _Question, claim: float | None, found: Recomputed) -> Item:
-    """No fit: without a baseline it is not asked for, else the raw depths are at fault."""
+    """No fit: the camera's facts lack the baseline, or the raw depths are at fault."""
     if found.why_no_law.startswith("baseline_m"):
-        says = f"{asked.name}: not counted; your camera does not say its baseline."
-        return asked._replace(of=0.0).item("right" if claim is None else "missing", says)
+        says = f"{asked.name}: missing; without the camera's baseline there is no disparity."
+        return asked.item("missing", says)
     return asked.item("missing", f"{asked.name}: your raw depths give none ({found.why_no_law}).")
 
 
@@ -615,12 +681,15 @@ def _conclusion(asked: _Question, submission: Submission, found: Recomputed) -> 
         says = f"Bias or noise: you say {said.dominates}, but not at which mounting distance."
         return asked.item("partial", says, "incomplete")
     z, frames = said.distance_m, said.frames
+    low, high = known[0].distance_m / 1.5, 1.5 * known[-1].distance_m
     bias, bias_se, noise, noise_se = _at_mounting(submission, known, z, frames)
     over = f"{frames} frames" if frames > 1 else "one frame"
     says = SAYS["dominates"].format(said.dominates, z, bias, bias_se, noise, over)
-    low, high = known[0].distance_m, known[-1].distance_m
-    if not low / 1.5 <= z <= 1.5 * high:
-        says += f", but you measured from {low:.2f} to {high:.2f} m only: that is too far to tell."
+    if not low <= z <= high:
+        ends = f"{known[0].distance_m:.2f} to {known[-1].distance_m:.2f} m"
+        says += f", but you measured from {ends} only: that is too far to tell."
+        if low <= z / 100 <= high:
+            says = f"Bias or noise: {z:g} m? In metres: {z / 100:g}."
         return asked.item("partial", says, "not_measured_there")
     lead = abs(bias) - noise
     sure = grading_rules()["tolerance"]["standard_errors"] * math.hypot(bias_se, noise_se)
@@ -630,8 +699,7 @@ def _conclusion(asked: _Question, submission: Submission, found: Recomputed) -> 
     if said.dominates == larger:
         return asked.item("right", f"{says}: right.")
     says += f": wrong because {larger} is the larger by {abs(lead):.2f} mm"
-    if larger == "bias" and frames > 1:
-        says += "; averaging takes noise down and leaves the bias"
+    says += "; averaging takes noise down and leaves the bias" * (larger == "bias" and frames > 1)
     return asked.item("partial", f"{says}.", "other_dominates")
 
 
@@ -677,22 +745,70 @@ def _judge(
     tolerance: float,
     mistakes: Callable[[], Iterator[_Mistake]],
 ) -> Item:
-    """A claimed number beside what the raw depths say; the first mistake to explain it counts."""
+    """A claimed number beside what the raw depths say; the mistake that explains it best counts."""
+    tolerance += _rounding(asked.topic, claim) - _half_digit(asked.topic)
+    off = abs(claim - found) / tolerance
+    accepted = _accepted(asked.topic, tolerance)
+    return _verdict(asked, claim, found, off, tolerance, accepted, mistakes)
+
+
+def _judge_error(
+    asked: _Question, claim: float, found: float, mistakes: Callable[[], Iterator[_Mistake]]
+) -> Item:
+    """A standard error, which is itself known to a part only: its ratio to what is found counts."""
+    rule = grading_rules()["tolerance"]
+    factor = 1 + rule["standard_errors"] * rule["error_of_an_error"]
+    off = abs(math.log(claim / found)) / math.log(factor) if claim > 0 < found else math.inf
+    if abs(claim - found) <= _rounding(asked.topic, claim):
+        off = 0.0
+    accepted = f"up to {factor:.2g} times as much or as little is accepted"
+    return _verdict(asked, claim, found, off, (factor - 1) * found, accepted, mistakes)
+
+
+def _verdict(
+    asked: _Question,
+    claim: float,
+    found: float,
+    off: float,
+    tolerance: float,
+    accepted: str,
+    mistakes: Callable[[], Iterator[_Mistake]],
+) -> Item:
+    """Right, explained, close or wrong; off: in units of what is accepted."""
     shown = [_shown(asked.topic, value) for value in (claim, found)]
-    says = SAYS["compared"].format(asked.name, *shown, _accepted(asked.topic, tolerance))
+    says = SAYS["compared"].format(asked.name, *shown, accepted)
     answer = partial(asked.item, tolerance=tolerance)
-    off = abs(claim - found)
-    if off <= tolerance:
+    if off <= 1:
         return answer("right", f"{says}: right.")
-    for mistake in mistakes():
-        value = mistake.value
-        if abs(claim - value) <= max(mistake.within, EXPLAINED_WITHIN * abs(value)) < math.inf:
-            says, code = f"{says}: wrong because {mistake.why(asked.topic)}.", mistake.key
-            return answer("partial", says, code.partition(".")[0])
-    if off <= grading_rules()["tolerance"]["near"] * tolerance:
+    mistake = _explanation(asked.topic, claim, found, tolerance, mistakes())
+    if mistake is not None:
+        says, code = f"{says}: wrong because {mistake.why(asked.topic)}.", mistake.key
+        return answer("partial", says, code.partition(".")[0])
+    if off <= grading_rules()["tolerance"]["near"]:
         return answer("partial", f"{says}: close, but not within that.", "close")
     size = "large" if claim > found else "small"
     return answer("wrong", f"{says}: wrong because it is too {size}.")
+
+
+def _explanation(
+    topic: str, claim: float, found: float, tolerance: float, mistakes: Iterable[_Mistake]
+) -> _Mistake | None:
+    """The mistake whose number is nearest to a claim, if it is near enough to be the reason.
+
+    A mistake whose number is near the right one explains only a claim that has its digits.
+    """
+    best, least = None, math.inf
+    if topic not in ONE_DIGIT and claim == float(f"{found:.0e}"):
+        return _Mistake("rounded", claim)
+    for mistake in mistakes:
+        value, off = mistake.value, abs(claim - mistake.value)
+        within = max(mistake.within, EXPLAINED_WITHIN * abs(value))
+        if abs(value - found) < max(2 * tolerance, NEAR_RIGHT * abs(found)):
+            coarse = _written(claim) > EXPLAINED_WITHIN / 2 * abs(value)
+            within = 0.0 if coarse else max(_half_digit(topic), EXACTLY * abs(value))
+        if off <= within and off < least:
+            best, least = mistake, off
+    return best
 
 
 def _unknown(asked: _Question, claim: float) -> Item:
@@ -713,9 +829,19 @@ def _tolerance(topic: str, se: float) -> float:
     return float(grading_rules()["tolerance"]["standard_errors"] * se + _half_digit(topic))
 
 
-def _error_tolerance(topic: str, se: float) -> float:
-    """Of a standard error, which is itself known to a part only."""
-    return _tolerance(topic, grading_rules()["tolerance"]["error_of_an_error"] * se)
+def _written(claim: float) -> float:
+    """Half a unit of the last digit with which a number is written."""
+    return 0.5 * 10.0 ** int(Decimal(repr(float(claim))).as_tuple().exponent)
+
+
+def _rounding(topic: str, claim: float) -> float:
+    """By how much a claim is rounded, in the claim's unit: half a printed digit, or half of its own
+    last one where that is the second at least."""
+    if claim == 0:
+        return _half_digit(topic)
+    first = math.floor(math.log10(abs(claim)))
+    most = 0.5 * 10.0 ** (first - (topic not in ONE_DIGIT))
+    return max(_half_digit(topic), min(_written(claim), most))
 
 
 def _log_se(law: NoiseFit, i: int, widened: bool = True) -> float:

@@ -40,12 +40,8 @@ from coursekit.words import counted
 
 MEASURED = "studio_1.measured"  # in results/
 LESSON_PREFIX = "depth_noise."  # of its checkpoints and exercises
-COLUMNS = [field.name for field in fields(TableRow)][1:]
-TABLE_UNITS = {  # of a quantity that is handed in, and what one of it is in the table's own
-    "depth_bias": {"mm": 1.0, "m": 1e3},
-    "depth_std": {"mm": 1.0, "m": 1e3},
-    "invalid": {"1": 1.0, "%": 0.01},
-}
+COLUMNS = [field.name for field in fields(TableRow)][1:]  # of one's own table
+IN_MM = {"mm": 1.0, "m": 1e3}  # units of a std, and what one of them is in mm
 NOBODY = "nobody"  # stands in for a name while there is none
 Table = Mapping[float, Sequence[float | None]]
 
@@ -122,31 +118,23 @@ def measured(
 ) -> Submission:
     """A measured studio exercise, still without a name and a conclusion.
 
-    stacks: one a distance. quantities: the student's table, by the names that notebook 02 gives
-    (depth_bias_at_300_mm, depth_std_at_300_mm, invalid_at_300_mm, ...). fit: sigma_d from the
-    block; its exponent is claimed only if it was fitted. predicted_mm: the std of depth that was
-    predicted for each stack, None if nobody did. tape_sigma_m, caliper_m: as in `Submission`.
-    table: the student's own numbers, {distance: (bias, its se, std, its se, all in mm, invalid
-    part)}; each that is not None takes the place of the one in `quantities`.
+    stacks: one a distance. quantities: what notebook 02 measured; the figure takes from it
+    depth_std_at_300_mm and so on. fit: sigma_d from the block; its exponent is claimed only if it
+    was fitted. predicted_mm: the std of depth that was predicted for each stack, None if nobody
+    did. tape_sigma_m, caliper_m: as in `Submission`. table: the student's own numbers, {distance:
+    (bias, its se, std, its se, all in mm, invalid part)}; what is None there is not handed in.
     Raises ValueError for what no bundle can hold.
     """
     stacks = tuple(stacks)
-    rows = _with_own(tuple(_row(s.distance_m, quantities) for s in stacks), table or {})
-    want(
-        predicted_mm is None or np.shape(predicted_mm) == (len(stacks),),
-        "predicted_mm",
-        predicted_mm,
-        f"{len(stacks)}: one number in mm for each distance",
-    )
+    at = tuple(s.distance_m for s in stacks)
+    rows = _own_rows(at, {} if table is None else table)
+    predicted = _predicted(predicted_mm, len(stacks))
     free = fit.exponent if fit.exponent_interval is not None else None
     sigma_d = interval = None
     if fit.baseline_m is not None:  # else there is no disparity
         sigma_d, interval = fit.sigma_d_px, fit.sigma_d_interval_px
-    stds = [row.depth_std_mm for row in rows if row.depth_std_mm is not None]
-    predicted = None if predicted_mm is None else tuple(predicted_mm)
-    figure = None
-    if len(stds) == len(stacks):
-        figure = Plot(tuple(s.distance_m for s in stacks), tuple(stds), predicted)
+    stds = tuple(std for z in at if (std := _std_mm(z, quantities)) is not None)
+    figure = Plot(at, stds, predicted) if len(stds) == len(stacks) else None
     return Submission(
         student=NOBODY,
         made=results.now(),
@@ -190,14 +178,19 @@ def submit(
     frames: int = 1,
     folder: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
+    mismatches: Literal["kept", "left out"] | None = None,
+    table: Table | None = None,
+    predicted_mm: Sequence[float] | None = None,
 ) -> Handed:
     """Pack what notebook 02 kept into one bundle to hand in, and say what the grader will say.
 
     student: the name that the course knows. distance_m: where the camera will be mounted, and
     frames, how many can be averaged there. dominates: "bias" or "noise", paragraph: the reasons.
-    folder: where the bundle goes, default `results/`. Without a measurement or a name nothing is
-    written; whatever else is missing is said, and the bundle is written all the same. A bundle that
-    is there already stays, unless overwrite=True.
+    folder: where the bundle goes, default `results/`. mismatches: whether your own table keeps the
+    samples far from all others of their pixel ("kept") or not ("left out"). table, predicted_mm: as
+    in `keep`, for what was changed since; None is what was kept. Without a measurement or a name
+    nothing is written; whatever else is missing is said, and the bundle is written all the same. A
+    bundle that is there already stays, unless overwrite=True.
     Raises ValueError for an argument that cannot be, naming it.
     """
     if isinstance(dominates, str):  # "Bias" is meant as well
@@ -207,9 +200,16 @@ def submit(
     kept = load_measured()
     if kept is None:
         return Handed(None, MEASURE_FIRST)
+    claims, plot = replace(kept.claims, mismatches=mismatches), kept.plot
+    if table is not None:
+        claims = replace(claims, rows=_own_rows([s.distance_m for s in kept.stacks], table))
+    if plot is not None and predicted_mm is not None:
+        plot = replace(plot, predicted_mm=_predicted(predicted_mm, len(plot.distances_m)))
     name = (student or "").strip()
     whole = replace(
         kept,
+        claims=claims,
+        plot=plot,
         student=name or NOBODY,
         made=results.now(),
         conclusion=Conclusion(distance_m, frames, dominates, (paragraph or "").strip()),
@@ -270,37 +270,35 @@ def load_measured() -> Submission | None:
         ) from error
 
 
-def _row(distance_m: float, quantities: Mapping[str, results.Quantity]) -> TableRow:
-    """The line of the table at one distance; what was not measured is left out."""
-
-    def found(name: str) -> tuple[float | None, float | None]:
-        """A quantity and its standard error in the table's units; None for what is not there."""
-        full = f"{name}_at_{1000 * distance_m:.0f}_mm"
-        quantity = quantities.get(full)
-        if quantity is None:
-            return None, None
-        units = TABLE_UNITS[name]
-        wanted = f"Quantity(value, {next(iter(units))!r}, standard error)"
-        want(isinstance(quantity, results.Quantity), full, quantity, wanted)
-        unit = quantity.unit
-        want(unit in units, full, unit, f"the unit {' or '.join(map(repr, units))}")
-        factor = units[unit]
-        sigma = None if quantity.sigma is None else factor * quantity.sigma
-        return factor * quantity.value, sigma
-
-    return TableRow(distance_m, *found("depth_bias"), *found("depth_std"), found("invalid")[0])
+def _std_mm(distance_m: float, quantities: Mapping[str, results.Quantity]) -> float | None:
+    """The std of depth that was measured at a distance, mm; None if it was not."""
+    name = f"depth_std_at_{1000 * distance_m:.0f}_mm"
+    std = quantities.get(name)
+    if std is None:
+        return None
+    wanted = "Quantity(value, 'mm', standard error)"
+    want(isinstance(std, results.Quantity), name, std, wanted)
+    want(std.unit in IN_MM, name, std.unit, "the unit 'mm' or 'm'")
+    return IN_MM[std.unit] * std.value
 
 
-def _with_own(rows: tuple[TableRow, ...], table: Table) -> tuple[TableRow, ...]:
-    """The rows with the student's own numbers in them, wherever these are not None."""
+def _own_rows(distances_m: Sequence[float], table: Table) -> tuple[TableRow, ...]:
+    """The student's own numbers; what is None, or not there, is left out."""
     want(isinstance(table, Mapping), "table", table, "{0.30: (five numbers), ...}")
-    at = [row.distance_m for row in rows]
     five = "five: bias, its standard error, std, its standard error (mm), invalid part"
+    rows = {z: TableRow(z) for z in distances_m}
     for z, numbers in table.items():
-        want(z in at, "table", z, f"one of the distances {', '.join(f'{d:g}' for d in at)}")
+        want(z in rows, "table", z, f"one of the distances {', '.join(f'{d:g}' for d in rows)}")
         several = isinstance(numbers, (tuple, list, np.ndarray)) and len(numbers) == len(COLUMNS)
         want(several, f"table at {z:g} m", numbers, five)
-        own = {part: n for part, n in zip(COLUMNS, numbers, strict=True) if n is not None}
-        i = at.index(z)
-        rows = (*rows[:i], replace(rows[i], **own), *rows[i + 1 :])
-    return rows
+        rows[z] = TableRow(z, *numbers)
+    return tuple(rows.values())
+
+
+def _predicted(predicted_mm: Sequence[float] | None, n: int) -> tuple[float, ...] | None:
+    """What was predicted for n distances; None if nobody did."""
+    three = f"{n}: one number in mm for each distance"
+    want(
+        predicted_mm is None or np.shape(predicted_mm) == (n,), "predicted_mm", predicted_mm, three
+    )
+    return None if predicted_mm is None else tuple(predicted_mm)
