@@ -1,6 +1,7 @@
 """Sets up the course once, then runs it.
 
-python3 course.py lab     open the notebooks in JupyterLab (more options: those of jupyter lab)
+python3 course.py lab     open your copies of the notebooks, in notebooks/my, in JupyterLab
+                          (more options: those of jupyter lab)
 python3 course.py test    check everything (more options: those of pytest)
 python3 course.py run     execute every notebook into build/, without a browser
 python3 course.py bench   time the parts that must be fast
@@ -32,11 +33,11 @@ import time
 import urllib.error
 import urllib.request
 import webbrowser
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import IO, NamedTuple
 
-MINIMUM = (3, 11)
+MINIMUM, BELOW = (3, 11), (3, 15)
 RECOMMENDED = "3.12"
 
 
@@ -48,9 +49,9 @@ def works(command: list) -> bool:
     return subprocess.call(command, stdin=nothing, stdout=nothing, stderr=nothing) == 0
 
 
-def too_old(version: tuple, arguments: list) -> str:
-    """What to tell somebody whose Python is too old, with the command to type instead."""
-    check = ["-c", f"import sys; sys.exit(sys.version_info < {MINIMUM})"]
+def unfit(version: tuple, arguments: list) -> str:
+    """What to tell somebody whose Python is too old or too new, and what to type instead."""
+    check = ["-c", f"import sys; sys.exit(not {MINIMUM} <= sys.version_info < {BELOW})"]
     names = [
         name.format(minor) for name in ("python3.{}", "py -3.{}") for minor in (12, 13, 11, 14)
     ]
@@ -60,12 +61,12 @@ def too_old(version: tuple, arguments: list) -> str:
     advice = f"Install Python {RECOMMENDED} (python.org has it), or uv, and run this again."
     if newer:
         advice = f"Type this instead:\n\n    {newer[0]} {' '.join(arguments)}\n"
-    found, wanted = (".".join(map(str, numbers[:2])) for numbers in (version, MINIMUM))
-    return f"This is Python {found}, and the course needs {wanted} or newer. {advice}"
+    found = ".".join(map(str, version[:2]))
+    return f"This is Python {found}, and the course needs 3.11, 3.12, 3.13 or 3.14. {advice}"
 
 
-if sys.version_info < MINIMUM:
-    sys.exit(too_old(sys.version_info, sys.argv))
+if not MINIMUM <= sys.version_info < BELOW:
+    sys.exit(unfit(sys.version_info, sys.argv))
 
 if sys.platform == "win32":
     import msvcrt
@@ -76,14 +77,14 @@ ROOT = Path(__file__).resolve().parent
 VENV = ROOT / ".venv"
 SCHEME = {"base": str(VENV), "platbase": str(VENV)}
 SCRIPTS = Path(sysconfig.get_path("scripts", "venv", SCHEME))
-SITE_PACKAGES = Path(sysconfig.get_path("purelib", "venv", SCHEME))
 PYTHON = SCRIPTS / ("python.exe" if os.name == "nt" else "python")
 BASE_PYTHON = getattr(sys, "_base_executable", sys.executable)  # also when started inside .venv
 MARKER = VENV / "made-by-course"  # written first: this .venv may be deleted
 STATE = VENV / "course-state.json"  # written last: this .venv is complete
 LOG = ROOT / "build" / "setup.log"
 LOCK = ROOT / "build" / "setup.lock"
-FIRST_PAGE = "lab/tree/notebooks/01_pinhole.ipynb"
+COMPILING = ROOT / "build" / "compiling"  # there while the fast parts are compiled
+CONFIGURATION = ROOT / "tools" / "jupyter_server_config.py"
 SPACE_BYTES = 1_500_000_000
 HASHED = ("--require-hashes", "--only-binary", ":all:", "-r")
 EDITABLE = ("--no-deps", "--no-build-isolation", "-e", ".")
@@ -91,6 +92,7 @@ EDITABLE = ("--no-deps", "--no-build-isolation", "-e", ".")
 OVERRIDES = "share/jupyter/lab/settings/overrides.json"
 NO_NEWS = {"fetchNews": "false", "checkForUpdates": False}  # else a question pops up at first
 
+CERTIFICATE = "CERTIFICATE_VERIFY_FAILED|invalid peer certificate"
 NETWORK = "the network did not answer. Connect to it (or check the proxy) and run this again"
 CAUSES = {  # what pip, uv or the system says: what it means. A retry that went well leaves a
     # network warning behind, so the network comes after what never gets better by itself.
@@ -102,7 +104,7 @@ CAUSES = {  # what pip, uv or the system says: what it means. A retry that went 
     r"|Access is denied|(os error|WinError) 5\b": "a file cannot be written, or is in use. End "
     "JupyterLab if it is running; if the folder is read-only, copy it into your home folder and "
     "run this there",
-    r"CERTIFICATE_VERIFY_FAILED|invalid peer certificate": "the network's certificate is not "
+    CERTIFICATE: "the network's certificate is not "
     "trusted. Try another network, or ask whoever runs this one how to set up pip for it",
     r"Failed to establish a new connection|NewConnectionError|ProxyError|Max retries exceeded"
     r"|timed out|Connection (broken|reset|aborted)|error sending request"
@@ -115,7 +117,7 @@ CAUSES = {  # what pip, uv or the system says: what it means. A retry that went 
 class Step(NamedTuple):
     name: str  # in the state file
     says: str
-    inputs: tuple[str, ...]  # files; when one of them changes, the step is repeated
+    inputs: tuple[str, ...] = ()  # files; when one of them changes, the step is repeated
     pip: tuple[str, ...] = ()  # what pip or uv installs ...
     python: tuple[str, ...] = ()  # ... or what Python runs
     without: str = ""  # what follows when the step fails; empty: nothing works without it
@@ -124,13 +126,16 @@ class Step(NamedTuple):
 COURSE, TEST = "requirements.txt", "requirements-test.txt"
 CAMERA = "requirements-camera.txt"
 NO_CAMERA = "The simulated camera works all the same; for a real one, the next start tries again."
+NO_PIP = "Only `!pip` in a notebook needs it."
 NO_KERNELS = "The notebooks compile them when they need them, and the next start tries again."
 KERNELS = ("kernels", "simulation/raycast", "simulation/rig", "simulation/board_images")
 COMPILED = (COURSE, *(f"coursekit/{name}.py" for name in KERNELS))
 COMPILE = ("-m", "coursekit.warm_up")
 # A module's tests, and the cells of a notebook, stay together in one of the two processes.
 TWO_PROCESSES = ("-n", "2", "--dist", "loadscope", "--no-loadscope-reorder")
+PIP = ("-m", "ensurepip", "--default-pip")
 STEPS = (
+    Step("pip", "pip", python=PIP, without=NO_PIP),
     Step("course", "Packages", (COURSE,), (*HASHED, COURSE)),
     Step("test", "Test tools", (TEST,), (*HASHED, TEST)),
     Step("camera", "RealSense driver", (CAMERA,), (*HASHED, CAMERA), without=NO_CAMERA),
@@ -150,6 +155,7 @@ def environment() -> dict[str, str]:
         **kept,
         "VIRTUAL_ENV": str(VENV),
         "PYTHONUTF8": "1",
+        "UV_SYSTEM_CERTS": kept.get("UV_SYSTEM_CERTS", "1"),  # a campus may have its own
         "PIP_USER": "0",  # wins over a "user = true" in pip's configuration
         "PIP_NO_INPUT": "1",
         "PIP_PROGRESS_BAR": "off",
@@ -189,12 +195,8 @@ def fingerprint(step: Step) -> str:
     return hashlib.sha256(b"\0".join(content)).hexdigest()
 
 
-def pending(done: dict[str, str], for_tests: bool) -> list[Step]:
-    return [
-        step
-        for step in STEPS
-        if (for_tests or step.name != "test") and done.get(step.name) != fingerprint(step)
-    ]
+def pending(done: dict[str, str], but: Collection[str]) -> list[Step]:
+    return [s for s in STEPS if s.name not in but and done.get(s.name) != fingerprint(s)]
 
 
 # ---- setting up ---------------------------------------------------------------------------------
@@ -220,9 +222,9 @@ def show(text: str, end: str = "") -> None:
     print("\r" + text[:width].ljust(width), end=end, flush=True)
 
 
-def run_logged(says: str, command: list[str]) -> tuple[int, str]:
+def run_logged(says: str, command: list[str], live: bool | None = None) -> tuple[int, str]:
     """Run one step with a live line on a terminal; what it says goes to the log, too."""
-    live = sys.stdout.isatty()
+    live = sys.stdout.isatty() if live is None else live
     if not live:
         print(f"{says} ...")
     started = time.monotonic()
@@ -266,17 +268,16 @@ def must(says: str, command: list[str]) -> None:
         sys.exit(f"{says}: {explain(output)}.\nThe full output is in {LOG}")
 
 
-def perform(step: Step, done: dict[str, str]) -> None:
+def perform(step: Step, done: dict[str, str], live: bool | None = None) -> None:
     """Run a step; the state file is away while it changes the environment."""
     done.pop(step.name, None)
-    pip = ["uv", "pip", "install", "--python", str(PYTHON)]
-    if not has_uv():
-        pip = [str(PYTHON), "-m", "pip", "install"]
     if step.pip:
         STATE.unlink(missing_ok=True)
-    code, output = run_logged(
-        step.says, [*pip, *step.pip] if step.pip else [str(PYTHON), *step.python]
-    )
+    code, output = run_logged(step.says, [*command_of(step)], live)
+    if code and step.pip and has_uv() and re.search(CERTIFICATE, output):
+        print("uv does not trust this network; pip may have been told of it: once more with pip.")
+        run_logged("pip", [str(PYTHON), *PIP])
+        code, output = run_logged(step.says, [str(PYTHON), "-m", "pip", "install", *step.pip])
     cause = explain(output)
     if code == 0:
         done[step.name] = fingerprint(step)
@@ -286,6 +287,15 @@ def perform(step: Step, done: dict[str, str]) -> None:
         sys.exit(f"{step.says}: {cause}.\nThe full output is in {LOG}")
     if code:
         print(f"{step.says}: {cause}.\n{step.without}\nThe full output is in {LOG}")
+
+
+def command_of(step: Step) -> Iterator[str]:
+    if not step.pip:
+        yield from (str(PYTHON), *step.python)
+    elif has_uv():
+        yield from ("uv", "pip", "install", "--python", str(PYTHON), *step.pip)
+    else:
+        yield from (str(PYTHON), "-m", "pip", "install", *step.pip)
 
 
 def require_ensurepip() -> None:
@@ -326,7 +336,7 @@ def create() -> None:
             f"The disk has {free / 1e9:.1f} GB free, and the course needs about "
             f"{SPACE_BYTES / 1e9:.1f} GB. Free some and run this again."
         )
-    print("Setting up the course in .venv, once: a minute or two; seconds with uv.")
+    print("Setting up the course in .venv, once: one to three minutes; with uv half a minute.")
     with_uv = ["uv", "venv", "--no-project", "--allow-existing", "--python", BASE_PYTHON, str(VENV)]
     with_venv = [BASE_PYTHON, "-m", "venv", "--without-pip", str(VENV)]
     must("Environment", with_uv if has_uv() else with_venv)
@@ -336,10 +346,10 @@ def create() -> None:
     overrides.write_text(json.dumps(news), encoding="utf-8")
 
 
-def set_up(for_tests: bool = False) -> None:
-    """Bring .venv up to date; when it is, this takes milliseconds and no network."""
+def set_up(but: Collection[str] = ("test",)) -> None:
+    """Bring .venv up to date, but for some steps; if it is, that takes milliseconds, no network."""
     state = read_state()
-    if state is not None and not pending(state, for_tests):
+    if state is not None and not pending(state, but):
         return
     with locked():
         state = read_state()  # whoever held the lock may have done the work
@@ -348,12 +358,21 @@ def set_up(for_tests: bool = False) -> None:
             require_ensurepip()
         if state is None:
             create()
-        if not has_uv() and not (SITE_PACKAGES / "pip").exists():
-            STATE.unlink(missing_ok=True)
-            must("pip", [str(PYTHON), "-m", "ensurepip"])
         done = state or {}
-        for step in pending(done, for_tests):
+        for step in pending(done, but):
             perform(step, done)
+
+
+def finish_set_up() -> None:
+    """What JupyterLab can start without, while it runs; a notebook that needs it waits."""
+    state = read_state() or {}
+    COMPILING.touch()
+    try:
+        with locked():
+            for step in pending(state, ("test",)):
+                perform(step, state, live=False)
+    finally:
+        COMPILING.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
@@ -407,7 +426,7 @@ def run_python(*arguments: str) -> int:
     return finish(subprocess.Popen([str(PYTHON), *arguments], cwd=ROOT, env=environment()))
 
 
-def address_when_ready(child: subprocess.Popen, runtime: Path) -> str:
+def address_when_ready(child: subprocess.Popen, runtime: Path, page: str) -> str:
     """Wait until JupyterLab answers; empty when it ends before that."""
     opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     while child.poll() is None:
@@ -419,13 +438,14 @@ def address_when_ready(child: subprocess.Popen, runtime: Path) -> str:
                     opener.open(server["url"] + "api", timeout=5).close()
             except (OSError, ValueError):
                 continue  # half-written, or not answering yet
-            return f"{server['url']}{FIRST_PAGE}?token={server['token']}"
+            return f"{server['url']}{page}?token={server['token']}"
     return ""
 
 
-def jupyter_command(arguments: list[str]) -> list[str]:
+def jupyter_command(page: str, arguments: list[str]) -> list[str]:
     options = ["--no-browser", "--log-level=ERROR", "--LabApp.log_level=ERROR"]
-    options += [f"--ServerApp.root_dir={ROOT}", f"--LabApp.default_url=/{FIRST_PAGE}"]
+    options += [f"--config={CONFIGURATION}"]
+    options += [f"--ServerApp.root_dir={ROOT}", f"--LabApp.default_url=/{page}"]
     options += ["--KernelManager.transport_encryption=auto"]  # "disabled" warns on the terminal
     options += ["--ServerApp.answer_yes=True"]  # to "Shut down this server?" after Ctrl-C
     if hasattr(os, "geteuid") and os.geteuid() == 0:
@@ -439,16 +459,27 @@ def open_browser(address: str) -> None:
 
 
 def lab(arguments: list[str]) -> int:
-    set_up()
+    if {"-h", "--help", "--help-all", "--version"} & set(arguments):
+        print(__doc__)
+        return 0
+    COMPILING.unlink(missing_ok=True)  # of a start that was killed
+    later = ("pip", "kernels") if has_uv() else ("kernels",)
+    set_up(("test", *later))
+    from tools import copies
+
+    print(copies.older_ones(copies.make()), end="")
+    page = f"lab/tree/notebooks/my/{copies.unfinished()}"
     print("Starting JupyterLab ...")
     screen = sys.platform != "linux" or {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ)
     with tempfile.TemporaryDirectory(prefix="coursekit-", ignore_cleanup_errors=True) as runtime:
-        token = {"JUPYTER_TOKEN": secrets.token_hex(24), "JUPYTER_RUNTIME_DIR": runtime}
-        child = subprocess.Popen(
-            jupyter_command(arguments), cwd=ROOT, env={**environment(), **token}
-        )
+        own = {"JUPYTER_TOKEN": secrets.token_hex(24), "JUPYTER_RUNTIME_DIR": runtime}
+        own["COURSEKIT_COMPILING"] = str(COMPILING)
+        command = jupyter_command(page, arguments)
+        child = subprocess.Popen(command, cwd=ROOT, env={**environment(), **own})
         try:
-            address = address_when_ready(child, Path(runtime))
+            if pending(read_state() or {}, ("test",)):
+                threading.Thread(target=finish_set_up, daemon=True).start()
+            address = address_when_ready(child, Path(runtime), page)
             if address:
                 print(f"\nThe course is at\n\n    {address}\n\nCtrl-C here ends it.")
             if address and screen and "CI" not in os.environ and "--no-browser" not in arguments:
@@ -458,10 +489,12 @@ def lab(arguments: list[str]) -> int:
             stop(child)
             print("\nJupyterLab has ended.")
             return 0
+        finally:
+            COMPILING.unlink(missing_ok=True)
 
 
 def test(arguments: list[str]) -> int:
-    set_up(for_tests=True)
+    set_up(())
     checks = (
         ("ruff check", ("-m", "ruff", "check")),
         ("ruff format", ("-m", "ruff", "format", "--check")),

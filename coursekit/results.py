@@ -52,6 +52,18 @@ class MeasuringCamera(Protocol):
 
 
 @dataclass(frozen=True)
+class Origin:
+    """What stands in for a camera where somebody else's took the images: photographs in a folder.
+
+    >>> Origin("photographs in desk").source
+    'recorded'
+    """
+
+    name: str
+    source: Source = "recorded"
+
+
+@dataclass(frozen=True)
 class Quantity:
     """A number with its unit.
 
@@ -156,6 +168,7 @@ class Result:
 
     covariances: of those quantities that were estimated together, by a name for the group. lens,
     placement: the camera's K, size and distortion, and where it is, if the notebook found these.
+    eye_to_hand: where a second camera is, that of notebook 04's rig which does not move.
     """
 
     lesson: str
@@ -168,6 +181,7 @@ class Result:
     serial: str = ""
     lens: Intrinsics | None = None
     placement: Placement | None = None
+    eye_to_hand: Placement | None = None
 
 
 def folder() -> Path:
@@ -182,13 +196,14 @@ def save(
     covariances: Mapping[str, Covariance] | None = None,
     lens: Intrinsics | None = None,
     placement: Placement | None = None,
+    eye_to_hand: Placement | None = None,
 ) -> Path:
     """Write `results/<lesson>.json` in one step (a reader sees the old file or the new one).
 
     covariances: of those quantities that were estimated together, by a name for the group. lens,
-    placement: for `export`; the camera's serial number goes along where it has one. Returns the
-    path. Raises ValueError for what is no quantity and no covariance, and for a covariance of
-    something that is not among the quantities.
+    placement, eye_to_hand: as in `Result`; the camera's serial number goes along where it has one.
+    Returns the path. Raises ValueError for what is no quantity and no covariance, and for a
+    covariance of something that is not among the quantities.
     """
     covariances = covariances or {}
     for name, quantity in quantities.items():
@@ -199,7 +214,8 @@ def save(
             want(name in quantities, argument, name, "the name of a quantity")
     made = (lesson, camera.source, camera.name, now(), versions())
     result = Result(*made, dict(quantities), dict(covariances), getattr(camera, "serial", ""))
-    whole = {"lens": lens and lens.to_dict(), "placement": placement and placement.to_dict()}
+    parts = {"lens": lens, "placement": placement, "eye_to_hand": eye_to_hand}
+    whole = {name: part and part.to_dict() for name, part in parts.items()}
     path = _path(lesson)
     write_json(path, {"format": FORMAT} | asdict(result) | whole)
     return path
@@ -222,9 +238,11 @@ def read(path: Path) -> Result:
         quantities = {k: Quantity(**v) for k, v in content.pop("quantities").items()}
         covariances = {k: Covariance(**v) for k, v in content.pop("covariances", {}).items()}
         checks.choice("source", content["source"], get_args(Source))
-        lens, placement = content.pop("lens", None), content.pop("placement", None)
+        lens = content.pop("lens", None)
         content["lens"] = lens and Intrinsics.from_dict(lens)
-        content["placement"] = placement and Placement.from_dict(placement)
+        for name in ("placement", "eye_to_hand"):
+            placed = content.pop(name, None)
+            content[name] = placed and Placement.from_dict(placed)
         return Result(**content, quantities=quantities, covariances=covariances)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path.name}: {error}") from error

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import html
 import textwrap
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Self, TypeVar, overload
+from typing import Any, Self, TypeVar, overload
 
 from coursekit.arrays import Interval
 from coursekit.checks import is_number, want
@@ -36,6 +38,38 @@ def with_notes(text: str, notes: Sequence[str]) -> str:
 def counted(n: int, thing: str, several: str = "") -> str:
     """ "1 view", "3 views"; several: the plural that is not made with an s."""
     return f"{n} {thing}" if n == 1 else f"{n} {several or thing + 's'}"
+
+
+@contextlib.contextmanager
+def counting(total: int, thing: str, shown: bool = True) -> Iterator[Callable[[], Any]]:
+    """A line that counts, and is gone at the end; yields what to call after each thing.
+
+    In a notebook it is text, because a widget would be a dead one on the next day.
+    """
+    from IPython import get_ipython
+
+    if not shown or getattr(get_ipython(), "kernel", None) is None:
+        from tqdm import tqdm
+
+        with tqdm(total=total, unit=thing, leave=False, disable=not shown) as bar:
+            yield bar.update
+        return
+    from IPython.display import DisplayHandle
+
+    line, done, said = DisplayHandle(), 0, time.monotonic()
+
+    def count() -> None:
+        nonlocal done, said
+        done += 1
+        if time.monotonic() - said > 0.3:
+            said = time.monotonic()
+            line.update({"text/plain": f"{done} of {counted(total, thing)}"}, raw=True)
+
+    line.display({"text/plain": ""}, raw=True)
+    try:
+        yield count
+    finally:
+        line.update({"text/plain": ""}, raw=True)
 
 
 def p_text(p_value: float) -> str:

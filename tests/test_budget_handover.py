@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from coursekit import results
-from coursekit.budget import HandOver, beside, hand_over, independent_frames
+from coursekit.budget import HandOver, hand_over, independent_frames
 from coursekit.budget.handover import NEEDED, lesson_budget, wrist_budget
 from coursekit.results import Covariance, Quantity
 
@@ -183,18 +183,48 @@ def test_the_reference_is_only_read(folders: tuple[Path, Path]) -> None:
     assert json.loads(before["01_pinhole.json"])["source"] == "simulated"
 
 
-def test_beside_the_lesson_says_every_row_and_whose_it_is(folders: tuple[Path, Path]) -> None:
+def test_a_table_says_every_row_and_whose_it_is(folders: tuple[Path, Path]) -> None:
     write(YOURS)
     handed = hand_over(folders[1])
-    both = beside(lesson_budget(), handed.budget())
-    lines = {line[0]: line[2:] for line in both.lines()}
-    assert lines["hand-eye rotation"][0] == "0.5 deg: 0.0–3.9 mm"
-    assert lines["depth bias"] == ("2–5 mm: 2.0–6.0 mm", "0.18–0.62 %: 0.8–2.8 mm")
-    assert lines["intrinsics"][0] == "-"
-    whose = [line for line in repr(both).splitlines() if "pixel, forward kinematics" in line]
-    assert whose == ["  pixel, forward kinematics: the lesson"]
-    assert "the bench" in repr(both)
-    assert "the bench" in both._repr_html_()
+    table = handed.budget()
+    _, lines = table.table()
+    assert lines[2][:5] == ("depth bias", "bias", "-0.4 %, +0 px", "sZ - oZ²/(fB)", "0.8 to 2.8 mm")
+    assert "from the lesson: pixel, forward kinematics" in repr(table).splitlines()
+    assert "the bench, 20" in repr(table)
+    assert "the bench, 20" in table._repr_html_()
+    assert "from" not in repr(lesson_budget())  # all of one source
+    assert (handed.source, handed.name) == ("live", "D435 on the bench")
+    (folders[0] / "03_intrinsics.json").unlink()
+    mixed = hand_over(folders[1])
+    assert (mixed.source, mixed.name) == ("reference", "D435 on the bench, Simulated D435, seed 7")
+
+
+def test_what_notebooks_2_and_4_keep_since(folders: tuple[Path, Path]) -> None:
+    """The law of the depth bias, the mount of the fixed camera and the touch test are used."""
+    write(YOURS)
+    depth, mounts = results.load("02_depth_noise").quantities, results.load("04_hand_eye")
+    law = {"depth_scale_error": Quantity(-0.008, "1"), "disparity_offset": Quantity(-0.2, "px")}
+    C = np.array([[4e-6, 3e-5], [3e-5, 9e-4]])
+    results.save("02_depth_noise", YOURS, depth | law, {"depth_bias": Covariance(tuple(law), C)})
+    sigmas = np.repeat([math.radians(0.1), 1.5e-3], 3)
+    above = results.Placement("base_link", "x", "eye_to_hand", np.eye(4), np.diag(sigmas**2))
+    touched = mounts.quantities | {"touch_mm": Quantity(3.0, "mm")}
+    results.save("04_hand_eye", YOURS, touched, eye_to_hand=above)
+    handed = hand_over(folders[1])
+    assert handed.budget()["depth bias"].mean == (-0.008, -0.2)
+    for Z in (0.45, 1.2):
+        budget = handed.budget().at(distance_m=Z)
+        at = {row.term.name: row.high_m for row in budget.rows}
+        by = np.array([Z, -(Z**2) / (430 * budget.view.baseline_m)])
+        middle, sigma = abs(by @ [-0.008, -0.2]), math.sqrt(by @ C @ by)
+        assert at["depth bias"] == pytest.approx(middle + 2 * sigma)
+        assert at["hand-eye rotation"] == pytest.approx(2 * math.radians(0.1) * Z)
+        assert at["hand-eye translation"] == pytest.approx(2 * 1.5e-3)
+        assert at["forward kinematics"] == pytest.approx(2 * 3e-3 / math.sqrt(3))
+    assert "eye to hand" in handed.budget()["hand-eye rotation"].source
+    assert "touch test" in handed.budget()["forward kinematics"].source
+    wrist = handed.wrist_budget()["hand-eye rotation"].high
+    assert wrist == pytest.approx(2 * math.radians(math.sqrt((0.05**2 + 0.06**2 + 0.07**2) / 3)))
 
 
 def test_what_notebook_1_and_2_may_have_kept_is_used(folders: tuple[Path, Path]) -> None:

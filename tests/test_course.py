@@ -304,15 +304,15 @@ def stand_in(folder: Path, name: str, status: int) -> None:
 def test_old_python_is_told_a_command_that_works(course, tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     typed = ["course.py", "lab", "--port=9000"]
-    alone = course.too_old((3, 9, 18), typed)
-    assert alone.startswith("This is Python 3.9, and the course needs 3.11 or newer. Install")
+    alone = course.unfit((3, 9, 18), typed)
+    assert alone.startswith("This is Python 3.9, and the course needs 3.11, 3.12, 3.13 or 3.14. In")
     stand_in(tmp_path, "uv", 0)
-    with_uv = course.too_old((3, 9, 18), typed)
+    with_uv = course.unfit((3, 9, 18), typed)
     assert "\n    uv run --no-project --python 3.12 course.py lab --port=9000\n" in with_uv
     stand_in(tmp_path, "python3.12", 127)  # like a shim of pyenv with nothing behind it
     stand_in(tmp_path, "python3.13", 0)
-    newer = course.too_old((3, 10, 1), typed)
-    assert newer.startswith("This is Python 3.10,")
+    newer = course.unfit((3, 15, 1), typed)
+    assert newer.startswith("This is Python 3.15,")
     assert "\n    python3.13 course.py lab --port=9000\n" in newer
 
 
@@ -324,7 +324,7 @@ def test_old_python_gets_that_far_and_no_further() -> None:
         [sys.executable, "-c", program], input=source, capture_output=True, text=True, check=False
     )
     assert old.returncode == 1
-    assert old.stderr.startswith("This is Python 3.9, and the course needs 3.11 or newer.")
+    assert old.stderr.startswith("This is Python 3.9, and the course needs 3.11,")
 
 
 def test_missing_ensurepip_names_the_package(course, monkeypatch) -> None:

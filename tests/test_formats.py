@@ -938,7 +938,8 @@ def kept(tmp_path, monkeypatch, result):
     placed = results.Placement(
         "ee_gripper_link", results.OPTICAL, "eye_in_hand", result.X, result.covariance[:6, :6]
     )
-    results.save("04_hand_eye", camera, {}, placement=placed)
+    above = results.Placement("base_link", results.OPTICAL, "eye_to_hand", result.X)
+    results.save("04_hand_eye", camera, {}, placement=placed, eye_to_hand=above)
     return tmp_path / "results"
 
 
@@ -949,6 +950,7 @@ def test_results_carry_all_that_a_robot_needs(kept, result) -> None:
     placed = results.load("04_hand_eye").placement
     assert np.array_equal(placed.T, result.X)
     assert np.array_equal(placed.covariance, result.covariance[:6, :6])
+    assert results.load("04_hand_eye").eye_to_hand.mount == "eye_to_hand"
     assert Intrinsics.from_file(kept / "03_intrinsics.json") == LENS
     assert ck.export("03_intrinsics", "ros").text == ck.export(LENS, "ros").text
     assert ck.export("04_hand_eye", "urdf").text == ck.export(result, "urdf").text
@@ -957,7 +959,11 @@ def test_results_carry_all_that_a_robot_needs(kept, result) -> None:
 def test_results_of_before_are_read_and_say_what_they_lack(kept) -> None:
     for lesson, message in (("03_intrinsics", "no lens"), ("04_hand_eye", "no place")):
         old = json.loads((kept / f"{lesson}.json").read_text("utf-8"))
-        old = {key: old[key] for key in old if key not in ("lens", "placement", "serial")}
+        old = {
+            key: old[key]
+            for key in old
+            if key not in ("lens", "placement", "eye_to_hand", "serial")
+        }
         results.write_json(kept / f"{lesson}.json", old | {"format": 1})
         assert results.load(lesson).camera == "D435"
         with pytest.raises(ValueError, match=f"{lesson}.json.*{message}.*run the notebook again"):

@@ -79,6 +79,43 @@ def test_the_grid_fixes_the_rotation_and_leaves_the_translation_free() -> None:
     assert min(off_mm) > 50
 
 
+def test_one_axis_leaves_the_slide_along_it_and_a_turn_in_the_first_half() -> None:
+    session, truth = hand_eye_session(
+        "eye_in_hand", 7, mistakes=HandEyeMistakes(design="single_axis")
+    )
+    A, _ = ck.hand_eye.motions(session.T_base_gripper, session.T_camera_board, "eye_in_hand")
+    _, sizes, directions = np.linalg.svd(
+        (A[:, :3, :3] - np.eye(3)).reshape(-1, 3), full_matrices=False
+    )
+    assert sizes[2] < 0.05
+    assert sizes[1] > 5
+    for method, least_deg, most_deg in (("park", 5, 30), ("daniilidis", 0, 0.2)):
+        off = ck.geometry.pose_difference(truth.X, session.solve(method).X)
+        assert least_deg < np.degrees(np.linalg.norm(off[:3])) < most_deg
+        assert abs(off[3:] @ directions[2]) > 0.95 * np.linalg.norm(off[3:]) > 0.05
+    with pytest.raises(ck.hand_eye.NotDetermined, match="all poses turn about one axis"):
+        session.solve()
+    guess = session.solve(guess=ck.arm.widowx().T_gripper_camera)
+    best = ck.hand_eye.next_pose(guess)
+    assert best.now_mm > 50
+    assert best.then_mm[best.index] < 1
+
+
+def test_three_sessions_are_told_by_what_they_show() -> None:
+    """The evidence of notebook 04, with other arms than the one on its page."""
+    for name, session in ck.simulation.unknown_sessions(23).items():
+        A, B = ck.hand_eye.motions(session.T_base_gripper, session.T_camera_board, "eye_in_hand")
+        a, b = (Rotation.from_matrix(T[:, :3, :3]).as_rotvec() for T in (A, B))
+        along = [
+            np.sum(r * T[:, :3, 3], axis=1) / np.linalg.norm(r, axis=1) for r, T in ((a, A), (b, B))
+        ]
+        assert np.linalg.norm(a, axis=1) == pytest.approx(np.linalg.norm(b, axis=1), abs=0.02)
+        slope = along[0] @ along[1] / (along[0] @ along[0])
+        assert slope == pytest.approx(1 / 1.05 if name == "P" else 1.0, abs=0.01)
+        spread = session.solve().spread_board_mm
+        assert spread > 50 if name == "Q" else spread < 6
+
+
 def test_the_lever_is_what_a_rotation_does() -> None:
     turned = Rotation.from_euler("y", 0.3, degrees=True).apply([0, 0, 0.4])
     assert CHECKPOINTS["hand_eye.lever"].value == pytest.approx(

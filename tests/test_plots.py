@@ -24,6 +24,7 @@ from coursekit.simulation import (
     default_setup,
     hand_eye_session,
     tabletop,
+    unknown_sessions,
 )
 
 D435 = specifications.device("D435").unit
@@ -332,7 +333,8 @@ def hand_eye_figures() -> dict[str, plots.LessonFigure]:
         "diversity": hand_eye.diversity({"this session": session.T_base_gripper}),
         "study": hand_eye.study(error_study(trials=5)),
         "more_poses": hand_eye.more_poses(counts, {"a": [3.0, 2.9]}, {"a": [1.0, 0.7]}),
-        "gaps": hand_eye.gaps([1.0, 2.0], [2.0]),
+        "agreement": hand_eye.agreement(unknown_sessions(11)),
+        "gaps": hand_eye.gaps([1.0, 2.0, 2.0], [False, False, True]),
         "touched": hand_eye.touched([[1.0, -1.0, 0.5], [2.0, 0.0, 0.1]]),
     }
 
@@ -341,8 +343,30 @@ def test_the_rig_is_drawn_where_forward_kinematics_puts_it(figures) -> None:
     q = np.array([0.0, 0.7, 1.3, 0.7, 0.0, 0.0])
     rig = default_setup("eye_in_hand")
     chain = figures["mounts"].axes[0].lines[0]
-    x, z = chain.get_xdata()[-1], chain.get_ydata()[-1]
-    assert (x, z) == pytest.approx(tuple(rig.arm.forward(q)[[0, 2], 3]))
+    end = [places[-1] for places in chain.get_data_3d()]
+    assert end == pytest.approx(list(rig.arm.forward(q)[:3, 3]))
+
+
+def test_the_letters_of_the_arrows_lie_on_nothing() -> None:
+    """From wherever one looks: no letter is nearer to a line, an arrow or a letter than it says."""
+    rigs = {mount: default_setup(mount) for mount in ("eye_in_hand", "eye_to_hand")}
+    joints = dict(
+        zip(rigs, [(0, 1.1, 1.6, -1.2, 0, 0), (0, 0.86, 0.31, 0.73, 0, 1.57)], strict=True)
+    )
+    for view_from_deg in (-150.0, -65.0, -20.0):
+        for ax in hand_eye.mounts(rigs, joints, view_from_deg).axes:
+            letters = {t.get_text(): np.array(t.xy) for t in ax.texts if t.get_text()}
+            assert set(letters) == {"T", "X", "C"}
+            away = [
+                np.hypot(*(ax.transData.transform(page) - place).T).min()
+                for place in letters.values()
+                for line in ax.lines
+                for x, y, _, w in [
+                    ax.get_proj() @ [*line.get_data_3d(), np.ones_like(line.get_data_3d()[0])]
+                ]
+                for page in [np.column_stack([x / w, y / w])]
+            ]
+            assert min(away) > hand_eye.CLEAR_PX
 
 
 def test_gaps_say_their_root_mean_squares(figures) -> None:
@@ -363,7 +387,6 @@ def error_budget_figures() -> dict[str, plots.LessonFigure]:
         "between_fingers": error_budget.between_fingers(
             budget.LESSON_GRIPPER, budget.CUBE, table.noise_covariance, (1.0, 2.0, 0.5), others
         ),
-        "distances": error_budget.distances(budget.best_distance(table)),
         "misses": error_budget.misses(missed),
     }
 

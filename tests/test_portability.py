@@ -514,15 +514,11 @@ class TestStart:
         said = self.variables(tmp_path, CPU_LIMIT=limit)
         assert {said[f"{name}_NUM_THREADS"] for name in ("NUMBA", "OMP", "OPENBLAS")} == {threads}
 
-    def test_notebooks_come_home_once(self, tmp_path: Path) -> None:
+    def test_copies_come_home_once(self, tmp_path: Path) -> None:
         self.start(tmp_path, "true")
-        there = tmp_path / "notebooks"
+        there = tmp_path / "notebooks" / "my"
         names = sorted(path.name for path in (ROOT / "notebooks").glob("[0-9]*.ipynb"))
         assert sorted(path.name for path in there.iterdir()) == names
         (there / names[0]).write_text("my answers", encoding="utf-8")
-        self.start(tmp_path, "true")
+        assert f"{names[0]}. They stay as they are" in self.start(tmp_path, "true")
         assert (there / names[0]).read_text(encoding="utf-8") == "my answers"
-
-    def test_where_the_project_is_the_home_folder_nothing_is_copied(self, tmp_path: Path) -> None:
-        self.start(tmp_path, "true", REPO_DIR=str(tmp_path))
-        assert list(tmp_path.iterdir()) == []

@@ -288,13 +288,15 @@ def test_every_checkpoint_keeps_its_explanation_closed(pages):
 @pytest.mark.parametrize(
     ("output", "html"),
     [
-        ({"data": {"text/plain": "  0%|          | 0/26 [00:00<?, ?image/s]"}}, ""),
+        ({"data": {"text/plain": ""}}, ""),
+        ({"data": {"text/html": ""}}, ""),
+        ({"data": {"text/html": '<details class="alt"><summary>The figure in words'}}, ""),
         ({"data": {"text/plain": "a < b"}}, '<pre class="output">a &lt; b</pre>\n'),
         ({"text": ["a", " & b\n"]}, '<pre class="output">a &amp; b</pre>\n'),
         ({"data": {"text/html": "<b>x</b>", "text/plain": "x"}}, "<b>x</b>"),
     ],
 )
-def test_a_progress_bar_is_left_out_and_text_is_escaped(output, html):
+def test_what_is_empty_is_left_out_and_text_is_escaped(output, html):
     said = build_site.output_html(a_page(), {}, {"output_type": "display_data", **output})
     assert html in said
     assert bool(html) == bool(said)

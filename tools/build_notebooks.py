@@ -132,7 +132,8 @@ def _executed(path: Path) -> Any:
 def execute_copy(path: Path, into: Path) -> int:
     """Execute a notebook where it is and store it in another folder; returns its code cells."""
     notebook = _load(path)
-    execute(notebook, path.stem, path.parent, os.environ)
+    own = {"COURSEKIT_RESULTS": str(into.resolve() / "results")}  # never the student's
+    execute(notebook, path.stem, path.parent, {**os.environ, **own})
     into.mkdir(parents=True, exist_ok=True)
     _store(into / path.name, notebook)
     return len(code_cells(notebook))

@@ -39,7 +39,6 @@ FORMATS = ROOT / "data" / "formats.md"
 
 WIDE_PX = 600  # a figure wider than this scrolls by itself on a phone, rather than shrink
 IN_WORDS = '<details class="alt">'
-PROGRESS_BAR = re.compile(r"\s*\d+%\|")
 MINUTES = re.compile(r"Core: about (\d+) minutes")
 OBJECTIVES = re.compile(r"^\*\*Afterwards you can\*\*\n+(.+?)\s*\Z", re.MULTILINE | re.DOTALL)
 PLAIN = '<div class="highlight"><pre>{}</pre></div>\n'
@@ -211,7 +210,7 @@ def output_html(page: Page, cell: Cell, output: dict[str, Any]) -> str:
         return f'<div class="output">{html}</div>\n'
     if "image/png" in data:
         return _figure(page, cell, output)
-    if not text or PROGRESS_BAR.match(text):
+    if not text:
         return ""
     return f'<pre class="output">{escape(text.rstrip())}</pre>\n'
 

@@ -18,18 +18,17 @@ import nbformat
 import numpy as np
 
 import coursekit as ck
-from coursekit.arm import ArmErrors
 from coursekit.boards import Board
 from coursekit.boards.board import seen
 from coursekit.boards.detector import SESSION
 from coursekit.budget.handover import REFERENCE
 from coursekit.cameras.capture import session_card
 from coursekit.cameras.simulated import SimulatedCamera
-from coursekit.hand_eye.poses import Mount
+from coursekit.hand_eye.poses import MOUNTS
 from coursekit.intrinsics import diagnose
 from coursekit.intrinsics.diagnosis import POWER_FILE
 from coursekit.results import Quantity, write_bytes, write_json
-from coursekit.simulation.arm_sessions import SIMULATED, rendered_session
+from coursekit.simulation.arm_sessions import session_folder
 from coursekit.simulation.corner_sessions import Effects, corner_session, view_poses
 from coursekit.specifications import DATA
 from coursekit.submission.format import Conclusion, Stack, Submission, bundle_bytes
@@ -46,15 +45,7 @@ ORIGIN = (
     "seed looks at the board from random places, as a hand would hold it. No real camera took it."
 )
 
-# The seed, which names the arm too (one arm carries both), and whose lens.
-HAND_EYE: dict[Mount, tuple[int, str]] = {"eye_in_hand": (1, "D405"), "eye_to_hand": (1, "D435")}
-HAND_EYE_VIEWS = 20
-HAND_EYE_ORIGIN = (
-    "Rendered by tools/make_data.py: a WidowX AI with hidden errors, its seed as given, stops at "
-    "each pose; the lens is this device's colour camera, and the intrinsics given are the true "
-    "ones. The table behind a board in the gripper goes along with it. No real arm or camera took "
-    "it. Where the camera really is, coursekit.simulation.arm_sessions.truth_of tells."
-)
+HAND_EYE_SEED = 1  # names the arm too: one arm carries both cameras
 
 
 def readme_picture() -> None:
@@ -149,22 +140,10 @@ def times_named(cause: str, size: float, seeds: Sequence[int] = POWER_SEEDS) -> 
 
 def hand_eye_sessions() -> None:
     """data/hand_eye_in_hand/, data/hand_eye_to_hand/: the sessions of notebook 04, without X."""
-    for mount, (seed, device) in HAND_EYE.items():
-        folder = DATA / f"hand_{mount}"
-        shutil.rmtree(folder, ignore_errors=True)
-        session, _, images = rendered_session(mount, seed, HAND_EYE_VIEWS, ArmErrors())
-        files = {
-            f"{name}.jpg": _jpeg(image, 92)
-            for name, image in zip(session.names, images, strict=True)
-        }
-        about = {
-            "camera": f"Simulated {device}",
-            "source": SIMULATED,
-            "seed": seed,
-            "views": HAND_EYE_VIEWS,
-            "origin": HAND_EYE_ORIGIN,
-        }
-        replace(session, names=tuple(files)).save(folder, files, about)
+    for mount in MOUNTS:
+        shutil.rmtree(DATA / f"hand_{mount}", ignore_errors=True)
+        made = session_folder(mount, HAND_EYE_SEED, DATA)
+        made.rename(DATA / f"hand_{mount}")
 
 
 SAMPLES = DATA / "sample_bundles"

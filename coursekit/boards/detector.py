@@ -25,6 +25,7 @@ from coursekit.boards.corners import blur_covariance, refine_corners, steps
 from coursekit.boards.explain import BLANK_GREY, blank, explain
 from coursekit.boards.find import OFF_PLANE, find_corners, on_plane
 from coursekit.checks import want
+from coursekit.words import counting
 
 FEWEST_CORNERS = 6
 SMALLEST_IMAGE_PX = 40  # shorter side of an image in which a board can be told
@@ -171,19 +172,19 @@ def detect_all(
       image 0: 12 corners in 290x248, noise 0.115 px
       not used: image 1: the picture is blank: nearly all of it has grey levels from 0 to 0
     """
-    from tqdm.auto import tqdm
-
     sources = _sources(images)
-    quiet = not progress or len(sources) < 10
+    shown = progress and len(sources) >= 10
     views: list[Detection] = []
     skipped: list[Skipped] = []
     try:
-        for name, source in tqdm(sources, unit="image", leave=False, disable=quiet):
-            try:
-                views.append(detect(_read(source), board, name))
-            except BoardNotFound as reason:
-                kind = "other_board" if isinstance(reason, OtherBoard) else ""
-                skipped.append(Skipped(name, str(reason), kind))
+        with counting(len(sources), "image", shown) as counts:
+            for name, source in sources:
+                try:
+                    views.append(detect(_read(source), board, name))
+                except BoardNotFound as reason:
+                    kind = "other_board" if isinstance(reason, OtherBoard) else ""
+                    skipped.append(Skipped(name, str(reason), kind))
+                counts()
     except KeyboardInterrupt:
         done = len(views) + len(skipped)
         print(f"Stopped after {done} of {len(sources)} images; they are kept.")

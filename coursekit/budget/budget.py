@@ -6,7 +6,8 @@ moves the object in the base: dp = M n, M (3, k). What is known of the component
 - noise: each component has standard deviation `high`, independent of the others; it averages down
   and adds in quadrature.
 - bias: the components are m n, with a length m between `low` and `high` and an unknown direction n
-  (an unknown sign where k = 1); it repeats, so averaging does nothing to it.
+  (an unknown sign where k = 1), about their `mean` where that was measured; it repeats, so
+  averaging does nothing to it.
 
 How biases add is a question of what is asked:
 
@@ -14,7 +15,7 @@ How biases add is a question of what is asked:
 - quadrature: how far off is it typically, if their directions have nothing to do with each other?
 - Monte Carlo: how often is it off by more than a tolerance, if sizes and directions are drawn?
 
-First the terms, then their table and its sums, then two tables side by side.
+First the terms, then their table and its sums.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from coursekit.results import ErrorKind
 from coursekit.stereo.law import depth_slope
 from coursekit.words import html_list, html_table, wrapped
 
-Along = Literal["image", "ray", "scale", "disparity", "turn", "shift", "intrinsics"]
+Along = Literal["image", "ray", "disparity", "depth", "turn", "shift", "intrinsics"]
 Directions = Literal["own", "isotropic"]
 MOST_ALIKE = 0.9999  # two frames; beyond it an autocorrelation says nothing more
 SIGMAS = 2.0  # a bias known by its standard deviation is taken to reach so many of them
@@ -70,25 +71,32 @@ def _disparity(view: View) -> Floats:
     return float(depth_slope(view.distance_m, view.intrinsics.fx, view.baseline_m)) * _ray(view)
 
 
+def _depth(view: View) -> Floats:
+    return np.hstack([view.distance_m * _ray(view), _disparity(view)])
+
+
 @dataclass(frozen=True)
 class _Conversion:
-    """How a kind of term reaches the object: unit and factor of its magnitude for people, in
-    words, and M (3, k) from a view."""
+    """How a kind of term reaches the object: unit and factor of each component for people, in
+    words (`per`: mm at the object for one such unit), and M (3, k) from a view."""
 
-    shown: tuple[str, float]
+    shown: tuple[tuple[str, float], ...]
     words: str
     matrix: Callable[[View], Floats]
 
 
 _CONVERSIONS: dict[str, _Conversion] = {
-    "image": _Conversion(("px", 1.0), "times Z/f, across the view", _across),
-    "ray": _Conversion(("mm", 1e3), "along the ray, leaks sideways by tan", _ray),
-    "scale": _Conversion(("%", 1e2), "times Z along the ray", lambda v: v.distance_m * _ray(v)),
-    "disparity": _Conversion(("px", 1.0), "times Z²/(f B), along the ray", _disparity),
-    "turn": _Conversion(("deg", math.degrees(1.0)), "times the lever arm, across it", _turn),
-    "shift": _Conversion(("mm", 1e3), "direct", lambda _: np.eye(3)),
-    "intrinsics": _Conversion(("σ", 1.0), "through the derivatives by K and lens", _by_K),
+    "image": _Conversion((("px", 1.0),), "Z/f: {per:.2f} mm/px", _across),
+    "ray": _Conversion((("mm", 1e3),), "along the ray", _ray),
+    "disparity": _Conversion((("px", 1.0),), "Z²/(fB): {per:.1f} mm/px", _disparity),
+    "depth": _Conversion((("%", 1e2), ("px", 1.0)), "sZ - oZ²/(fB)", _depth),
+    "turn": _Conversion(
+        (("deg", math.degrees(1.0)),), "lever {lever:.2f} m: {per:.1f} mm/deg", _turn
+    ),
+    "shift": _Conversion((("mm", 1e3),), "direct", lambda _: np.eye(3)),
+    "intrinsics": _Conversion((("σ", 1.0),), "by K and lens", _by_K),
 }
+FACTORED = ("depth", "intrinsics")  # their components have different units
 
 
 @dataclass(frozen=True)
@@ -96,13 +104,14 @@ class ErrorTerm:
     """One row of a budget.
 
     kind: "bias" or "noise". low, high: the range of its magnitude, in the unit of `along` (px, m,
-    rad, or 1 for "scale" and "intrinsics"); a noise has one standard deviation, low = high.
-    along: "image" (px of the detection), "ray" (m of depth), "scale" (relative depth), "disparity"
-    (px), "turn" (rad of the camera about its own centre), "shift" (m, any direction), "intrinsics"
-    (in sigmas; needs a `factor` of nine rows: fx, fy, cx, cy, k1, k2, p1, p2, k3). source: whose
-    number this is.
+    rad, or sigmas for "depth" and "intrinsics"); a noise has one standard deviation, low = high.
+    along: "image" (px of the detection), "ray" (m of depth), "disparity" (px), "depth" (the law
+    s Z - o Z²/(f B); needs a `factor` of two rows: s, and o in px), "turn" (rad of the camera about
+    its own centre), "shift" (m, any direction), "intrinsics" (needs a `factor` of nine rows: fx,
+    fy, cx, cy, k1, k2, p1, p2, k3). source: whose number this is.
     normal: a bias known by its standard deviation, high / 2 for each component.
     factor (k, k'): a square root of the components' covariance; the magnitude then counts sigmas.
+    mean (k): what a normal bias was measured to be; the magnitude says how well that is known.
     stated_m: (low, high) at the object as somebody else has converted it; used instead of the
     conversion, with any direction. floor: the part of a noise that repeats, in the same unit.
     Raises ValueError for a kind or direction that is not known, and for a range that is none.
@@ -119,6 +128,7 @@ class ErrorTerm:
     source: str
     normal: bool = False
     factor: tuple[tuple[float, ...], ...] | None = None
+    mean: tuple[float, ...] | None = None
     stated_m: Interval | None = None
     floor: float = 0.0
 
@@ -132,20 +142,29 @@ class ErrorTerm:
         want(one_sigma, "low", self.low, f"one standard deviation, {self.high}")
         most = math.inf if self.kind == "noise" else 0.0
         checks.number("floor", self.floor, "0 or more, and 0 for a bias", least=0.0, most=most)
-        rooted = self.along != "intrinsics" or self.factor is not None
-        want(rooted, "factor", self.factor, "a square root of the covariance of K")
+        rooted = self.along not in FACTORED or self.factor is not None
+        want(rooted, "factor", self.factor, "a square root of the components' covariance")
+        want(self.mean is None or self.normal, "mean", self.mean, "None, or normal=True")
 
-    @property
-    def conversion(self) -> str:
-        """In words, how the magnitude reaches the object."""
-        return _CONVERSIONS[self.along].words
+    def conversion(self, view: View) -> str:
+        """In words, how the magnitude reaches the object, such as "Z/f: 1.01 mm/px"."""
+        how = _CONVERSIONS[self.along]
+        per = 1e3 / how.shown[0][1] * float(np.linalg.norm(how.matrix(view), 2))
+        return how.words.format(per=per, lever=np.linalg.norm(view.lever_base))
 
     @property
     def magnitude(self) -> str:
-        """The range of the magnitude for people, such as "2 to 5 mm"."""
-        unit, factor = _CONVERSIONS[self.along].shown
+        """The range of the magnitude for people, such as "2 to 5 mm"; the mean where there is one.
+
+        A factor's magnitude counts sigmas.
+        """
+        shown = _CONVERSIONS[self.along].shown
+        if self.mean is not None:
+            pairs = zip(shown, self.mean, strict=True)
+            return ", ".join(f"{factor * value:+.2g} {unit}" for (unit, factor), value in pairs)
+        unit, factor = ("σ", 1.0) if self.factor else shown[0]
         low, high = (f"{factor * value:.2g}" for value in (self.low, self.high))
-        repeats = f", {factor * self.floor:.2g} repeats" if self.floor else ""
+        repeats = f", {factor * self.floor:.2g} stays" if self.floor else ""
         return f"{high} {unit}{repeats}" if low == high else f"{low} to {high} {unit}"
 
     @property
@@ -162,6 +181,22 @@ class ErrorTerm:
             return matrix
         return np.asarray(matrix @ checks.array("factor", self.factor, (matrix.shape[1], None)))
 
+    def middle_m(self, view: View) -> Floats:
+        """Where the mean moves the object, base axes, (3,), m; zero where there is none."""
+        if self.mean is None:
+            return np.zeros(3)
+        matrix = _CONVERSIONS[self.along].matrix(view)
+        return np.asarray(matrix @ checks.array("mean", self.mean, (matrix.shape[1],)))
+
+    def ends_m(self, view: View, matrix: Floats, direction: Floats) -> Interval:
+        """(low, high) of a bias's part along a direction (3,), each with its greatest effect there.
+
+        matrix: that of this view, known already.
+        """
+        gain, middle = float(np.linalg.norm(direction @ matrix)), direction @ self.middle_m(view)
+        (low, high), off = self.range, abs(float(middle))
+        return max(low * gain, off - high * gain), off + high * gain
+
     def at_object_m(self, view: View) -> Interval:
         """(low, high) of the length of the displacement at the object, m.
 
@@ -171,18 +206,20 @@ class ErrorTerm:
         direction in which it is largest.
         """
         gains = np.linalg.svd(self.matrix(view), compute_uv=False)
-        low, high = self.range
+        (low, high), middle = self.range, float(np.linalg.norm(self.middle_m(view)))
         if self.kind == "noise":
             single = math.hypot(high, self.floor) * float(gains[0])
             return single, single
-        return low * float(gains[-1]), high * float(gains[0])
+        most = high * float(gains[0])
+        return max(low * float(gains[-1]), middle - most), middle + most
 
     def scaled(self, factor: float) -> ErrorTerm:
         """The same row with `factor` times the magnitude."""
         checks.number("factor", factor, "0 or more", least=0.0)
         stated = self.stated_m and (factor * self.stated_m[0], factor * self.stated_m[1])
         low, high, floor = (factor * value for value in (self.low, self.high, self.floor))
-        return replace(self, low=low, high=high, stated_m=stated, floor=floor)
+        mean = self.mean and tuple(factor * value for value in self.mean)
+        return replace(self, low=low, high=high, stated_m=stated, floor=floor, mean=mean)
 
 
 def independent_frames(frames: int, autocorrelation: float = 0.0) -> float:
@@ -353,8 +390,9 @@ class ErrorBudget:
         """Each term at the object, of single frames."""
         axes, found = self.grasp.directions, []
         for term, matrix in zip(self.terms, self._matrices, strict=True):
-            along = term.range[1] * np.linalg.norm(axes @ matrix, axis=1)
-            found.append(Row(term, *term.at_object_m(self.view), tuple(along.tolist())))
+            closing, approach, lateral = (term.ends_m(self.view, matrix, a)[1] for a in axes)
+            ends = term.at_object_m(self.view)
+            found.append(Row(term, *ends, (closing, approach, lateral)))
         return tuple(found)
 
     @property
@@ -398,11 +436,8 @@ class ErrorBudget:
         """Along "closing", "approach" or "lateral": each term with its greatest effect there."""
         i = axis_index(axis)
         direction = self.grasp.directions[i]
-        lows, highs = [], []
-        for term, matrix in self._of("bias"):
-            gain = float(np.linalg.norm(direction @ matrix))
-            lows.append(term.range[0] * gain)
-            highs.append(term.range[1] * gain)
+        ends = [term.ends_m(self.view, matrix, direction) for term, matrix in self._of("bias")]
+        lows, highs = [low for low, _ in ends], [high for _, high in ends]
         noise = float(np.sqrt(direction @ self.noise_covariance @ direction))
         worst, quadrature = (sum(lows), sum(highs)), (math.hypot(*lows), math.hypot(*highs))
         return AxisBudget(axis, self.grasp.tolerance_m[i], noise, worst, quadrature)
@@ -453,11 +488,11 @@ class ErrorBudget:
         low, high = term.range if own else term.at_object_m(self.view)
         if term.kind == "noise":
             drawn *= self._sigma(term)
-        elif term.normal:
+        elif term.normal and (own or term.mean is None):
             drawn *= high / SIGMAS
         else:
             drawn *= rng.uniform(low, high, n) / np.linalg.norm(drawn, axis=0)
-        return np.asarray(matrix @ drawn) if own else drawn
+        return np.asarray(matrix @ drawn + term.middle_m(self.view)[:, None]) if own else drawn
 
     @cached_property
     def _matrices(self) -> tuple[Floats, ...]:
@@ -480,13 +515,24 @@ class ErrorBudget:
     # for people
 
     def table(self) -> tuple[Sequence[str], list[Sequence[str]]]:
-        """Heading and one line of text a term."""
-        head = ("error", "kind", "magnitude", "conversion", "at the object", "whose number")
+        """Heading and one line of text a term; along closing: the most that it does there."""
+        head = ("error", "kind", "magnitude", "conversion", "at the object", "closing")
         lines: list[Sequence[str]] = []
         for row in self.rows:
             term, at = row.term, span(row.low_m, row.high_m)
-            lines.append((term.name, term.kind, term.magnitude, term.conversion, at, term.source))
-        return head, lines
+            closing = "" if self._stated else f"{1e3 * row.along_m[0]:.1f} mm"
+            lines.append(
+                (term.name, term.kind, term.magnitude, term.conversion(self.view), at, closing)
+            )
+        return (head[:-1], [line[:-1] for line in lines]) if self._stated else (head, lines)
+
+    def sources(self) -> list[str]:
+        """Whose numbers the rows are, a line for each source; none where all are from one."""
+        rows: dict[str, list[str]] = {}
+        for term in self.terms:
+            rows.setdefault(term.source, []).append(term.name)
+        lines = [f"from {source}: {', '.join(names)}" for source, names in rows.items()]
+        return lines if len(lines) > 1 else []
 
     def summary(self) -> list[str]:
         """The sums, a line each, with the question each answers."""
@@ -495,8 +541,8 @@ class ErrorBudget:
         sums = {"worst case": self.worst_case_m, "quadrature": self.quadrature_m}
         for name, ends in sums.items():
             text.append(f"bias, {name}: {span(*ends)} ({QUESTIONS[name]})")
-        if all(term.stated_m is not None for term in self.terms):
-            return text  # lengths alone know no direction
+        if self._stated:
+            return text
         for axis in AXES:
             a = self.along(axis)
             text.append(
@@ -513,13 +559,19 @@ class ErrorBudget:
             f"f = {view.intrinsics.fx:.0f} px, baseline {1e3 * view.baseline_m:.0f} mm"
         )
 
+    @property
+    def _stated(self) -> bool:
+        """Whether all rows are stated at the object: lengths alone, which know no direction."""
+        return all(term.stated_m is not None for term in self.terms)
+
     def __repr__(self) -> str:
-        head, *lines = ([*cells[:3], cells[4]] for cells in (self.table()[0], *self.table()[1]))
-        return "\n".join([self._heading(), words.table(head, lines), *self.summary()])
+        whose = (wrapped(line, 84) for line in self.sources())
+        table = words.table(*self.table())
+        return "\n".join([self._heading(), table, *self.summary(), *whose])
 
     def _repr_html_(self) -> str:
-        heading = html.escape(self._heading())
-        return f"<p><b>{heading}</b></p>{html_table(*self.table())}{html_list(self.summary())}"
+        heading, sums = html.escape(self._heading()), [*self.summary(), *self.sources()]
+        return f"<p><b>{heading}</b></p>{html_table(*self.table())}{html_list(sums)}"
 
 
 def axis_index(axis: str) -> int:
@@ -531,66 +583,3 @@ def span(low_m: float, high_m: float, digits: int = 1) -> str:
     """A range of lengths for people, such as "2.0 to 6.0 mm"."""
     low, high = f"{1e3 * low_m:.{digits}f}", f"{1e3 * high_m:.{digits}f}"
     return f"{high} mm" if low == high else f"{low} to {high} mm"
-
-
-# --- two tables side by side ---
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Beside:
-    """The lesson's budget, or any other, beside the student's own."""
-
-    theirs: ErrorBudget
-    yours: ErrorBudget
-
-    def lines(self) -> list[tuple[str, ...]]:
-        """Name, kind, theirs and yours of every row, in their order; then the sums."""
-        budgets = (self.theirs, self.yours)
-        tables = [{row.term.name: row for row in budget.rows} for budget in budgets]
-        lines: list[tuple[str, ...]] = []
-        for name in dict.fromkeys(name for table in tables for name in table):
-            rows = [table.get(name) for table in tables]
-            kind = next(row.term.kind for row in rows if row)
-            lines.append((name, kind, *(_cell(row) for row in rows)))
-        closing = [budget.along("closing").worst_case_m for budget in budgets]
-        return [
-            *lines,
-            ("sum, quadrature", "noise", *(span(b.noise_m, b.noise_m, 2) for b in budgets)),
-            ("sum, quadrature", "bias", *(span(*b.quadrature_m) for b in budgets)),
-            ("sum, worst case", "bias", *(span(*b.worst_case_m) for b in budgets)),
-            ("worst along closing", "bias", *(span(*ends) for ends in closing)),
-        ]
-
-    @property
-    def heading(self) -> tuple[str, ...]:
-        """Of the columns."""
-        return ("error", "kind", self.theirs.title, self.yours.title)
-
-    def sources(self) -> list[str]:
-        """Whose numbers your rows use, a line for each source."""
-        rows: dict[str, list[str]] = {}
-        for term in self.yours.terms:
-            rows.setdefault(term.source, []).append(term.name)
-        return [
-            wrapped(f"  {', '.join(names)}: {source}", 84, indent="    ")
-            for source, names in rows.items()
-        ]
-
-    def __repr__(self) -> str:
-        whose = "Whose numbers the right-hand column uses:"
-        return "\n".join([words.table(self.heading, self.lines()), whose, *self.sources()])
-
-    def _repr_html_(self) -> str:
-        whose = "<p>Whose numbers the right-hand column uses:</p>"
-        return f"{html_table(self.heading, self.lines())}{whose}{html_list(self.sources())}"
-
-
-def beside(theirs: ErrorBudget, yours: ErrorBudget) -> Beside:
-    """Two budgets row by row: the magnitude, and what it makes at the object."""
-    return Beside(theirs, yours)
-
-
-def _cell(row: Row | None) -> str:
-    if row is None:
-        return "-"
-    return f"{row.term.magnitude}: {span(row.low_m, row.high_m)}".replace(" to ", "–")

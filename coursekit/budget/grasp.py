@@ -1,23 +1,22 @@
-"""Does the grasp succeed, what to fix first, and how far away to mount the camera."""
+"""Does the grasp succeed, and what to fix first."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from coursekit import checks
-from coursekit.arrays import Floats
 from coursekit.budget.budget import ErrorBudget
 from coursekit.budget.view import AXES
 from coursekit.checks import want
 from coursekit.results import ErrorKind
 
 DRAWS = 20_000  # of a probability that is redrawn while dragging: a standard error of 0.4 % at most
-DISTANCES = 200
 FEW_DRAWS = 10  # a gain of so many draws says nothing about which row is first
+BY_GRASPS = "what it gains, in the order of grasps:"
+BY_ROOM = "what it gains, in the order of room along closing, because no row gains grasps:"
 WIDTH_WANTED = "a positive length of at most 1 m: 60 mm is 0.060"  # more was meant in millimetres
 
 
@@ -135,15 +134,37 @@ class Gain:
     noise_m: float
     success: float
 
-    def __str__(self) -> str:
+    @property
+    def room_m(self) -> float:
+        """Of the tolerance along closing, that is given back: the bias, and two sigmas of noise."""
+        return self.worst_case_m + 2 * self.noise_m
+
+    def line(self, grasps: bool = True) -> str:
+        """The gain in words; grasps: with what it gains in these."""
         action = "halve" if self.factor == 0.5 else f"{self.factor:g} times"
+        few = abs(self.success) < FEW_DRAWS / DRAWS
+        share = "<0.1" if few else f"{100 * self.success:+.1f}"
+        gained = f"{share:>5} % of grasps, " if grasps else ""
         return (
-            f"{action} {self.name + ':':<22} {100 * self.success:+.1f} % of grasps; "
-            f"{1e3 * self.worst_case_m:.1f} mm less bias, {1e3 * self.noise_m:.2f} mm less noise"
+            f"{action} {self.name + ':':<21} {gained}{1e3 * self.room_m:.1f} mm of room "
+            f"(bias {1e3 * self.worst_case_m:.1f} + 2 × noise {1e3 * self.noise_m:.2f})"
         )
 
+    def __str__(self) -> str:
+        return self.line()
 
-def sensitivity(budget: ErrorBudget, factor: float = 0.5) -> tuple[Gain, ...]:
+
+class Ranking(tuple[Gain, ...]):
+    """Gains, the largest first. by_room: all change the grasps alike, and room counts."""
+
+    by_room: bool
+
+    def __repr__(self) -> str:
+        order = BY_ROOM if self.by_room else BY_GRASPS
+        return "\n".join([order, *("  " + gain.line(not self.by_room) for gain in self)])
+
+
+def sensitivity(budget: ErrorBudget, factor: float = 0.5) -> Ranking:
     """ "Halve this, gain that": every term by itself, the one to fix first in front.
 
     factor: by which each magnitude is multiplied. The order is by grasps gained; where that is
@@ -164,98 +185,7 @@ def sensitivity(budget: ErrorBudget, factor: float = 0.5) -> tuple[Gain, ...]:
         bias, noise = at.worst_case_m[1] - along.worst_case_m[1], at.noise_m - along.noise_m
         gains.append(Gain(term.name, term.kind, factor, bias, noise, fewer.success() - before))
     chance = max(2 * math.sqrt(before * (1 - before) / DRAWS), FEW_DRAWS / DRAWS)
-    if max(abs(gain.success) for gain in gains) <= chance:
-        return tuple(sorted(gains, key=lambda g: -(g.worst_case_m + 2 * g.noise_m)))
-    return tuple(sorted(gains, key=lambda g: -g.success))
-
-
-@dataclass(frozen=True)
-class Mounting:
-    """What a camera's place must allow.
-
-    workspace_m: (width, height) that must be in the image at the object's distance. clearance_m:
-    the arm, or the hand under the camera, needs so much room. reach_m: the mount, or the arm that
-    carries the camera, goes no farther. minimum_range_m: nearer than that there is no depth; None:
-    what a search over 126 px of disparity gives.
-    """
-
-    workspace_m: tuple[float, float] = (0.30, 0.20)
-    clearance_m: float = 0.20
-    reach_m: float = 0.80
-    minimum_range_m: float | None = None
-
-    def __post_init__(self) -> None:
-        checks.positive("clearance_m", self.clearance_m, "a positive length, m")
-        checks.positive("reach_m", self.reach_m, "a positive length, m")
-        workspace = checks.array("workspace_m", self.workspace_m, (2,), finite=True)
-        want((workspace > 0).all(), "workspace_m", self.workspace_m, "(width, height), m")
-        if self.minimum_range_m is not None:
-            checks.positive("minimum_range_m", self.minimum_range_m, "a positive length, m")
-
-    def least_m(self, budget: ErrorBudget) -> dict[str, float]:
-        """The least distance that each constraint allows, by its name, m."""
-        camera = budget.view.intrinsics
-        width, height = self.workspace_m
-        seen = max(width * camera.fx / camera.width, height * camera.fy / camera.height)
-        shortest = self.minimum_range_m or budget.view.minimum_range_m
-        return {"field of view": seen, "minimum range": shortest, "clearance": self.clearance_m}
-
-
-@dataclass(frozen=True, eq=False)
-class BestDistance:
-    """Where to mount the camera.
-
-    distance_m, figure_m: the best, and what it gives. low_m, high_m: what is allowed. limit: the
-    constraint that keeps it from being better, "" where the best lies inside. distances_m,
-    figures_m (n,): the curve. allowed: the least distance of each constraint, m.
-    """
-
-    distance_m: float
-    figure_m: float
-    low_m: float
-    high_m: float
-    limit: str
-    distances_m: Floats
-    figures_m: Floats
-    allowed: dict[str, float]
-
-    def __repr__(self) -> str:
-        why = f", held by the {self.limit}" if self.limit else ""
-        return (
-            f"{self.distance_m:.2f} m ({1e3 * self.figure_m:.1f} mm along the closing axis)"
-            f"{why}; allowed are {self.low_m:.2f} to {self.high_m:.2f} m"
-        )
-
-
-def closing_figure_m(budget: ErrorBudget) -> float:
-    """Along the closing axis: biases in quadrature at their largest, and two sigmas of noise, m."""
-    along = budget.along("closing")
-    return along.quadrature_m[1] + 2 * along.noise_m
-
-
-def best_distance(
-    budget: ErrorBudget,
-    mounting: Mounting | None = None,
-    figure: Callable[[ErrorBudget], float] = closing_figure_m,
-) -> BestDistance:
-    """The distance with the least `figure` that the constraints allow.
-
-    The object stays at its pixel. Raises ValueError when no distance meets the constraints, with
-    those that contradict each other, and when rows hold only where they were stated.
-
-    >>> from coursekit.budget import lesson_budget
-    >>> best_distance(lesson_budget(stated=False)).limit
-    'clearance'
-    """
-    mounting = mounting or Mounting()
-    allowed = mounting.least_m(budget)
-    binding = max(allowed, key=lambda name: allowed[name])
-    low, high = allowed[binding], mounting.reach_m
-    room = f"at least {low:.2f} m, for the {binding}"
-    want(low <= high, "mounting", f"a reach of {high:.2f} m", room)
-    distances = np.linspace(low, high, DISTANCES)
-    figures = np.array([figure(budget.at(distance_m=float(Z))) for Z in distances])
-    best = int(np.argmin(figures))
-    limit = binding if best == 0 else "reach" if best == len(distances) - 1 else ""
-    at, figure_m = float(distances[best]), float(figures[best])
-    return BestDistance(at, figure_m, low, high, limit, distances, figures, allowed)
+    alike = max(abs(gain.success) for gain in gains) <= chance
+    ranked = Ranking(sorted(gains, key=lambda g: -(g.room_m if alike else g.success)))
+    ranked.by_room = alike
+    return ranked

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,7 @@ from coursekit.budget.view import GRIPPER_DOWN, View
 from coursekit.checks import want
 from coursekit.geometry import Intrinsics
 from coursekit.intrinsics.derivatives import PARAMETERS, scaled_root
-from coursekit.results import Covariance, ErrorKind, Quantity, Result
+from coursekit.results import Covariance, ErrorKind, Quantity, Result, Source
 from coursekit.specifications import DATA, device
 from coursekit.stereo.law import depth_slope
 
@@ -43,6 +43,8 @@ NEEDED: dict[str, tuple[str, ...]] = {  # by notebook; "a|b": either
 }
 BY_SIGMA = ("03_intrinsics", "04_hand_eye")  # their sigmas are the rows; without they say nothing
 TOGETHER = ("01_pinhole", "03_intrinsics", "04_hand_eye")  # all of it from one place, or none
+LAW = "depth_bias"  # the name in the file of the covariance of s and o
+STANDING = "eye_to_hand"
 COVARIANCE_OF = {"03_intrinsics": "intrinsics", "04_hand_eye": "X"}  # its name in the file
 USUAL_DEPTH_SIZE = (848, 480)  # of the depth image, where notebook 1 did not keep it
 
@@ -65,12 +67,18 @@ def lesson_terms(stated: bool) -> tuple[ErrorTerm, ...]:
         return ErrorTerm(name, kind, low, high, along, LESSON, stated_m=at)
 
     turn, matching = math.radians(0.5), LESSON_SIGMA_D_PX
+    per_px = -float(depth_slope(LESSON_DISTANCE_M, LESSON_CAMERA.fx, LESSON_BASELINE_M))
+    depth = (
+        row("depth noise", "noise", 7e-4, 7e-4, "ray", 0.7),
+        row("depth bias", "bias", 2e-3, 5e-3, "ray", 2.0, 6.0),
+    )
+    if not stated:
+        bias = row("depth bias", "bias", 2e-3 / per_px, 5e-3 / per_px, "disparity")
+        bias = replace(bias, source=f"{LESSON}, read as an offset of disparity")
+        depth = (row("depth noise", "noise", matching, matching, "disparity"), bias)
     return (
         row("pixel", "noise", 1.0, 1.0, "image", 1.0),
-        row("depth noise", "noise", 7e-4, 7e-4, "ray", 0.7)
-        if stated
-        else row("depth noise", "noise", matching, matching, "disparity"),
-        row("depth bias", "bias", 2e-3, 5e-3, "ray", 2.0, 6.0),
+        *depth,
         row("hand-eye rotation", "bias", turn, turn, "turn", 0.0, 3.9),
         row("hand-eye translation", "bias", 1e-3, 2e-3, "shift", 1.0, 2.0),
         row("forward kinematics", "bias", 2e-3, 4e-3, "shift", 2.0, 4.0),
@@ -82,7 +90,8 @@ def lesson_budget(stated: bool = True) -> ErrorBudget:
 
     stated: with the lesson's own millimetres at the object, its ranges included ("up to 3.9" is 0
     to 3.9), each in any direction; they hold at 0.45 m only. Otherwise the same magnitudes are
-    converted here, the depth noise from 0.08 px of disparity, and the budget can be moved.
+    converted here and the budget can be moved: the depth noise from 0.08 px of disparity, the depth
+    bias from 0.22 to 0.55 px, which is **assumed**: an offset of disparity, 2 to 5 mm at 0.45 m.
 
     >>> [round(1000 * end, 1) for end in lesson_budget().worst_case_m]
     [5.0, 15.9]
@@ -94,11 +103,11 @@ def lesson_budget(stated: bool = True) -> ErrorBudget:
 def wrist_budget() -> ErrorBudget:
     """The D405 on the wrist, looking at the object from 0.25 m along its optical axis.
 
-    Camera and baseline are those of data/devices.toml. Nobody has published the D405's bias:
-    **assumed** is the lesson's 2 to 5 mm at 0.45 m read as an offset of disparity, 0.22 to 0.55 px,
-    and the same offset here. The mount's and the arm's rows are the lesson's; for a camera on the
-    wrist the arm's counts for what differs between looking and grasping, so it is the upper end.
-    The gripper comes along the fingers' direction of the maker's mount, the camera 20° from it.
+    Camera and baseline are those of data/devices.toml. Nobody has published the D405's bias: it is
+    the lesson's here, as an offset of disparity. The mount's and the arm's rows are the lesson's;
+    for a camera on the wrist the arm's counts for what differs between looking and grasping, so it
+    is the upper end. The gripper comes along the fingers' direction of the maker's mount, the
+    camera 20° from it.
 
     >>> wrist_budget().at(distance_m=0.40)["depth bias"].magnitude
     '0.22 to 0.55 px'
@@ -107,10 +116,7 @@ def wrist_budget() -> ErrorBudget:
     T_base_camera = np.eye(4)  # where it stands does not matter, only how it is turned
     T_base_camera[:3, :3] = GRIPPER_DOWN @ widowx().T_gripper_camera[:3, :3]
     view = View(unit.depth, WRIST_DISTANCE_M, unit.baseline_m, T_base_camera=T_base_camera)
-    per_px = -float(depth_slope(LESSON_DISTANCE_M, LESSON_CAMERA.fx, LESSON_BASELINE_M))
-    assumed = "assumed: the lesson's, as a disparity"
-    bias = ErrorTerm("depth bias", "bias", 2e-3 / per_px, 5e-3 / per_px, "disparity", assumed)
-    return ErrorBudget(lesson_terms(False), view, title="D405 on the wrist").with_term(bias)
+    return ErrorBudget(lesson_terms(False), view, title="D405 on the wrist")
 
 
 # --- what the notebooks found ---
@@ -167,6 +173,18 @@ class HandOver:
         """Of the numbers that this notebook estimated together, None where it kept none."""
         return self[lesson].result().covariances.get(COVARIANCE_OF.get(lesson, ""))
 
+    @property
+    def source(self) -> Source:
+        """Of the whole: "reference" as soon as one notebook's numbers are the reference's."""
+        sources = [found.yours.source if found.yours else "reference" for found in self]
+        order = ("reference", "simulated", "recorded", "live")
+        return min(sources, key=order.index)
+
+    @property
+    def name(self) -> str:
+        """The cameras whose numbers these are."""
+        return ", ".join(dict.fromkeys(found.result().camera for found in self))
+
     def __repr__(self) -> str:
         return "\n".join(found.says for found in self)
 
@@ -184,23 +202,23 @@ class HandOver:
         baseline_m = 1e-3 * self._also("01_pinhole", "baseline", usual_mm)
         return View(Intrinsics(width, height, fx, fy, cx, cy), LESSON_DISTANCE_M, baseline_m)
 
-    def terms(self, subtract_depth_bias: bool = False) -> tuple[ErrorTerm, ...]:
+    def terms(self, subtract_depth_bias: bool = False, mount: str = STANDING) -> tuple[ErrorTerm, ...]:
         """The rows, each with its source.
 
         subtract_depth_bias: as if every depth were corrected by the bias that notebook 2 measured,
-        so that only what is not known of it stays. What nobody has measured stays the lesson's: the
-        detector's pixel and the arm. What was measured with a standard deviation is a normal bias,
-        shown up to two of them.
+        so that only what is not known of it stays. mount: of the camera, "eye_to_hand" or
+        "eye_in_hand"; the other one's stands in where notebook 4 kept one only. What nobody has
+        measured stays the lesson's: the detector's pixel, and the arm where nobody touched the
+        board. What was measured with a standard deviation is a normal bias, shown up to two of
+        them.
         """
-        pixel, *_, arm = lesson_terms(stated=False)
         return (
-            pixel,
+            lesson_terms(stated=False)[0],
             self._depth_noise(),
             self._depth_bias(subtract_depth_bias),
             self._intrinsics(),
-            self._hand_eye("rotation", MOUNT_TWIST[:3], "turn", math.radians(1.0)),
-            self._hand_eye("translation", MOUNT_TWIST[3:], "shift", 1e-3),
-            arm,
+            *self._hand_eye(mount),
+            self._arm(),
         )
 
     def budget(self, subtract_depth_bias: bool = False) -> ErrorBudget:
@@ -223,7 +241,7 @@ class HandOver:
         assumed one there, because notebook 2's belongs to another camera.
         """
         wrist, own = wrist_budget(), self.budget()
-        for term in own.terms:
+        for term in self.terms(mount="eye_in_hand"):
             if term.name != "depth bias":
                 wrist = wrist.with_term(term)
         return wrist.at(autocorrelation=own.autocorrelation, title=own.title)
@@ -272,15 +290,30 @@ class HandOver:
         return ErrorTerm("depth noise", "noise", sigma_d, sigma_d, "disparity", whose, floor=floor)
 
     def _depth_bias(self, subtracted: bool) -> ErrorTerm:
-        """As a scale: between a shift, which does not grow with Z, and an offset of disparity,
-        which grows with Z²; at 0.45 m, where it was measured, all three are the same."""
+        """By the law s Z - o Z²/(f B) that notebook 2 fitted; a file that holds the bias at 0.45 m
+        alone has it taken for a scale, between a shift and what grows with Z²."""
         name = NEEDED["02_depth_noise"][1]
-        bias, whose = self.quantity("02_depth_noise", name), self["02_depth_noise"].whose(name)
-        sigma = SIGMAS * (bias.sigma or 0.0)
-        size = 0.0 if subtracted else abs(bias.value)
-        low, high = max(0.0, size - sigma), size + sigma
-        low, high = (1e-3 * value / LESSON_DISTANCE_M for value in (low, high))
-        return ErrorTerm("depth bias", "bias", low, high, "scale", whose, normal=subtracted)
+        notebook = self["02_depth_noise"]
+        found, known = notebook.result(name), notebook.result(name).covariances.get(LAW)
+        if known is None:
+            at = self.quantity("02_depth_noise", name)
+            mean, sigmas = (1e-3 / LESSON_DISTANCE_M * v for v in (at.value, at.sigma or 0.0))
+            law, root, whose = (mean, 0.0), np.array([[sigmas], [0.0]]), ", taken for a scale"
+        else:
+            s, o = (found.quantities[number].value for number in known.names)
+            law, root, whose = (s, o), scaled_root(np.array(known.matrix)), ""
+        factor = tuple(map(tuple, root.tolist()))
+        return ErrorTerm(
+            "depth bias",
+            "bias",
+            0.0,
+            SIGMAS,
+            "depth",
+            notebook.whose(name) + whose,
+            normal=True,
+            factor=factor,
+            mean=None if subtracted else law,
+        )
 
     def _intrinsics(self) -> ErrorTerm:
         """By the covariance of K and lens together, where there is one; else by the sigmas.
@@ -295,15 +328,30 @@ class HandOver:
         rows = tuple(map(tuple, factor.tolist()))
         return ErrorTerm("intrinsics", "bias", 0.0, SIGMAS, "intrinsics", whose, True, rows)
 
-    def _hand_eye(self, part: str, names: tuple[str, ...], along: Along, unit: float) -> ErrorTerm:
+    def _hand_eye(self, mount: str) -> tuple[ErrorTerm, ErrorTerm]:
         """The root mean square over the three axes: a row knows no frame. What `propagate` takes
-        is the whole covariance."""
-        known = self._known("04_hand_eye")
-        variances = [known.matrix[i][i] for i in map(known.names.index, names)]
-        high = SIGMAS * unit * math.sqrt(sum(variances) / 3)
-        mount = self["04_hand_eye"].result().quantities["tx"].note.replace("_", " ")
-        whose = self["04_hand_eye"].whose() + (f", {mount}" if mount else "")
-        return ErrorTerm(f"hand-eye {part}", "bias", 0.0, high, along, whose, normal=True)
+        is the whole covariance of the camera on the wrist."""
+        notebook, known = self["04_hand_eye"], self._known("04_hand_eye")
+        fixed, of = notebook.result().eye_to_hand, notebook.result().quantities["tx"].note
+        order = [known.names.index(name) for name in MOUNT_TWIST]
+        variances = np.diag(known.matrix)[order] * np.repeat([math.radians(1.0), 1e-3], 3) ** 2
+        if mount == STANDING and fixed is not None and fixed.covariance is not None:
+            variances, of = np.diag(fixed.covariance), fixed.mount
+        turn, shift = (SIGMAS * math.sqrt(part.mean()) for part in np.split(variances, 2))
+        whose = notebook.whose() + f", {of.replace('_', ' ')}" * bool(of)
+        return (
+            ErrorTerm("hand-eye rotation", "bias", 0.0, turn, "turn", whose, normal=True),
+            ErrorTerm("hand-eye translation", "bias", 0.0, shift, "shift", whose, normal=True),
+        )
+
+    def _arm(self) -> ErrorTerm:
+        """From the touch test: rms over all directions of what arm and camera disagree by."""
+        touched = self["04_hand_eye"].result().quantities.get("touch_mm")
+        if touched is None:
+            return lesson_terms(stated=False)[-1]
+        high = SIGMAS * 1e-3 * touched.value / math.sqrt(3)
+        whose = self["04_hand_eye"].whose() + ", touch test"
+        return ErrorTerm("forward kinematics", "bias", 0.0, high, "shift", whose, normal=True)
 
 
 def hand_over(reference: Path = REFERENCE) -> HandOver:

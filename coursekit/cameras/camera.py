@@ -16,6 +16,7 @@ from coursekit.cameras import recording
 from coursekit.cameras.frames import CameraError, Description, Frame, Frames
 from coursekit.geometry import Intrinsics
 from coursekit.results import Quantity
+from coursekit.words import counting
 
 
 @dataclass(frozen=True)
@@ -191,18 +192,16 @@ class Camera(Description, ABC):
         return index.folder
 
     def _take(self, n: int, progress: bool) -> Iterator[Frame]:
-        """Up to n frames with a progress bar; one printed line when a recording ends early."""
-        from tqdm.auto import tqdm
-
+        """Up to n frames, counted on a line; one printed line when a recording ends early."""
         count = 0
         with (
             contextlib.closing(self.stream()) as stream,
-            tqdm(total=n, unit="frame", leave=False, disable=not progress or n < 10) as bar,
+            counting(n, "frame", progress and n >= 10) as counts,
         ):
             for frame in itertools.islice(stream, n):
                 yield frame
                 count += 1
-                bar.update()
+                counts()
         if count < n:
             print(f"The recording ends after {count} of the {n} frames asked for.")
 

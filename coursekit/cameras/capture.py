@@ -568,7 +568,7 @@ class Screen:
     """A progress bar on standard error with the next view's description."""
 
     def __init__(self, views: int) -> None:
-        from tqdm.auto import tqdm
+        from tqdm import tqdm
 
         self._bar = tqdm(total=views, unit="view", leave=False)
 

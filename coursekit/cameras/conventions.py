@@ -56,10 +56,9 @@ class Agreement:
     yours_mm: float | None = None
 
     def __str__(self) -> str:
-        yours = [(self.yours_px, "px"), (self.yours_mm, "mm")]
-        columns = [(self.project_px, "px"), (self.round_trip_px, "px"), *yours]
-        texts = ["-" if size is None else f"{size:.3f} {unit}" for size, unit in columns]
-        return f"{self.model:22} {self.coefficients:21}" + "".join(f"{t:>12}" for t in texts)
+        sizes = self.project_px, self.round_trip_px, self.yours_px, self.yours_mm
+        texts = ["-" if size is None else f"{size:.3f}" for size in sizes]
+        return f"{self.model:22} {self.coefficients:21}" + "".join(f"{t:>9}" for t in texts)
 
 
 def measure(*yours: Function) -> list[Agreement]:

@@ -21,6 +21,7 @@ from coursekit.hand_eye.poses import IN_METRES, SCATTER, by_X_and_Y, camera_boar
 from coursekit.hand_eye.refinement import arm_poses_with
 from coursekit.hand_eye.session import HandEyeResult, HandEyeSession
 from coursekit.hand_eye.views import PixelViews, board_gap, rms_length, view_residuals
+from coursekit.words import wrapped
 
 CORNER_PX = 0.1  # corner noise where no images have told
 VIEW_ROOM_PX = 10.0  # that a proposed view leaves between the board and the image's border
@@ -67,7 +68,7 @@ class HeldOut:
     def __repr__(self) -> str:
         pixels = "" if self.residuals is None else f"{self.rms_px:.2f} px, "
         across, along = (1e3 * rms_length(part[:, None]) for part in (self.across_m, self.along_m))
-        return (
+        return wrapped(
             f"{len(self.gap_m)} poses held out: {pixels}{self.rms_mm:.2f} mm at the board "
             f"({across:.2f} across the line of sight, {along:.2f} along it), "
             f"worst {1e3 * self.gap_m.max():.2f} mm"

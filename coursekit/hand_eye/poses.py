@@ -43,6 +43,7 @@ WRITTEN_TOLERANCE = 1e-4  # of R R^T: poses are often written with five digits
 # What a pair of pose and image scatters by about and along each axis, (omega, v), rad and m.
 SCATTER = np.repeat([np.radians(0.1), 0.5e-3], 3)
 LEVER_M = 0.3  # a rotation of X counts by what it does this far in front of the camera
+NOTHING_MM = 1e9  # the standard deviation of what is not known at all
 IN_METRES = np.array([LEVER_M, LEVER_M, LEVER_M, 1.0, 1.0, 1.0])  # times (omega, v)
 FREE_M = 0.03  # a direction known no better than this is free: nobody would mount a camera so
 
@@ -169,11 +170,14 @@ class Observability:
 
     def __repr__(self) -> str:
         turns = ", ".join(f"{turn:.1f}" for turn in self.turns_deg)
-        sigmas = ", ".join("unknown" if s > 1e4 else f"{s:.2g}" for s in self.sigma_mm)
+        known = np.minimum(self.sigma_mm, NOTHING_MM)[:, None] * self.directions
+        turn, shift = known[:, :3] / 1e3, known[:, 3:]  # rad, mm: by direction, along each axis
+        sizes = np.degrees(np.linalg.norm(turn, axis=0).max()), np.linalg.norm(shift, axis=0).max()
+        deg, mm = (f"{s:.2f}" if s < 10 else f"{s:.0f}" if s < 1e4 else "over 10000" for s in sizes)
         lines = (
             f"{self.poses} poses, turned by {turns} deg (rms) about three axes, at most "
             f"{self.largest_turn_deg:.0f} deg between two",
-            f"X would be known to {sigmas} mm (1 sigma, its six directions)",
+            f"X would be known to {deg} deg and {mm} mm (1 sigma, about and along the worst axis)",
             f"NOT determined: {'; '.join(self.free)}." if self.free else "All of X is determined.",
         )
         return "\n".join(map(wrapped, lines))

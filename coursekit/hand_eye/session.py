@@ -42,7 +42,7 @@ from coursekit.causes import DiagnosisTexts
 from coursekit.checks import array, choice, instance, transform, want
 from coursekit.formats import poses as pose_files
 from coursekit.formats.poses import JOINTS, PLACE, THREE, TURN, VELOCITIES, PoseRow
-from coursekit.geometry import Intrinsics, pose_difference
+from coursekit.geometry import Intrinsics, cross_matrix, pose_difference
 from coursekit.hand_eye import refinement, views
 from coursekit.hand_eye.closed_form import CLOSED_FORMS, FEWEST_POSES, closed_form
 from coursekit.hand_eye.poses import (
@@ -800,7 +800,7 @@ class HandEyeResult(Estimate):
             lines.append(wrapped(f"NOT DETERMINED: {'; '.join(self.free)}", indent=""))
         lines.append(f"residuals: {pixels}{self.rms_mm:.2f} mm at the board (rms)")
         lines.append(
-            f"spread: {self.spread_board_mm:.2f} mm of the board on its stand, "
+            f"spread: {self.spread_board_mm:.2f} mm of the board in the {name_Y.split('_')[1]}, "
             f"{self.spread_gripper_mm:.2f} mm and {self.spread_gripper_deg:.3f} deg of the gripper"
         )
         return "\n".join(lines)
@@ -853,9 +853,16 @@ class HandEyeResult(Estimate):
     @property
     def reach_sigma_mm(self) -> float:
         """Standard deviation, mm, worst direction, of where X puts a point `LEVER_M` ahead."""
+        return self.sigma_at_mm((0.0, 0.0, LEVER_M))
+
+    def sigma_at_mm(self, point: ArrayLike) -> float:
+        """Standard deviation, mm, worst direction, of where X puts a point (3,), m, of the camera.
+
+        Infinite where the poses leave X free; ValueError after a closed form.
+        """
         if not np.isfinite(self.covariance).all():
             return math.inf
-        by_turn = np.cross(np.eye(3), self.X[:3, 2] * LEVER_M).T  # omega moves it by omega x lever
-        by_twist = np.hstack([by_turn, np.eye(3)])
+        lever = self.X[:3, :3] @ array("point", point, (3,), finite=True)
+        by_twist = np.hstack([-cross_matrix(lever), np.eye(3)])  # omega moves it by omega x lever
         spread = by_twist @ self.covariance[:6, :6] @ by_twist.T
         return 1e3 * float(np.sqrt(np.linalg.eigvalsh(spread)[-1]))

@@ -1,9 +1,10 @@
-"""Notebook 05: its exercise and the mistakes that people make in it."""
+"""Notebook 05: its exercises and the mistakes that people make in them."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -60,4 +61,135 @@ SENSITIVITIES.add_mistakes(
     ("leak", "landing_place", lambda by_u, by_Z, depth_error, Z: by_Z * (Z + depth_error)),
     ("order", "all_millimetres", lambda u, Z, leak: np.array([1000 * u, Z, 1000 * leak])),
     ("order", "exchanged", lambda by_u, by_Z, leak: np.array([by_Z, by_u, leak])),
+)
+
+
+# --- add_up ---
+
+Rows = list[tuple[float, float, Any, str]]
+
+
+def _build_sums(steps: Mapping[str, Step]) -> Model:
+    def add_up(rows: Rows, tolerance: float) -> Floats:
+        noise, bias = steps["kinds"](rows)
+        along = steps["along"]
+        noises = [high * along(toward) for _, high, toward, _ in noise]
+        most = [steps["most"](low, high, toward) * along(toward) for low, high, toward, _ in bias]
+        parts = [steps["third"]() if row[2] is None else along(row[2]) ** 2 for row in bias]
+        squares = [steps["square"](*row[:2]) * part for row, part in zip(bias, parts, strict=True)]
+        sigma = steps["sigma"](steps["rigs"](squares, noises), most)
+        sums = steps["noise"](noises), steps["worst"](most), steps["quadrature"](most)
+        return steps["order"](*sums, steps["share"](tolerance / sigma if sigma else math.inf))
+
+    return add_up
+
+
+def _sorted(rows: Rows) -> tuple[Rows, Rows]:
+    noise, bias = ([row for row in rows if row[3] == kind] for kind in ("noise", "bias"))
+    return noise, bias
+
+
+def _along(toward: Any) -> float:
+    return 1.0 if toward is None else abs(toward[0])
+
+
+def _root(values: list[float]) -> float:
+    return math.sqrt(sum(value * value for value in values))
+
+
+def _beyond(z: float) -> float:
+    """The share of a normal distribution beyond z standard deviations, to both sides."""
+    return math.erfc(z / math.sqrt(2))
+
+
+def _tilted(degrees: float, sign: float = 1.0) -> tuple[float, float, float]:
+    return sign * math.sin(math.radians(degrees)), math.cos(math.radians(degrees)), 0.0
+
+
+LESSON_ROWS: Rows = [
+    (1.0, 1.0, None, "noise"),
+    (0.7, 0.7, None, "noise"),
+    (2.0, 6.0, None, "bias"),
+    (0.0, 3.9, None, "bias"),
+    (1.0, 2.0, None, "bias"),
+    (2.0, 4.0, None, "bias"),
+]
+
+ADD_UP = Exercise(
+    name="error_budget.add_up",
+    build=_build_sums,
+    steps={
+        "kinds": _sorted,
+        "along": _along,
+        "most": lambda low, high, toward: high,
+        "noise": _root,
+        "worst": sum,
+        "quadrature": _root,
+        "square": lambda low, high: (low * low + low * high + high * high) / 3,
+        "third": lambda: 1 / 3,
+        "rigs": lambda squares, noises: sum(squares),
+        "sigma": lambda variance, most: math.sqrt(variance),
+        "share": _beyond,
+        "order": lambda *sums: np.array(sums),
+    },
+    cases=[
+        (LESSON_ROWS[1:4], 5.0),
+        (LESSON_ROWS, 7.0),
+        ([(0.6, 0.6, None, "noise"), (1.5, 1.5, _tilted(60, -1), "noise"),
+          (1.0, 4.0, _tilted(25, -1), "bias"), (1.0, 3.0, _tilted(40), "bias"),
+          (0.0, 2.0, None, "bias")], 3.0),
+        ([(2.0, 4.0, None, "bias"), (0.8, 0.8, _tilted(30), "noise"),
+          (0.5, 5.0, (0.6, 0.0, -0.8), "bias"), (0.4, 0.4, None, "noise")], 4.0),
+    ],
+    per_row=0,
+    unit="(mm, mm, mm and a share)",
+    tolerance=1e-6,
+    describe=lambda args: "; ".join(_row_in_words(row) for row in args[0])
+    + f"; tolerance {args[1]:g} mm",
+    show=lambda row: "(" + ", ".join(f"{v:.4g}" for v in np.ravel(row)) + ")",
+)  # fmt: skip
+
+
+def _row_in_words(row: tuple[float, float, Any, str]) -> str:
+    low, high, toward, kind = row
+    way = "any way" if toward is None else "along ({:.2f}, {:.2f}, {:.2f})".format(*toward)
+    return f"{kind} {low:g} to {high:g} mm {way}"
+
+
+def _third_of(toward: Any, value: float) -> float:
+    return value if toward is None else abs(toward[0])
+
+
+ADD_UP.add_mistakes(
+    ("kinds", "noise_in_the_bias", lambda rows: (_sorted(rows)[0], rows)),
+    ("kinds", "bias_in_the_noise", lambda rows: (rows, _sorted(rows)[1])),
+    ("along", "not_projected", lambda toward: 1.0),
+    ("along", "direction_sign", lambda toward: 1.0 if toward is None else toward[0]),
+    ("along", "other_axis", lambda toward: 1.0 if toward is None else abs(toward[1])),
+    ("along", "any_way_nothing", lambda toward: 0.0 if toward is None else abs(toward[0])),
+    ("most", "third_of_the_worst", lambda low, high, toward: high * _third_of(toward, 3**-0.5)),
+    ("most", "least_for_most", lambda low, high, toward: low),
+    ("most", "middle_for_most", lambda low, high, toward: (low + high) / 2),
+    ("noise", "noise_added", sum),
+    ("noise", "noise_squared", lambda values: _root(values) ** 2),
+    ("noise", "noise_mean", lambda values: _root(values) / max(len(values), 1) ** 0.5),
+    ("worst", "worst_in_quadrature", _root),
+    ("quadrature", "quadrature_added", sum),
+    ("quadrature", "quadrature_squared", lambda values: _root(values) ** 2),
+    ("square", "mean_squared", lambda low, high: ((low + high) / 2) ** 2),
+    ("square", "largest_squared", lambda low, high: high * high),
+    ("square", "ends_squared", lambda low, high: (low * low + high * high) / 2),
+    ("square", "spread_squared", lambda low, high: (high - low) ** 2 / 12),
+    ("third", "third_forgotten", lambda: 1.0),
+    ("third", "third_rooted", lambda: 3**-0.5),
+    ("third", "half_for_third", lambda: 0.5),
+    ("rigs", "noise_in_the_share", lambda squares, noises: sum(squares) + _root(noises) ** 2),
+    ("sigma", "variance_for_sigma", lambda variance, most: variance),
+    ("sigma", "quadrature_for_sigma", lambda variance, most: _root(most)),
+    ("sigma", "worst_for_sigma", lambda variance, most: sum(most)),
+    ("share", "one_sided", lambda z: _beyond(z) / 2),
+    ("share", "within_for_beyond", lambda z: 1 - _beyond(z)),
+    ("share", "share_in_percent", lambda z: 100 * _beyond(z)),
+    ("share", "root_two_lost", math.erfc),
+    ("order", "sums_exchanged", lambda n, w, q, share: np.array([n, q, w, share])),
 )

@@ -11,7 +11,7 @@ from matplotlib.ticker import MultipleLocator
 
 from coursekit.arrays import ArrayLike, Floats
 from coursekit.attribution import SimulatedMisses
-from coursekit.budget import BestDistance, Draws, ErrorBudget, Gripper, Target
+from coursekit.budget import Draws, ErrorBudget, Gripper, Target
 from coursekit.plots.style import COLORS, LessonFigure, figure, panels, single
 
 KINDS = {"bias": "measured", "noise": "depth"}
@@ -45,7 +45,7 @@ def bars(budget: ErrorBudget) -> LessonFigure:
     ax.annotate(f"closing tolerance ±{tolerance:g} mm", (tolerance, -0.7), (4, 0),
                 textcoords="offset points", fontsize=10, va="center")  # fmt: skip
     ax.set_yticks(range(len(rows)), [f"{row.term.name} ({row.term.kind})" for row in rows])
-    right = max(11.0, 1050 * max(row.high_m for row in rows))
+    right = max(1.5 * tolerance, 1050 * max(row.high_m for row in rows))
     ax.set(xlabel="at the object (mm)", xlim=(0, right), ylim=(len(rows) - 0.5, -1.0))
     ax.set_ylabel(" ")
     return fig.saying("The budget's rows at the object: " + "; ".join(said))
@@ -100,7 +100,8 @@ def between_fingers(
     space.scatter(others[:, 0], others[:, 2], -others[:, 1], s=2, color=COLORS["ink"], alpha=0.4)
     limits: dict[str, Any] = {f"{axis}lim": (-reach, reach) for axis in "xyz"}
     space.set(xlabel="closing (mm)", ylabel="lateral (mm)", zlabel="up (mm)", **limits)
-    space.set_box_aspect((1, 1, 1), zoom=1.1)
+    space.set_box_aspect((1, 1, 1), zoom=1.05)
+    space.yaxis.labelpad = 9
     for axis in (space.xaxis, space.yaxis, space.zaxis):
         axis.set_major_locator(MultipleLocator(20))
     space.view_init(elev=20, azim=-65)
@@ -156,32 +157,23 @@ def _box(ax: Any, middle: tuple[float, ...], size: tuple[float, ...], color: str
     ax.bar3d(*corner, *size, color=color, alpha=alpha, shade=True)
 
 
-def distances(best: BestDistance) -> LessonFigure:
-    """A figure of the budget against the mounting distance, with what limits the distance."""
-    fig, ax = single(8.0, 3.6)
-    ax.plot(best.distances_m, 1000 * np.asarray(best.figures_m), color=COLORS["model"])
-    ax.plot(best.distance_m, 1000 * best.figure_m, "o", color=COLORS["measured"])
-    ax.set(xlabel="distance Z (m)", ylabel="error along closing (mm)", ylim=(0, None))
-    return fig.saying(
-        f"Error along the closing axis against the mounting distance: least, "
-        f"{1000 * best.figure_m:.1f} mm, at {best.distance_m:.2f} m; allowed are "
-        f"{best.low_m:.2f} to {best.high_m:.2f} m."
-    )
-
-
-def misses(sets: Mapping[str, SimulatedMisses]) -> LessonFigure:
-    """Sets of misses from above, each arrow where its grasp was and ten times as long."""
-    fig, axes = panels(len(sets), len(sets), 9.6, 3.4, sharex=True, sharey=True)
+def misses(sets: Mapping[str, SimulatedMisses], times: float = 15.0) -> LessonFigure:
+    """Sets of misses from above, each arrow where its grasp was and so many times as long."""
+    fig, axes = panels(len(sets), 2, 9.6, 3.0, sharex=True, sharey=True)
+    ends = [one.T_base_gripper[:, :2, 3] + times * one.misses[:, :2] for one in sets.values()]
+    forward, left = np.concatenate(ends).T
+    wide = 1.05 * np.abs(left).max()
     for ax, (name, one) in zip(axes, sets.items(), strict=True):
-        x, y = one.T_base_gripper[:, :2, 3].T
-        ax.quiver(x, y, *(10 * one.misses[:, :2].T), angles="xy", scale_units="xy", scale=1,
-                  width=0.012, color=COLORS["measured"])  # fmt: skip
-        ax.plot(x, y, ".", ms=3, color=COLORS["ink"])
-        ax.set(xlim=(0.05, 0.5), ylim=(-0.42, 0.42), aspect="equal", title=name,
-               xlabel="x of the base (m)", ylabel="y of the base (m)")  # fmt: skip
+        (x, y), (right, up) = one.T_base_gripper[:, :2, 3].T, times * one.misses[:, 1::-1].T
+        ax.quiver(y, x, right, up, angles="xy", scale_units="xy", scale=1, width=0.006,
+                  color=COLORS["measured"])  # fmt: skip
+        ax.plot(y, x, ".", ms=4, color=COLORS["ink"])
+        ax.set(xlim=(wide, -wide), ylim=(min(0.0, forward.min()), 1.05 * forward.max()),
+               aspect="equal", title=f"{name}, {len(one.misses)} trials",
+               xlabel="y of the base, to the left (m)", ylabel="x, forward (m)")  # fmt: skip
         ax.label_outer()
     return fig.saying(
-        "Misses from above, ten times as long, where they happened: "
+        f"Misses from above, {times:g} times as long, where they happened: "
         + "; ".join(
             f"{name}, {len(one.misses)} trials, mean "
             f"{1000 * np.linalg.norm(one.misses.mean(axis=0)):.1f} mm"

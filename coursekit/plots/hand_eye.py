@@ -6,78 +6,114 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.ticker import MultipleLocator
 from scipy.spatial.transform import Rotation
 
 from coursekit.arrays import ArrayLike, Floats
-from coursekit.hand_eye import StudyPoint
+from coursekit.geometry import deproject, transform_points
+from coursekit.hand_eye import HandEyeSession, StudyPoint, motions
+from coursekit.hand_eye.poses import stand_board
 from coursekit.plots.style import (
     COLORS,
     MARKERS,
     STYLES,
     LessonFigure,
     cross,
+    figure,
     panels,
     plain_ticks,
     single,
 )
 from coursekit.simulation.arm_poses import Setup
 
-AXIS_M = 0.09  # how long a frame's axes are drawn
+VIEW_M = 0.16  # how far the camera's pyramid is drawn
+SPACE_M = ((-0.30, 0.66), (-0.36, 0.36), (0.0, 0.84))  # x, y, z of the base that is shown
+CLEAR_PX = 13.0  # around a letter
 
 
-def mounts(setups: Mapping[str, Setup], joints: Mapping[str, ArrayLike]) -> LessonFigure:
-    """Rigs from the side, at true scale: the arm's links, the camera's view, the board.
+def mounts(
+    setups: Mapping[str, Setup], joints: Mapping[str, ArrayLike], view_from_deg: float = -65.0
+) -> LessonFigure:
+    """Rigs in space, at true scale: the arm, the camera's view, the board, and T, X and C.
 
-    joints: the joint angles (6,), rad, at which each rig is drawn. Seen from the arm's right, so
-    x of the base points to the right and z up.
+    joints: the joint angles (6,), rad, at which each rig is drawn. view_from_deg: from where, about
+    the vertical: -90 has x of the base to the right, 0 looks along it.
     """
-    fig, axes = panels(len(setups), len(setups), 9.6, 4.4, sharey=True)
-    for ax, (name, setup) in zip(axes, setups.items(), strict=True):
-        _side_view(ax, setup, np.asarray(joints[name], float))
-        ax.set_title(name)
-        ax.label_outer()
+    fig = figure(10.0, 4.9)
+    fig.set_layout_engine("none")  # the 3-D axes reserve far more room than they use
+    texts = []
+    for k, (name, setup) in enumerate(setups.items()):
+        ax: Any = fig.add_axes((k / len(setups), 0.0, 0.98 / len(setups), 1.0), projection="3d")
+        limits = dict(zip(("xlim", "ylim", "zlim"), SPACE_M, strict=True))
+        ax.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)", **limits)
+        ax.set_box_aspect(np.ptp(SPACE_M, axis=1), zoom=0.96)
+        for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
+            axis.set_major_locator(MultipleLocator(0.3))
+        ax.view_init(elev=18, azim=view_from_deg)
+        ax.set_title(name, y=0.94)
+        lengths = _rig(ax, setup, np.asarray(joints[name], float))
+        texts.append(f"{name}: " + ", ".join(f"{k} {v:.2f} m" for k, v in lengths.items()))
     return fig.saying(
-        "Side views at true scale: with the camera on the wrist it looks along the gripper at a "
-        "board on the table; with the camera over the shoulder it looks down at a board in the "
-        "gripper."
+        "Two rigs in space with the arrows T (base to gripper), X (to the camera) and C (camera to "
+        "board), at true scale. " + "; ".join(texts)
     )
 
 
-def _side_view(ax: Any, setup: Setup, q: Floats) -> None:
-    T_base_gripper = setup.arm.forward(q)
+def _rig(ax: Any, setup: Setup, q: Floats) -> dict[str, float]:
+    """The arm, the board, what the camera sees, and the three arrows; their lengths, m."""
+    gripper, on_wrist = setup.arm.forward(q), setup.mount == "eye_in_hand"
+    camera = gripper @ setup.X if on_wrist else setup.X
+    board, base = setup.Y if on_wrist else gripper @ setup.Y, np.eye(4)
     links = setup.arm.link_frames(q)[:, :3, 3]
-    chain = np.concatenate([[[0.0, 0.0, 0.0]], links, T_base_gripper[None, :3, 3]])
-    ax.plot(chain[:, 0], chain[:, 2], "o-", color=COLORS["block"], lw=5, ms=7)
-    on_wrist = setup.mount == "eye_in_hand"
-    T_base_camera = T_base_gripper @ setup.X if on_wrist else setup.X
-    T_base_board = setup.Y if on_wrist else T_base_gripper @ setup.Y
-    rim = setup.board.points[[0, setup.board.corners[0] - 1, -1, -setup.board.corners[0]]]
-    board = rim @ T_base_board[:3, :3].T + T_base_board[:3, 3]
-    ax.plot(*board[[0, 1, 2, 3, 0]][:, [0, 2]].T, color=COLORS["ink"], lw=3)
-    ax.annotate("board", board[2, [0, 2]], (8, 8), textcoords="offset points")
-    eye = T_base_camera[:3, 3]
-    for corner in board:
-        ax.plot(*np.array([eye, corner])[:, [0, 2]].T, color=COLORS["color"], lw=0.8)
-    for T, label, offset in (
-        (np.eye(4), "base", (-10, -16)),
-        (T_base_gripper, "gripper", (10, -18)),
-        (T_base_camera, "camera", (-34, 16)),
-    ):
-        _axes(ax, T)
-        ax.annotate(label, T[[0, 2], 3], offset, textcoords="offset points", fontsize=10,
-                    bbox={"fc": "white", "ec": "none", "alpha": 0.7, "pad": 1})  # fmt: skip
-    ax.axhline(0, color=COLORS["faint"], lw=1)
-    ax.set(aspect="equal", xlabel="x of the base (m)", ylabel="z of the base (m)",
-           xlim=(-0.3, 0.75), ylim=(-0.08, 0.9))  # fmt: skip
+    chain = np.concatenate([np.zeros((1, 3)), links, gripper[None, :3, 3]])
+    ax.plot(*chain.T, "o-", color=COLORS["block"], lw=5, ms=7)
+    rim = transform_points(board, setup.board.outline)
+    sheet = rim[[[0, 1], [3, 2]]]
+    ax.plot_surface(*np.moveaxis(sheet, 2, 0), color=COLORS["cube"], alpha=0.5, shade=False)
+    ax.plot(*rim[[0, 1, 2, 3, 0]].T, color=COLORS["ink"], lw=1.2)
+    wide, high = setup.intrinsics.size
+    pixels = np.array([(0, 0), (wide, 0), (wide, high), (0, high)], float)
+    far = deproject(pixels, np.full(4, VIEW_M), setup.intrinsics.K)
+    view = transform_points(camera, np.vstack([far, np.zeros(3)]))[
+        [0, 1, 2, 3, 0, 4, 1, 4, 2, 4, 3]
+    ]
+    ax.plot(*view.T, color=COLORS["color"], lw=1.2)
+    arrows = {
+        "T": (base, gripper, "model"),
+        "X": (gripper if on_wrist else base, camera, "measured"),
+        "C": (camera, board, "truth"),
+    }
+    ends = [np.stack([start[:3, 3], end[:3, 3]]) for start, end, _ in arrows.values()]
+    taken = [_on_page(ax, line) for line in (chain, rim[[0, 1, 2, 3, 0]], view, *ends)]
+    for (name, (*_, color)), line in zip(arrows.items(), taken[3:], strict=True):
+        place = _arrow(ax, name, line[0], line[-1], COLORS[color], np.concatenate(taken))
+        taken.append(place)
+    lengths = [float(np.linalg.norm(end - start)) for start, end in ends]
+    return dict(zip(arrows, lengths, strict=True))
 
 
-def _axes(ax: Any, T: Floats) -> None:
-    """A frame's x and z axis as they look from the side."""
-    at = T[[0, 2], 3]
-    for column, color in ((0, "measured"), (2, "model")):
-        tip = at + AXIS_M * T[[0, 2], column]
-        ax.annotate("", tip, at, arrowprops={"arrowstyle": "-|>", "color": COLORS[color], "lw": 2})
-        ax.annotate("xyz"[column], tip, color=COLORS[color], fontweight="bold", fontsize=10)
+def _on_page(ax: Any, line: Floats) -> Floats:
+    """Points along a line through (n, 3), m, as (m, 2) px on the page."""
+    steps = np.linspace(0, len(line) - 1, 30 * (len(line) - 1) + 1)
+    points = [np.interp(steps, np.arange(len(line)), column) for column in line.T]
+    x, y, _, w = ax.get_proj() @ [*points, np.ones(len(steps))]
+    return np.asarray(ax.transData.transform(np.stack([x / w, y / w], axis=1)))
+
+
+def _arrow(ax: Any, name: str, start: Floats, end: Floats, color: str, taken: Floats) -> Floats:
+    """An arrow on the page, px, its letter where nothing else is; where that is, (1, 2)."""
+    head = {"arrowstyle": "-|>", "color": color, "lw": 2.2, "shrinkA": 0, "shrinkB": 0}
+    ax.annotate("", end, start, xycoords="figure pixels", textcoords="figure pixels",
+                arrowprops=head, zorder=10)  # fmt: skip
+    along = (end - start) / np.linalg.norm(end - start)
+    across = np.array([-along[1], along[0]])
+    sides = [side * away for away in np.arange(CLEAR_PX + 1, 80, 3) for side in (1, -1)]
+    places = np.array([(start + end) / 2 + side * across for side in sides])
+    room = np.linalg.norm(places[:, None] - taken, axis=2).min(axis=1)
+    place = places[np.argmax(room > CLEAR_PX) if (room > CLEAR_PX).any() else room.argmax()]
+    ax.annotate(name, place, xycoords="figure pixels", color=color, ha="center", va="center",
+                fontweight="bold", fontsize=13, zorder=11)  # fmt: skip
+    return place[None]
 
 
 def diversity(sessions: Mapping[str, Floats]) -> LessonFigure:
@@ -85,8 +121,8 @@ def diversity(sessions: Mapping[str, Floats]) -> LessonFigure:
 
     Rotations are those from the session's mean, as rotation vectors along the gripper's axes.
     """
-    fig, (places, turns) = panels(2, 2, 9.6, 4.0)
-    texts = []
+    fig, (places, *turns) = panels(3, 3, 10.0, 3.6)
+    texts, reach = [], 10.0
     for marker, color, (name, T) in zip(
         MARKERS, ("measured", "model", "truth"), sessions.items(), strict=False
     ):
@@ -94,20 +130,69 @@ def diversity(sessions: Mapping[str, Floats]) -> LessonFigure:
         places.plot(T[:, 0, 3], T[:, 1, 3], **style)
         R = Rotation.from_matrix(T[:, :3, :3])
         vectors = np.degrees((R.mean().inv() * R).as_rotvec())
-        turns.plot(vectors[:, 1], vectors[:, 2], **style)
+        for ax, axis in zip(turns, (0, 2), strict=True):
+            ax.plot(vectors[:, axis], vectors[:, 1], **style)
+        reach = max(reach, 1.1 * np.abs(vectors).max())
         texts.append(f"{name}: turned by up to {np.linalg.norm(vectors, axis=1).max():.0f} deg")
     places.set(aspect="equal", xlabel="x of the base (m)", ylabel="y of the base (m)")
     places.set_title("the gripper from above")
-    cross(turns)
-    reach = max(10.0, 1.1 * np.abs([*turns.get_xlim(), *turns.get_ylim()]).max())
-    turns.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal",
-              xlabel="turned about the gripper's y (deg)",
-              ylabel="turned about the gripper's z (deg)")  # fmt: skip
-    turns.set_title("how it was turned, from the mean")
-    turns.legend(loc="best")
+    for ax, name in zip(turns, "xz", strict=True):
+        cross(ax)
+        ax.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal",
+               xlabel=f"about its {name} (deg)", ylabel="about its y (deg)")  # fmt: skip
+        ax.set_title("turned, from the mean")
+    if len(sessions) > 1:
+        turns[1].legend(loc="best")
     return fig.saying(
         "Gripper places from above, and rotations from their mean. " + "; ".join(texts)
     )
+
+
+def agreement(sessions: Mapping[str, HandEyeSession]) -> LessonFigure:
+    """Three things that a session shows before anybody believes its X, a row for each session.
+
+    From all pairs of poses how far gripper and camera turned (deg) and how far each moved along the
+    axis of that turn (mm), which no X changes; and where `solve` puts the board, pose by pose, mm.
+    """
+    fig, axes = panels(3 * len(sessions), 3, 10.0, 2.4)
+    texts = []
+    for row, (name, session) in zip(np.reshape(axes, (-1, 3)), sessions.items(), strict=True):
+        A, B = motions(session.T_base_gripper, session.T_camera_board, session.mount)
+        (turned, moved), (turned_seen, moved_seen) = _screw(A), _screw(B)
+        turns, shifts = (turned, turned_seen), (moved, moved_seen)
+        for ax, (arm, seen), unit in ((row[0], turns, "deg"), (row[1], shifts, "mm")):
+            top = 1.05 * float(np.max(arm))
+            ax.plot([0, top], [0, top], color=COLORS["faint"], lw=1)
+            ax.plot(arm, seen, ".", ms=3, color=COLORS["measured"])
+            ax.set(xlabel=f"gripper ({unit})", ylabel=f"camera ({unit})", xlim=(0, top))
+        fit = session.solve()
+        places = 1e3 * stand_board(fit.T_base_gripper, fit.measured, fit.X, session.mount)[:, :3, 3]
+        off = places - np.median(places, axis=0)
+        for column, color in enumerate(("measured", "truth", "model")):
+            row[2].plot(np.arange(1, len(off) + 1), off[:, column], ".-", lw=1,
+                        color=COLORS[color], label="xyz"[column])  # fmt: skip
+        row[2].set(xlabel="pose (number)", ylabel="off the median (mm)")
+        row[0].set_title(f"{name}: turned by")
+        row[1].set_title("moved along the axis by")
+        row[2].set_title("the board in the base")
+        worst = np.abs(np.subtract(turned_seen, turned)).max()
+        ratio, wide = np.sum(moved * moved_seen) / np.sum(np.square(moved)), _rms(off) * 3**0.5
+        texts.append(
+            f"{name}: turns agree within {worst:.1f} deg, the camera moves {ratio:.3f} times as "
+            f"far, the board's place spreads by {wide:.1f} mm"
+        )
+    fig.legend(*axes[2].get_legend_handles_labels(), loc="outside lower right", ncols=3)
+    return fig.saying(
+        "Gripper and camera between any two poses, and the board. " + "; ".join(texts)
+    )
+
+
+def _screw(T: Floats) -> tuple[Floats, Floats]:
+    """How far motions (n, 4, 4) turn (n,), deg, and how far along the axis of that, mm."""
+    turns = Rotation.from_matrix(T[:, :3, :3]).as_rotvec()
+    angles = np.linalg.norm(turns, axis=1)
+    along = np.abs(np.sum(turns * T[:, :3, 3], axis=1)) / angles
+    return np.degrees(angles), 1e3 * along
 
 
 def study(points: Sequence[StudyPoint]) -> LessonFigure:
@@ -159,22 +244,23 @@ def more_poses(
     )
 
 
-def gaps(fitted_mm: ArrayLike, held_mm: ArrayLike) -> LessonFigure:
-    """How far the board is from where X says, pose by pose: fitted ones and ones held out, mm.
+def gaps(gap_mm: ArrayLike, held: ArrayLike) -> LessonFigure:
+    """How far the board is from where X says, (n,), mm; held (n,): which poses were held out.
 
-    >>> gaps([1.0, 2.0], [2.0]).alt[:65]
+    >>> gaps([1.0, 2.0, 2.0], [False, False, True]).alt[:65]
     'Gap between the board as seen and as predicted: rms 1.58 mm over '
     """
-    fitted, held = np.asarray(fitted_mm), np.asarray(held_mm)
-    fig, ax = single(8.0, 3.4)
-    ax.bar(np.arange(len(fitted)) + 1, fitted, color=COLORS["model"], label="fitted")
-    ax.bar(len(fitted) + 1 + np.arange(len(held)), held, color=COLORS["measured"],
-           label="held out")  # fmt: skip
+    gap, out = np.asarray(gap_mm, float), np.asarray(held, bool)
+    fig, ax = single(8.0, 3.2)
+    number = np.arange(1, len(gap) + 1)
+    for which, color, label in ((~out, "model", "fitted"), (out, "measured", "held out")):
+        ax.bar(number[which], gap[which], color=COLORS[color], label=label)
+    ax.set_xticks(number)
     ax.set(xlabel="pose (number)", ylabel="gap at the board (mm)")
-    ax.legend()
+    ax.legend(ncols=2)
     return fig.saying(
-        f"Gap between the board as seen and as predicted: rms {_rms(fitted):.2f} mm over "
-        f"{len(fitted)} fitted poses, {_rms(held):.2f} mm over {len(held)} held out."
+        f"Gap between the board as seen and as predicted: rms {_rms(gap[~out]):.2f} mm over "
+        f"{(~out).sum()} fitted poses, {_rms(gap[out]):.2f} mm over {out.sum()} held out."
     )
 
 

@@ -20,6 +20,7 @@ from functools import cache
 from pathlib import Path
 from typing import Literal, get_args
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -36,7 +37,7 @@ from coursekit.simulation import arm_poses
 from coursekit.simulation.arm_poses import Setup
 from coursekit.simulation.board_images import render_board
 from coursekit.simulation.corner_sessions import Effects, corner_noise, printed, with_street_errors
-from coursekit.specifications import device
+from coursekit.specifications import DATA, device
 
 Design = Literal["careful", "grid", "single_axis", "small_rotations"]
 Degrees = Literal["", "joints", "rotation_vectors"]
@@ -52,6 +53,23 @@ SECONDS = 4.0  # from one image to the next
 PLACES_TRIED = 20  # of camera and board, before the default ones are taken
 PARTIAL = 0.6  # of the corners in view are enough in a degenerate session
 SIMULATED = "simulated"  # what session.json calls its source
+WHOSE_LENS: dict[Mount, str] = {"eye_in_hand": "D405", "eye_to_hand": "D435"}
+FOLDER_VIEWS = 20
+# Progressive: the same pixels in a tenth less space.
+JPEG_OPTIONS = [
+    cv2.IMWRITE_JPEG_QUALITY,
+    92,
+    cv2.IMWRITE_JPEG_OPTIMIZE,
+    1,
+    cv2.IMWRITE_JPEG_PROGRESSIVE,
+    1,
+]
+FOLDER_ORIGIN = (
+    "Rendered by coursekit.simulation.session_folder: a WidowX AI with hidden errors, its seed as "
+    "given, stops at each pose; the lens is this device's colour camera, and the intrinsics given "
+    "are the true ones. The table behind a board in the gripper goes along with it. No real arm or "
+    "camera took it. Where the camera really is, coursekit.simulation.truth_of tells."
+)
 
 
 @dataclass(frozen=True)
@@ -153,10 +171,11 @@ def default_setup(mount: Mount) -> Setup:
     (7, 5)
     """
     arm = widowx()
-    if choice("mount", mount, MOUNTS) == "eye_in_hand":
-        lens, board = device("D405").unit.color, TABLE_BOARD
-        return Setup(arm, mount, arm.T_gripper_camera, arm_poses.board_on_table(board), lens, board)
-    lens, board = device("D435").unit.color, HELD_BOARD
+    lens = device(WHOSE_LENS[choice("mount", mount, MOUNTS)]).unit.color
+    if mount == "eye_in_hand":
+        X, board = arm.T_gripper_camera, TABLE_BOARD
+        return Setup(arm, mount, X, arm_poses.board_on_table(board), lens, board)
+    board = HELD_BOARD
     X, Y = arm_poses.over_the_shoulder(), arm_poses.board_in_gripper(board)
     return Setup(arm, mount, X, Y, lens, board)
 
@@ -197,18 +216,63 @@ def hand_eye_session(
     return _reported(truth, q, dq, Detections(found)), truth
 
 
+def unknown_sessions(seed: int) -> dict[str, HandEyeSession]:
+    """Three sessions with the camera on the wrist, each with one mistake for somebody to find."""
+    mistakes = {
+        "P": HandEyeMistakes(square_scale=1.05),
+        "Q": HandEyeMistakes(inverted_poses=True),
+        "R": HandEyeMistakes(slip_m=0.005),
+    }
+    made = {name: hand_eye_session("eye_in_hand", seed, mistakes=m) for name, m in mistakes.items()}
+    return {name: session for name, (session, _) in made.items()}
+
+
 def rendered_session(
-    mount: Mount, seed: int, n: int = 20, arm_errors: ArmErrors | None = None
+    mount: Mount,
+    seed: int,
+    n: int = 20,
+    arm_errors: ArmErrors | None = None,
+    progress: bool = False,
 ) -> tuple[HandEyeSession, HandEyeTruth, list[Grey]]:
     """A healthy session of rendered images (h, w), whose corners `boards.detect` found.
 
-    As `hand_eye_session`, at about 0.1 s an image. Raises BoardNotFound where the board is not
-    found in one, which the poses are chosen to avoid.
+    As `hand_eye_session`, at about 0.1 s an image, with a bar of progress if asked. Raises
+    BoardNotFound where the board is not found in one, which the poses are chosen to avoid.
     """
     truth, q, dq = _poses(mount, seed, n, arm_errors, HandEyeMistakes())
-    images, board = list(images_of(truth, seed)), truth.setup.board
+    from tqdm.auto import tqdm
+
+    rendered = tqdm(
+        images_of(truth, seed), total=n, unit="image", leave=False, disable=not progress
+    )
+    images, board = list(rendered), truth.setup.board
     found = [detect(image, board, f"view_{i:02d}") for i, image in enumerate(images)]
     return _reported(truth, q, dq, Detections(found)), truth, images
+
+
+def session_folder(mount: Mount, seed: int, into: str | os.PathLike[str]) -> Path:
+    """The folder of a rendered session of an arm with hidden errors, its 20 images made if need be.
+
+    seed: names the arm, which may carry both cameras; 1 is in data/. Others are rendered below the
+    folder `into`, in some five seconds, and kept there.
+    """
+    stored, made = DATA / f"hand_{mount}", Path(into) / f"hand_{mount}_{seed}"
+    for folder in (stored, made):
+        card = folder / SESSION
+        if card.is_file() and json.loads(card.read_text("utf-8"))["seed"] == seed:
+            return folder
+    session, _, images = rendered_session(mount, seed, FOLDER_VIEWS, ArmErrors(), True)
+    names = tuple(f"{name}.jpg" for name in session.names)
+    encoded = (cv2.imencode(".jpg", image, JPEG_OPTIONS)[1].tobytes() for image in images)
+    about = {
+        "camera": f"Simulated {WHOSE_LENS[mount]}",
+        "source": SIMULATED,
+        "seed": seed,
+        "views": FOLDER_VIEWS,
+        "origin": FOLDER_ORIGIN,
+    }
+    replace(session, names=names).save(made, dict(zip(names, encoded, strict=True)), about)
+    return made
 
 
 def truth_of(folder: str | os.PathLike[str]) -> HandEyeTruth:

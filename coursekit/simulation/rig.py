@@ -24,9 +24,12 @@ vector instructions of them; what a band of rows works on stays in the processor
 from __future__ import annotations
 
 import math
+import os
+import time
 import zlib
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from pathlib import Path
 from typing import Any, Literal
 
 import cv2
@@ -470,6 +473,7 @@ class Rig:
         Raises ValueError for a wrong scene and for a camera inside a box.
         """
         check_scene(scene)
+        _wait_while_compiled()
         return RigView(self, tuple(scene))
 
     def drift(self, time_s: float) -> float:
@@ -481,6 +485,15 @@ class Rig:
         frequencies, phases = _drift_spectrum(self.seed)
         angles = frequencies * (time_s / self.drift_time_s) + phases
         return float(self.drift_px * math.sqrt(2 / len(phases)) * np.cos(angles).sum())
+
+
+def _wait_while_compiled() -> None:
+    """Say so, and wait, while `course.py lab` compiles this: to do it here as well takes longer."""
+    mark, ends = Path(os.environ.get("COURSEKIT_COMPILING", "")), time.monotonic() + 300
+    if mark.is_file():
+        print("The fast parts are still being compiled, once, for a minute or so ...", flush=True)
+    while mark.is_file() and time.monotonic() < ends:
+        time.sleep(0.2)
 
 
 @dataclass(frozen=True, eq=False)
