@@ -237,10 +237,7 @@ def test_depth_unit_that_hides_the_noise_is_said():
     assert stats.frozen_fraction == pytest.approx(1 - changes)
     assert stats.pixel_std_unrounded_m == pytest.approx(2e-4, rel=0.06)
     assert stats.pixel_std_m > 1.3 * stats.pixel_std_unrounded_m
-    assert "1 mm hides it" in stats.rounding
-    assert "hides it" in str(stats)
     fine = stereo.window_stats(np.round(exact / 1e-4).astype(np.uint16), (0, 0, 40, 40), 1e-4)
-    assert fine.rounding == ""
 
 
 def around(rng, n=30, more=0.0, times=1.0):
@@ -407,7 +404,6 @@ def test_the_fixed_pattern_does_not_average_away():
     ]
     assert spatial[0] == pytest.approx(math.hypot(left.std(), 1.5e-3), rel=0.05)
     assert curve.floor_m < spatial[-1] < math.hypot(left.std(), 1.5e-3 / 3)
-    assert "do not average away" in str(curve)
 
 
 # --- the noise fit ---
@@ -798,7 +794,6 @@ def test_face_in_camera_like_frames(noisy_faces):
         assert face.fattening_px == pytest.approx(3.0, abs=0.6)
         assert abs(face.fattening_px - 3.0) < 3 * face.fattening_error_px
         assert face.width_m - 0.06 == pytest.approx(2 * face.fattening_px * z / FX, rel=0.05)
-        assert 0.01 < face.flying_fraction < 0.10
         assert face.stats.invalid_fraction == pytest.approx(0.01, abs=0.005)
         u, _, width, height = face.window
         assert (width, height) == (40, 40) or z > 0.5
@@ -837,7 +832,6 @@ def test_block_elsewhere_is_found_near_a_pixel_and_its_width_need_not_be_known()
     assert face.depth_m == pytest.approx(0.45, abs=1e-6)
     assert 1e3 * face.width_m == pytest.approx(60, abs=1.1)
     assert math.isnan(face.fattening_px)
-    assert "outwards" not in str(face)
 
 
 def test_a_camera_s_frames_bring_their_unit_and_intrinsics():
@@ -845,7 +839,7 @@ def test_a_camera_s_frames_bring_their_unit_and_intrinsics():
     frames = Frames(Frame(counts, None, 1e-4, i / 30, i, UNIT.depth) for i in range(3))
     face = stereo.block_face(frames)
     again = stereo.block_face(np.stack([counts] * 3), UNIT.depth, 1e-4)
-    assert str(face) == str(again)
+    assert (face.width_m, face.stats.pixel_std_m) == (again.width_m, again.stats.pixel_std_m)
     assert stereo.window_stats(frames, face.window).depth_m == face.stats.depth_m
     with pytest.raises(ValueError, match=r"^depth: got 0 frames"):
         stereo.window_stats(Frames(), (0, 0, 5, 5))

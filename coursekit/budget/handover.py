@@ -202,7 +202,9 @@ class HandOver:
         baseline_m = 1e-3 * self._also("01_pinhole", "baseline", usual_mm)
         return View(Intrinsics(width, height, fx, fy, cx, cy), LESSON_DISTANCE_M, baseline_m)
 
-    def terms(self, subtract_depth_bias: bool = False, mount: str = STANDING) -> tuple[ErrorTerm, ...]:
+    def terms(
+        self, subtract_depth_bias: bool = False, mount: str = STANDING
+    ) -> tuple[ErrorTerm, ...]:
         """The rows, each with its source.
 
         subtract_depth_bias: as if every depth were corrected by the bias that notebook 2 measured,

@@ -59,12 +59,10 @@ def two_eyes(fx: float, baseline_m: float, distance_m: float) -> LessonFigure:
         image.plot([u[name]] * 2, [row, 2], "o:", markevery=[0], **style)
         image.text(u[name] + 5, row, f"$u_{name[0].upper()}$", va="center", color=style["color"])
     above.plot(1000 * x, distance_m, "o", color=COLORS["ink"])
-    for ax, (left, right), y, what in (
-        (above, (0, 1000 * baseline_m), -0.15, "B"),
-        (image, (u["right"], u["left"]), 2.05, "d"),
-    ):
-        ax.annotate("", (left, y), (right, y), arrowprops={"arrowstyle": "<->"})
-        ax.text((left + right) / 2, y, what, ha="center", va="top" if what == "B" else "bottom")
+    ends = (0.0, 1000 * baseline_m), (u["right"], u["left"])
+    for ax, (low, high), y, what in zip((above, image), ends, (-0.2, 2.2), ("B", "d"), strict=True):
+        ax.annotate("", (low, y), (high, y), arrowprops={"arrowstyle": "<->"})
+        ax.text(high, y, f"  {what}", va="center")
     above.set(xlim=(-40, 130), ylim=(-0.4, 2.15), xlabel="X (mm)", ylabel="Z (m)")
     above.set_title(f"Z = {distance_m:.2f} m, B = {1000 * baseline_m:.0f} mm")
     image.set(xlim=(-150, 100), ylim=(-0.5, 2.5), xlabel="$u - c_x$ (px)")
@@ -205,8 +203,7 @@ def depth_image(
     shown = ax.imshow(np.where(depth_m > 0, depth_m, np.nan), vmin=0.2, vmax=1.2)
     fig.colorbar(shown, ax=ax, label="depth Z (m)", shrink=0.8)
     if flying is not None:
-        v, u = np.nonzero(flying)
-        ax.plot(u, v, "o", mfc="none", mec=COLORS["measured"], ms=5, mew=0.8)
+        ax.plot(*np.nonzero(flying)[::-1], "o", mfc="none", mec=COLORS["measured"], ms=5, mew=0.8)
     for name, (u, v) in (labels or {}).items():
         ax.annotate(name, (u, v), (u, v + 95), ha="center", fontsize=10, fontweight="bold",
                     bbox={"fc": "white", "ec": COLORS["ink"], "pad": 2},

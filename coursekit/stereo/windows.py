@@ -134,18 +134,6 @@ class WindowStats:
         low, high = self.pixel_std_m / np.sqrt(ends)
         return float(low), float(high)
 
-    @property
-    def rounding(self) -> str:
-        """What the depth unit does to `pixel_std_m`, in words; empty when it does little."""
-        std, step = self.pixel_std_unrounded_m, self.depth_scale_m
-        if step is None or math.isnan(std) or std >= step / 2:
-            return ""
-        return (
-            f"the depth unit of {1e3 * step:g} mm hides it: {self.frozen_fraction:.0%} of the "
-            f"pixels never change, before rounding it was {1e3 * std:.3f} mm if true depths lie "
-            "anywhere between two steps"
-        )
-
     def __repr__(self) -> str:
         start = f"{self.n_pixels} px, {counted(self.n_frames, 'frame')}"
         if math.isnan(self.depth_m):
@@ -164,8 +152,7 @@ class WindowStats:
         if self.not_gaussian:
             why = "; ".join(self.not_gaussian)
             text += f"; not one Gaussian noise, so the interval is wider: {why}"
-        said = f"{text}; {self.rounding}" if self.rounding else text
-        return wrapped(said, 84, indent="    ")
+        return wrapped(text, 84, indent="    ")
 
 
 def window_stats(depth: Any, window: Window, depth_scale_m: float | None = None) -> WindowStats:
@@ -473,7 +460,7 @@ def _drift_models(n: int) -> tuple[Floats, Floats, Floats, Floats, Integers]:
 # --- averaging ---
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True)
 class AveragingCurve:
     """What averaging N frames buys.
 
@@ -489,17 +476,6 @@ class AveragingCurve:
     gain: float
     floor_m: float | None
 
-    def __repr__(self) -> str:
-        low, high = self.effective_frames_interval
-        text = (
-            f"{self.n_frames} frames are worth {self.effective_frames:.0f} independent ones "
-            f"(95 %: {low:.0f} to {high:.0f});\n    their mean is {self.gain:.1f} times quieter "
-            f"than one frame ({math.sqrt(self.n_frames):.1f} if they were independent)"
-        )
-        if self.floor_m is None:
-            return text
-        return f"{text};\n    {1e3 * self.floor_m:.3f} mm do not average away"
-
 
 def averaging_curve(series_m: ArrayLike) -> AveragingCurve:
     """What the mean of N frames gains over one, and what stays in each pixel.
@@ -512,9 +488,8 @@ def averaging_curve(series_m: ArrayLike) -> AveragingCurve:
     pixels share the drift, so more of them do not narrow it.
     Raises ValueError for fewer than 8 frames, where no autocorrelation can be had.
 
-    >>> print(averaging_curve(0.5 + 0.001 * np.random.default_rng(1).standard_normal(64)))
-    64 frames are worth 64 independent ones (95 %: 2 to 64);
-        their mean is 8.0 times quieter than one frame (8.0 if they were independent)
+    >>> round(averaging_curve(np.random.default_rng(1).standard_normal(64)).effective_frames)
+    64
     """
     values = array("series_m", series_m, leading=True)
     long = values.ndim in (1, 3) and len(values) >= 8
