@@ -53,14 +53,17 @@ class MeasuringCamera(Protocol):
 
 @dataclass(frozen=True)
 class Origin:
-    """What stands in for a camera where somebody else's took the images: photographs in a folder.
+    """What stands in for a camera where one took the images that is none of ours: photographs.
 
-    >>> Origin("photographs in desk").source
+    color: what it reports of its own lens, nothing.
+
+    >>> Origin("photographs in my_photos").source
     'recorded'
     """
 
     name: str
     source: Source = "recorded"
+    color: None = None
 
 
 @dataclass(frozen=True)

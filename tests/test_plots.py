@@ -279,13 +279,13 @@ def intrinsics_figures() -> dict[str, plots.LessonFigure]:
     return {
         "best_fits": intrinsics.best_fits(X, Y, {"30 deg": seen}, 600.0),
         "board": intrinsics.board(BOARD),
-        "views": intrinsics.views(SESSION, boards.detect_all(shipped, BOARD, False)),
+        "views": intrinsics.views(str(SESSION), boards.detect_all(shipped, BOARD, False)),
         "coverage": intrinsics.coverage(two["Q"]),
         "residuals": intrinsics.residuals(two["Q"]),
         "uncertainty": intrinsics.uncertainty(two, 0.45),
         "two_sessions": intrinsics.two_sessions(two),
         "rules": intrinsics.rules(two, 0.45),
-        "signature": intrinsics.signature(two),
+        "rooms": intrinsics.rooms(two),
         "power": intrinsics.power(stored_power()),
         "difference": intrinsics.difference(compare(two["Q"], D435.color)),
     }

@@ -315,11 +315,11 @@ def test_links_between_sources_become_links_between_pages():
     html = build_site.markdown(
         page,
         "[a](02_depth_noise.ipynb#Start) [b](../data/corrections.md) [c](../data/lenses.toml)"
-        " [d](https://example.org/) [e](#start)",
+        " [d](https://example.org/) [e](#Exercise-1:-project)",
     )
     targets = re.findall(r'href="([^"]+)"', html)
     assert targets[:3] == ["02_depth_noise.html#Start", "corrections.html", "data/lenses.toml"]
-    assert targets[3:] == ["https://example.org/", "#start"]
+    assert targets[3:] == ["https://example.org/", "#exercise-1-project"]
     assert [*page.files] == ["data/lenses.toml"]
 
 

@@ -98,7 +98,7 @@ class Renderer(IPythonRenderer):
 
     def heading(self, text: str, level: int, **_: Any) -> str:
         """A heading that can be linked to."""
-        slug = re.sub(r"\W+", "-", re.sub(r"<[^>]*>", "", text).lower()).strip("-")
+        slug = _slug(re.sub(r"<[^>]*>", "", text))
         taken = {heading.id for heading in self.page.headings}
         names = (slug, *(f"{slug}-{n}" for n in range(2, len(taken) + 3)))
         unused = next(name for name in names if name not in taken)
@@ -137,6 +137,10 @@ class Renderer(IPythonRenderer):
         return figure_html(target, self.page.files[target], re.sub(r"<[^>]*>", "", text))
 
 
+def _slug(heading: str) -> str:
+    return re.sub(r"\W+", "-", heading.lower()).strip("-")
+
+
 def markdown(page: Page, text: str) -> str:
     """Markdown as HTML; the page notes its headings, and what it links to."""
     html = str(MarkdownWithMath(renderer=Renderer(page)).render(text))
@@ -146,8 +150,10 @@ def markdown(page: Page, text: str) -> str:
 def address(page: Page, url: str) -> str:
     """Where a link of a source leads from its page; a file that is linked to is copied along."""
     parts = urlsplit(url)
-    if parts.scheme or not parts.path:
+    if parts.scheme:
         return url
+    if not parts.path:
+        return f"#{_slug(unquote(parts.fragment))}"  # JupyterLab's has capitals
     target = (page.source.parent / unquote(parts.path)).resolve()
     if target in page_names():
         return page_names()[target] + (f"#{parts.fragment}" if parts.fragment else "")
