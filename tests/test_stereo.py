@@ -237,7 +237,6 @@ def test_depth_unit_that_hides_the_noise_is_said():
     assert stats.frozen_fraction == pytest.approx(1 - changes)
     assert stats.pixel_std_unrounded_m == pytest.approx(2e-4, rel=0.06)
     assert stats.pixel_std_m > 1.3 * stats.pixel_std_unrounded_m
-    fine = stereo.window_stats(np.round(exact / 1e-4).astype(np.uint16), (0, 0, 40, 40), 1e-4)
 
 
 def around(rng, n=30, more=0.0, times=1.0):
