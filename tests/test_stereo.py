@@ -222,7 +222,6 @@ def test_holes_jumps_and_frozen_pixels_are_counted_and_left_out():
     invalid = 1 - (np.isfinite(stack) & (stack > 0)).mean()
     assert stats.invalid_fraction == pytest.approx(invalid)
     assert stats.n_mismatches == pytest.approx(58, rel=0.15)
-    assert f"{stats.n_mismatches} mismatches left out" in " ".join(str(stats).split())
     assert not stats.not_gaussian
     assert stats.pixel_std_m == pytest.approx(5e-4, rel=0.03)
     assert stats.depth_m == pytest.approx(0.5, abs=2e-4)
@@ -279,7 +278,6 @@ def test_a_window_that_is_not_one_gaussian_noise_widens_its_interval_and_says_wh
     says, make = NOT_ONE_NOISE[kind]
     stats = stereo.window_stats(make(np.random.default_rng(5)), (0, 0, 40, 40))
     assert re.search(says, "; ".join(stats.not_gaussian)), stats.not_gaussian
-    assert "not one Gaussian noise, so the interval is wider" in " ".join(str(stats).split())
     assert stats.pixel_dof < (25_000 if "tails" in says else 40)  # of 46,425, and of 650
     if "surfaces" in says:  # the depth's interval reaches both
         apart = 0.008 if kind == "near surfaces" else 0.05
@@ -337,7 +335,6 @@ def test_one_frame_gives_no_noise_over_time():
     assert stats.depth_m == pytest.approx(0.5, abs=2e-4)
     nothing = (stats.pixel_std_m, stats.pixel_std_error_m, stats.mean_std_m)
     assert np.isnan([*nothing, *stats.pixel_std_interval_m]).all()
-    assert "no std over time from 1 frame" in str(stats)
 
 
 def test_window_without_a_valid_pixel_is_nan():
@@ -345,7 +342,6 @@ def test_window_without_a_valid_pixel_is_nan():
     assert stats.invalid_fraction == 1.0
     nothing = (stats.depth_m, stats.pixel_std_m, stats.spatial_std_m, stats.mean_std_m)
     assert np.isnan(nothing).all()
-    assert "no depth, 100% invalid" in str(stats)
 
 
 # --- averaging ---

@@ -18,7 +18,6 @@ import numpy as np
 from coursekit.arrays import AnyArray, ArrayLike, Bools, Floats, Integers, Interval, Window
 from coursekit.checks import array, positive, want
 from coursekit.stereo.law import unrounded_std
-from coursekit.words import counted, wrapped
 
 CORRELATION_PX = 12  # disparities farther apart than the matching window (11 px) are independent
 JUMP_SIGMAS = 8.0  # a sample this far from the rest is a mismatch, not noise
@@ -88,7 +87,7 @@ def clip_window(window: Window, stack: AnyArray) -> Window:
 # --- one window ---
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False)
 class WindowStats:
     """What a stack of depth images says in one window; lengths in m, NaN where nothing says it.
 
@@ -133,26 +132,6 @@ class WindowStats:
         ends = chi2.ppf([0.975, 0.025], self.pixel_dof) / self.pixel_dof
         low, high = self.pixel_std_m / np.sqrt(ends)
         return float(low), float(high)
-
-    def __repr__(self) -> str:
-        start = f"{self.n_pixels} px, {counted(self.n_frames, 'frame')}"
-        if math.isnan(self.depth_m):
-            return f"{start}: no depth, {self.invalid_fraction:.0%} invalid"
-        text = f"{start}: Z = {1e3 * self.depth_m:.2f} ± {1e3 * self.depth_error_m:.2f} mm, "
-        if math.isnan(self.pixel_std_m):
-            return f"{text}no std over time from {counted(self.n_frames, 'frame')}"
-        low, high = self.pixel_std_interval_m
-        text += (
-            f"std of a pixel {1e3 * self.pixel_std_m:.3f} mm (95 %: {1e3 * low:.3f} to "
-            f"{1e3 * high:.3f}), of the window's mean {1e3 * self.mean_std_m:.3f} mm, "
-            f"{self.invalid_fraction:.1%} invalid"
-        )
-        if self.n_mismatches:
-            text += f", {counted(self.n_mismatches, 'mismatch', 'mismatches')} left out"
-        if self.not_gaussian:
-            why = "; ".join(self.not_gaussian)
-            text += f"; not one Gaussian noise, so the interval is wider: {why}"
-        return wrapped(text, 84, indent="    ")
 
 
 def window_stats(depth: Any, window: Window, depth_scale_m: float | None = None) -> WindowStats:
