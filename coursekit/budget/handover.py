@@ -294,28 +294,18 @@ class HandOver:
     def _depth_bias(self, subtracted: bool) -> ErrorTerm:
         """By the law s Z - o Z²/(f B) that notebook 2 fitted; a file that holds the bias at 0.45 m
         alone has it taken for a scale, between a shift and what grows with Z²."""
-        name = NEEDED["02_depth_noise"][1]
-        notebook = self["02_depth_noise"]
-        found, known = notebook.result(name), notebook.result(name).covariances.get(LAW)
+        name, notebook = NEEDED["02_depth_noise"][1], self["02_depth_noise"]
+        found, whose = notebook.result(name), notebook.whose(name)
+        known = found.covariances.get(LAW)
         if known is None:
-            at = self.quantity("02_depth_noise", name)
-            mean, sigmas = (1e-3 / LESSON_DISTANCE_M * v for v in (at.value, at.sigma or 0.0))
-            law, root, whose = (mean, 0.0), np.array([[sigmas], [0.0]]), ", taken for a scale"
+            at, whose = self.quantity("02_depth_noise", name), whose + ", taken for a scale"
+            scale, sigma = (1e-3 / LESSON_DISTANCE_M * v for v in (at.value, at.sigma or 0.0))
+            mean, root = (scale, 0.0), np.array([[sigma], [0.0]])
         else:
-            s, o = (found.quantities[number].value for number in known.names)
-            law, root, whose = (s, o), scaled_root(np.array(known.matrix)), ""
-        factor = tuple(map(tuple, root.tolist()))
-        return ErrorTerm(
-            "depth bias",
-            "bias",
-            0.0,
-            SIGMAS,
-            "depth",
-            notebook.whose(name) + whose,
-            normal=True,
-            factor=factor,
-            mean=None if subtracted else law,
-        )
+            scale, offset = (found.quantities[number].value for number in known.names)
+            mean, root = (scale, offset), scaled_root(np.array(known.matrix))
+        rest = (True, tuple(map(tuple, root.tolist())), None if subtracted else mean)
+        return ErrorTerm("depth bias", "bias", 0.0, SIGMAS, "depth", whose, *rest)
 
     def _intrinsics(self) -> ErrorTerm:
         """By the covariance of K and lens together, where there is one; else by the sigmas.
