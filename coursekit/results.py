@@ -188,8 +188,12 @@ class Result:
 
 
 def folder() -> Path:
-    """Where the hand-over files are: COURSEKIT_RESULTS, else `results/` beside the package."""
-    return Path(os.environ.get("COURSEKIT_RESULTS") or ROOT / "results")
+    """Where the hand-over files are: COURSEKIT_RESULTS, else `results/` of the course.
+
+    Where the package was installed without the course: of the folder that one works in.
+    """
+    course = ROOT if (ROOT / "course.py").is_file() else Path.cwd()
+    return Path(os.environ.get("COURSEKIT_RESULTS") or course / "results")
 
 
 def save(

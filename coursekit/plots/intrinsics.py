@@ -199,7 +199,10 @@ def uncertainty(results: Mapping[str, IntrinsicsResult], range_m: float) -> Less
         levels = [x for x in LEVELS_PX if 0.02 < np.mean(sigma < x) < 0.99]  # room for a label
         lines = ax.contour(u, v, sigma, levels, colors="white", linewidths=1.2)
         lines.set_path_effects(edge)
-        ax.clabel(lines, fmt="%g px", fontsize=9, inline_spacing=1)
+        ends_at = np.array([width, height]) - 1
+        drawn = [path.vertices for path in lines.get_paths() if len(path)]
+        inside = [at[np.minimum(at, ends_at - at).min(axis=1).argmax()] for at in drawn]
+        ax.clabel(lines, fmt="%g px", fontsize=9, inline_spacing=1, manual=inside)
         for text in lines.labelTexts:
             text.set_path_effects(edge)
         image_axes(ax, width, height)

@@ -38,6 +38,7 @@ from coursekit.simulation.arm_poses import Setup
 from coursekit.simulation.board_images import render_board
 from coursekit.simulation.corner_sessions import Effects, corner_noise, printed, with_street_errors
 from coursekit.specifications import DATA, device
+from coursekit.words import counting
 
 Design = Literal["careful", "grid", "single_axis", "small_rotations"]
 Degrees = Literal["", "joints", "rotation_vectors"]
@@ -240,12 +241,12 @@ def rendered_session(
     BoardNotFound where the board is not found in one, which the poses are chosen to avoid.
     """
     truth, q, dq = _poses(mount, seed, n, arm_errors, HandEyeMistakes())
-    from tqdm.auto import tqdm
-
-    rendered = tqdm(
-        images_of(truth, seed), total=n, unit="image", leave=False, disable=not progress
-    )
-    images, board = list(rendered), truth.setup.board
+    images: list[Grey] = []
+    with counting(n, "image", progress) as counts:
+        for image in images_of(truth, seed):
+            images.append(image)
+            counts()
+    board = truth.setup.board
     found = [detect(image, board, f"view_{i:02d}") for i, image in enumerate(images)]
     return _reported(truth, q, dq, Detections(found)), truth, images
 
