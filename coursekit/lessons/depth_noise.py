@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from itertools import compress
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from coursekit.arrays import Floats
 from coursekit.lessons.exercises import Exercise, Model, Step
-from coursekit.specifications import device
+from coursekit.specifications import device  # noqa: F401  a wrong step in the TOML file uses it
 
 Bounds = tuple[int, int, int, int]  # first row, the one after the last; the same for columns
 
@@ -38,7 +38,7 @@ DEPTH_NOISE = Exercise(
     steps={
         "power": lambda Z: Z**2,
         "constant": lambda fx, baseline: fx * baseline,
-        "divide": lambda power, constant: power / constant,
+        "divide": lambda Z2, fxB: Z2 / fxB,
         "noise": lambda slope, sigma_d, Z: slope * sigma_d,
         "result": lambda sigma: sigma,
     },
@@ -47,7 +47,7 @@ DEPTH_NOISE = Exercise(
         (1.0, 447.0, 0.05, 0.08),
         (np.array([0.30, 0.45, 0.60]), 431.1, 0.0502, 0.08),
         (np.array([0.15, 0.20, 0.30, 0.45]), 425.0, 0.018, 0.06),
-        (np.array([[0.5, 0.7, 1.1], [1.3, 1.7, 1.9]]), 390.4, 0.0951, 0.25),
+        (np.array([[0.5, 0.7, 1.1], [1.3, 1.9, 7.5]]), 390.4, 0.0951, 0.25),
     ],
     per_row=1,
     unit="m",
@@ -57,45 +57,7 @@ DEPTH_NOISE = Exercise(
 )
 
 
-def _difference(between: Callable[[Any], Any]) -> Step:
-    """A difference of depths, which is the law's noise / between(noise / Z)."""
-
-    def noise(slope: Any, sigma_d: float, Z: Any) -> Any:
-        law = slope * sigma_d
-        return law / between(law / Z)
-
-    return noise
-
-
-DEPTH_NOISE.add_mistakes(
-    ("power", "linear_in_Z", lambda Z: Z),
-    ("power", "linear_in_Z", lambda Z: 2 * Z),
-    ("power", "cubed", lambda Z: Z**3),
-    ("constant", "millimetres", lambda fx, baseline: fx * baseline * 1000),
-    ("constant", "millimetres", lambda fx, baseline: fx * baseline / 1000),
-    ("constant", "baseline_forgotten", lambda fx, baseline: fx),
-    ("constant", "fx_forgotten", lambda fx, baseline: baseline),
-    ("constant", "constant_forgotten", lambda fx, baseline: 1.0),
-    # The notebook calls the simulated camera's baseline B.
-    ("constant", "other_baseline", lambda fx, baseline: fx * device("D435").unit.baseline_m),
-    ("constant", "other_baseline", lambda fx, baseline: fx * 0.050),
-    ("divide", "multiplied", lambda power, constant: power * constant),
-    ("constant", "baseline_behind_the_fraction", lambda fx, baseline: fx / baseline),
-    ("constant", "focal_length_behind_the_fraction", lambda fx, baseline: baseline / fx),
-    ("divide", "upside_down", lambda power, constant: constant / power),
-    ("noise", "noise_divided", lambda slope, sigma_d, Z: slope / sigma_d),
-    ("noise", "noise_forgotten", lambda slope, sigma_d, Z: slope),
-    ("noise", "root_of_two", lambda slope, sigma_d, Z: math.sqrt(2) * slope * sigma_d),
-    # fx B / (d - sigma_d) - Z; Z - fx B / (d + sigma_d); half of the two together; and the same
-    # with half of sigma_d to each side.
-    ("noise", "difference", _difference(lambda part: 1 - part)),
-    ("noise", "difference", _difference(lambda part: 1 + part)),
-    ("noise", "difference", _difference(lambda part: 1 - part**2)),
-    ("noise", "difference", _difference(lambda part: 1 - (part / 2) ** 2)),
-    ("result", "variance", lambda sigma: sigma**2),
-    ("result", "root", np.sqrt),
-    ("result", "negative", lambda sigma: -sigma),
-)
+DEPTH_NOISE.read_mistakes(globals())
 
 
 # --- robust_depth ---
@@ -215,6 +177,7 @@ ROBUST_DEPTH = Exercise(
         (IMAGE, 7, 6, 4, 20),
         (IMAGE, -9, 6),
         (IMAGE, 6, -9),
+        (7 * IMAGE, 10, 8),
     ],
     per_row=0,
     unit="m",
@@ -225,57 +188,4 @@ ROBUST_DEPTH = Exercise(
 )
 
 
-def _pixel_alone(image: Floats, row: int, column: int) -> Any:
-    height, width = image.shape
-    inside = 0 <= row < height and 0 <= column < width
-    return image[row, column] if inside and 0 < image[row, column] < math.inf else None
-
-
-def _pixel_alone_unless_zero(image: Floats, row: int, column: int) -> Any:
-    height, width = image.shape
-    known = -height <= row < height and -width <= column < width  # -9 counts from the far end
-    return image[row, column] if known and image[row, column] > 0 else None
-
-
-def _moved(start: int, stop: int, size: int) -> slice:
-    first = min(max(start, 0), size - (stop - start))
-    return slice(first, first + stop - start)
-
-
-def _height_width_swapped(image: Floats, top: int, bottom: int, left: int, right: int) -> Any:
-    height, width = image.shape
-    return _cut(_inside)(image, top, min(bottom, width), left, min(right, height))
-
-
-ROBUST_DEPTH.add_mistakes(
-    ("read", "u_v_swapped", lambda u, v: (v, u)),
-    ("round", "truncated", int),
-    ("window", "last_missing", lambda v, u, half: (v - half, v + half, u - half, u + half)),
-    ("window", "half_ignored", lambda row, column, half: _window(row, column, 2)),
-    ("window", "half_halved", lambda row, column, half: _window(row, column, half // 2)),
-    ("shortcut", "pixel_alone", _pixel_alone),
-    ("shortcut", "pixel_alone", _pixel_alone_unless_zero),
-    ("cut", "negative_index", _cut(_as_they_come)),
-    ("cut", "negative_index", _cut(_as_they_come, _inside)),
-    ("cut", "negative_index", _cut(_inside, _as_they_come)),
-    ("cut", "negative_index", _cut(lambda a, b, size: np.arange(a, min(b, size)))),
-    ("cut", "negative_end", _cut(lambda a, b, size: slice(max(a, 0), b))),
-    ("cut", "moved_inside", _cut(_moved)),
-    ("cut", "border_repeated", _cut(lambda a, b, size: np.clip(range(a, b), 0, size - 1))),
-    ("cut", "border_lost", _cut(lambda a, b, size: _inside(a, min(b, size - 1), size))),
-    ("cut", "border_lost", _cut(lambda a, b, size: slice(max(a, 0), min(b, size - 1)))),
-    ("cut", "modulo", _cut(lambda a, b, size: np.arange(a, b) % size)),
-    ("cut", "height_width_swapped", _height_width_swapped),
-    ("cut", "border_refused", _cut(lambda a, b, size: slice(a, b if a >= 0 and b <= size else a))),
-    ("zeros", "zeros_counted", lambda pixels: pixels),
-    ("finite", "nan_counted", lambda pixels: pixels),
-    ("finite", "infinity_counted", lambda pixels: pixels[~np.isnan(pixels)]),
-    ("enough", "min_valid_ignored", lambda valid, pixels, min_valid: True),
-    ("enough", "min_valid_fixed", lambda valid, pixels, min_valid: len(valid) >= 5),
-    ("enough", "one_too_strict", lambda valid, pixels, min_valid: len(valid) > min_valid),
-    ("enough", "all_pixels_counted", lambda valid, pixels, min_valid: pixels.size >= min_valid),
-    ("none", "zero_returned", lambda: 0.0),
-    ("middle", "mean", lambda valid: float(np.mean(valid))),
-    ("middle", "one_of_the_middle_two", lambda valid: float(np.sort(valid)[len(valid) // 2])),
-    ("middle", "one_of_the_middle_two", lambda valid: float(np.sort(valid)[(len(valid) - 1) // 2])),
-)
+ROBUST_DEPTH.read_mistakes(globals())

@@ -197,8 +197,7 @@ def displacement(lenses: Mapping[str, Intrinsics]) -> LessonFigure:
         grid, arrows = geometry.pixel_grid(*lens.size)[some, some], shift[some, some]
         ax.quiver(*np.moveaxis(grid, -1, 0), *np.moveaxis(arrows, -1, 0), angles="xy",
                   scale_units="xy", scale=1 / longer, color="white", width=0.005)  # fmt: skip
-        arrows_are = "true to scale" if longer == 1 else f"{longer} times too long"
-        title = f"{name}: edge {edge:.1f} px, corner {corner:.1f} px\narrows {arrows_are}"
+        title = f"{name}\nedge {edge:.1f} px, corner {corner:.1f} px, arrows ×{longer}"
         ax.set_title(title, fontsize=10)
         image_axes(ax, *lens.size)
         texts.append(f"{name}, {edge:.1f} px at an edge, {corner:.1f} px in a corner")
