@@ -16,9 +16,7 @@ import numpy as np
 
 from coursekit import checks, results
 from coursekit.arm import widowx
-from coursekit.arrays import ArrayLike
 from coursekit.budget.budget import SIGMAS, Along, ErrorBudget, ErrorTerm
-from coursekit.budget.propagation import Covariances
 from coursekit.budget.view import GRIPPER_DOWN, View
 from coursekit.checks import want
 from coursekit.geometry import Intrinsics
@@ -169,10 +167,6 @@ class HandOver:
             raise ValueError(f"{lesson}: holds no {names.replace('|', ' or ')}")
         return found
 
-    def covariance(self, lesson: str) -> Covariance | None:
-        """Of the numbers that this notebook estimated together, None where it kept none."""
-        return self[lesson].result().covariances.get(COVARIANCE_OF.get(lesson, ""))
-
     @property
     def source(self) -> Source:
         """Of the whole: "reference" as soon as one notebook's numbers are the reference's."""
@@ -248,30 +242,9 @@ class HandOver:
                 wrist = wrist.with_term(term)
         return wrist.at(autocorrelation=own.autocorrelation, title=own.title)
 
-    def covariances(self, view: View, arm: ArrayLike | None = None) -> Covariances:
-        """What `propagate` takes, from the same numbers: noise and what calibration left unknown.
-
-        arm (6, 6): of the gripper's twist, as `arm.fk_covariance(q).covariance`; None: exact. The
-        depth bias, which has a known size, is not in it. The mount's covariance is in the frame in
-        which notebook 4 gave X: the gripper's for a camera on the wrist, else the base's; the
-        `Chain` must be of the same mount.
-        """
-        K, X = self._known("03_intrinsics"), self._known("04_hand_eye")
-        order = [X.names.index(name) for name in MOUNT_TWIST]
-        unit = np.repeat([math.radians(1.0), 1e-3], 3)
-        depth = self._depth_noise()
-        return Covariances(
-            pixel=np.eye(2),
-            depth_sigma_m=depth.at_object_m(view)[1] / float(np.linalg.norm(view.ray)),
-            intrinsics=np.array(K.matrix),
-            names=K.names,
-            hand_eye=np.array(X.matrix)[np.ix_(order, order)] * np.outer(unit, unit),
-            arm=arm,
-        )
-
     def _known(self, lesson: str) -> Covariance:
         """The covariance that the notebook kept, else the sigmas of the numbers needed."""
-        known, names = self.covariance(lesson), NEEDED[lesson]
+        known, names = self[lesson].result().covariances.get(COVARIANCE_OF[lesson]), NEEDED[lesson]
         if known is not None and set(names) <= set(known.names) <= {*PARAMETERS, *MOUNT_TWIST}:
             return known
         sigmas = [self.quantity(lesson, name).sigma for name in names]
@@ -321,8 +294,7 @@ class HandOver:
         return ErrorTerm("intrinsics", "bias", 0.0, SIGMAS, "intrinsics", whose, True, rows)
 
     def _hand_eye(self, mount: str) -> tuple[ErrorTerm, ErrorTerm]:
-        """The root mean square over the three axes: a row knows no frame. What `propagate` takes
-        is the whole covariance of the camera on the wrist."""
+        """The root mean square over the three axes: a row knows no frame."""
         notebook, known = self["04_hand_eye"], self._known("04_hand_eye")
         fixed, of = notebook.result().eye_to_hand, notebook.result().quantities["tx"].note
         order = [known.names.index(name) for name in MOUNT_TWIST]
