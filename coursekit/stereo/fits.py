@@ -490,7 +490,8 @@ def _bias_notes(fit: BiasFit) -> Iterator[str]:
     else:
         of_both = fit.sigma("baseline_error") * fit.sigma("disparity_offset_px")
         correlation = fit.covariance[0, 1] / of_both
-        if abs(correlation) > 0.9:
+        ends = fit.interval("baseline_error"), fit.interval("disparity_offset_px")
+        if abs(correlation) > 0.9 and any(low <= 0 <= high for low, high in ends):
             yield (
                 f"these distances hardly tell the two apart (correlation {correlation:.2f}): "
                 "use their sum, the bias at a distance"
