@@ -89,7 +89,7 @@ def test_there_is_a_figure_of_every_function(figures) -> None:
         if function.__annotations__["return"] == "LessonFigure"
     }
     assert drawing == {name.partition(" ")[0] for name in figures}
-    assert len(drawing) == 38
+    assert len(drawing) == 39
 
 
 def test_similar_triangles_shows_f_x_over_z() -> None:
@@ -330,7 +330,7 @@ def hand_eye_figures() -> dict[str, plots.LessonFigure]:
     counts = (12, 25)
     return {
         "mounts": hand_eye.mounts(rigs, joints),
-        "diversity": hand_eye.diversity({"this session": session.T_base_gripper}),
+        "diversity": hand_eye.diversity(session.T_base_gripper),
         "study": hand_eye.study(error_study(trials=5)),
         "more_poses": hand_eye.more_poses(counts, {"a": [3.0, 2.9]}, {"a": [1.0, 0.7]}),
         "agreement": hand_eye.agreement(unknown_sessions(11)),
