@@ -134,6 +134,7 @@ def each_but(*long):
     """All sessions; these, which take ten seconds each, by night."""
     return [pytest.param(name, marks=nightly) if name in long else name for name in SESSIONS]
 
+
 STILL = {  # the board is paper and no more is wrong, or what is wrong has no name here
     "doosan": {"bowed_board", "no_edge_corners"},
     "opencv": {"bowed_board"},

@@ -22,8 +22,8 @@ changed(
         "Rotation.align_vectors(a, b)[0].as_matrix() -> (np.linalg.pinv(b) @ a).T": (
             "not_a_rotation"
         ),
-        "Rotation.align_vectors(a, b)[0].as_matrix() -> R_A[0] @ R_B[0].T": None,
-        "align_vectors(a, b)[0] -> from_matrix(R_A @ np.swapaxes(R_B, 1, 2)).mean()": None,
+        "Rotation.align_vectors(a, b)[0].as_matrix() -> R_A[0] @ R_B[0].T": "same_frame",
+        "align_vectors(a, b)[0] -> from_matrix(R_A @ np.swapaxes(R_B, 1, 2)).mean()": "same_frame",
         "as_matrix -> as_rotvec": None,
         ".as_matrix() -> ": None,
     },
