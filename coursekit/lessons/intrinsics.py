@@ -70,15 +70,6 @@ REPROJECTION_RMS = Exercise(
 )
 
 
-def _everywhere(measure: Step) -> Step:
-    """The same measure of the errors in u, of those in v and of the distances."""
-
-    def whole(residuals: Floats, result: Floats) -> Any:
-        return measure(np.column_stack([residuals, np.linalg.norm(residuals, axis=1)]))
-
-    return whole
-
-
 REPROJECTION_RMS.read_mistakes(globals())
 
 
