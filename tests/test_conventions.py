@@ -99,7 +99,7 @@ def test_a_learners_functions_beside_them() -> None:
     assert core[4].model == "modified_brown_conrady"  # theirs leaves the distortion in
     assert core[4].yours_m < 1e-4
     assert core[2].yours_m > 0.1
-    assert str(core[4]).endswith("37.326        -    0.000")
+    assert str(core[4]).endswith("37.326      -  0.000")
 
 
 def test_the_stored_table_serves_without_the_library(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -229,12 +229,12 @@ def depth_noise_figures() -> dict[str, plots.LessonFigure]:
         "prices": depth_noise.prices({"D405": (425.0, 0.018), "D435": (431.0, 0.050)}, 0.08),
         "infrared_pair": depth_noise.infrared_pair(image, image, (424, 240), 48.3, 5),
         "cost_curve": depth_noise.cost_curve(costs, 48.3),
-        "depth_image": depth_noise.depth_image(np.ones((480, 848)), {"card": (300.0, 200.0)}),
+        "depth_image": depth_noise.depth_image(
+            np.ones((480, 848)), {"card": (300.0, 200.0)}, np.eye(480, 848) > 0),
         "noise_law": depth_noise.noise_law([0.3, 1.0], [0.3, 3.7], [0.01, 0.1],
                                            (z, law, 0.9 * law, 1.1 * law), {"other": (z, law)}),
-        "averaging": depth_noise.averaging(
-            [1, 2, 4], [1.0, 0.8, 0.7], [0.1, 0.1, 0.2], [1.0, 0.71, 0.5]
-        ),
+        "two_eyes": depth_noise.two_eyes(431.0, 0.05, 0.5),
+        "averaging": depth_noise.averaging([1, 2, 4], [1.0, 0.8, 0.7], 0.65),
     }  # fmt: skip
 
 
@@ -330,7 +330,7 @@ def hand_eye_figures() -> dict[str, plots.LessonFigure]:
     counts = (12, 25)
     return {
         "mounts": hand_eye.mounts(rigs, joints),
-        "diversity": hand_eye.diversity({"this session": session.T_base_gripper}),
+        "diversity": hand_eye.diversity(session.T_base_gripper),
         "study": hand_eye.study(error_study(trials=5)),
         "more_poses": hand_eye.more_poses(counts, {"a": [3.0, 2.9]}, {"a": [1.0, 0.7]}),
         "agreement": hand_eye.agreement(unknown_sessions(11)),

@@ -58,7 +58,7 @@ class Agreement:
     def __str__(self) -> str:
         sizes = self.project_px, self.round_trip_px, self.yours_px, self.yours_m
         texts = ["-" if size is None else f"{size:.3f}" for size in sizes]
-        return f"{self.model:22} {self.coefficients:21}" + "".join(f"{t:>9}" for t in texts)
+        return f"{self.model:22} {self.coefficients:21}" + "".join(f"{t:>7}" for t in texts)
 
 
 def measure(*yours: Function) -> list[Agreement]:

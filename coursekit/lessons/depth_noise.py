@@ -1,4 +1,4 @@
-"""Notebook 02: its two exercises and the mistakes that people make in them."""
+"""Notebook 02: its exercises and the mistakes that people make in them."""
 
 from __future__ import annotations
 
@@ -169,3 +169,144 @@ ROBUST_DEPTH = Exercise(
 
 
 ROBUST_DEPTH.read_mistakes(globals())
+
+
+# --- table_row ---
+
+_FAR = 8 * 1.4826  # times the median distance from a pixel's median: a mismatch, see `stereo`
+
+
+def _left_out(z: Floats) -> Floats:
+    off = np.abs(z - np.nanmedian(z, axis=0))
+    return np.where(off > _FAR * np.nanmedian(off), np.nan, z)
+
+
+def _variances(z: Floats, ddof: int = 1) -> Floats:
+    return np.asarray(np.nanvar(z, axis=0, ddof=ddof))
+
+
+def _pooled(z: Floats) -> Any:
+    """Each pixel's variance over time, their mean, its root."""
+    return np.sqrt(np.nanmean(_variances(z)))
+
+
+def _pooled_by_samples(z: Floats) -> Any:
+    """The same with each pixel counted by its degrees of freedom."""
+    dof = np.maximum(np.isfinite(z).sum(axis=0) - 1, 0)
+    return np.sqrt(np.nansum(dof * _variances(z)) / dof.sum())
+
+
+def _steady(z: Floats) -> Floats:
+    """Only the pixels that are valid in every frame."""
+    return z[:, np.isfinite(z).all(axis=0)][..., None]
+
+
+def _build_table_row(steps: Mapping[str, Step]) -> Model:
+    def table_row(counts: Any, scale: float, distance: float) -> Any:
+        step_mm = 1e3 * scale
+        z = steps["depth"](counts, step_mm)
+        for_bias, for_std = steps["keep"](z)
+        bias = steps["bias"](steps["level"](for_bias), 1e3 * distance)
+        std = steps["report"](steps["std"](for_std), len(z))
+        return np.array([*steps["unit"]((bias, std), step_mm), steps["invalid"](counts)])
+
+    return table_row
+
+
+def _table_case(shape: tuple[int, int, int], scale: float, distance: float, seed: int) -> Any:
+    """Counts of a face with a pattern that stays; from 100 samples on with holes and mismatches."""
+    rng = np.random.default_rng(seed)
+    face = distance / scale + rng.normal(-8 if seed % 2 else 8, 6, shape[1:])
+    z = face + rng.uniform(1, 6, shape[1:]) * rng.uniform(-1.7, 1.7, shape)
+    if z.size > 100:
+        at = rng.choice(z.size, 9, replace=False)
+        z.flat[at[:7]] = 0
+        z.flat[at[7:] if seed % 2 else []] += 700
+    return np.rint(z).astype(np.uint16), scale, distance
+
+
+def _describe_table_row(args: tuple[Any, ...]) -> str:
+    counts, scale, distance = args
+    what = f"counts {counts.shape} up to {counts.max()}, {np.sum(counts == 0)} of them 0"
+    return f"{what}; scale = {scale:g} m, distance = {distance:g} m"
+
+
+TABLE_ROW = Exercise(
+    name="depth_noise.table_row",
+    build=_build_table_row,
+    steps={
+        "depth": lambda counts, step: np.where(counts > 0, step * counts, np.nan),
+        "keep": lambda z: (z, z),
+        "level": np.nanmean,
+        "bias": lambda level, distance: level - distance,
+        "std": _pooled,
+        "report": lambda std, frames: std,
+        "unit": lambda both, step: both,
+        "invalid": lambda counts: np.mean(counts == 0),
+    },
+    cases=[
+        _table_case((4, 2, 2), 0.001, 0.5, 0),
+        _table_case((6, 3, 4), 0.0001, 0.3, 2),
+        _table_case((10, 4, 5), 0.0001, 0.45, 4),
+        _table_case((10, 5, 4), 0.00025, 0.3, 5),
+        _table_case((16, 4, 5), 0.0001, 0.6, 7),
+    ],
+    per_row=0,
+    unit="(mm, mm, 1)",
+    tolerance=1e-7,
+    describe=_describe_table_row,
+    show=lambda row: f"({', '.join(f'{v:.5g}' for v in np.ravel(row))})",
+    nan_answers=True,
+    way="mismatches kept",
+    ways=[  # how the means and variances of pixels with holes are weighted is free
+        (f"mismatches {way}", {"keep": keep, "level": level, "std": std})
+        for way, keep in (("kept", lambda z: (z, z)), ("left out", lambda z: (_left_out(z),) * 2))
+        for level in (np.nanmean, lambda z: np.nanmean(np.nanmean(z, axis=0)))
+        for std in (_pooled, _pooled_by_samples)
+    ][1:],
+)
+# Tried two at a time are only these steps': with eight ways to be right, all would take too long.
+TABLE_ROW.read_mistakes(globals(), ("bias", "unit", "report", "invalid"))
+
+
+# --- standard_errors ---
+
+
+def _build_standard_errors(steps: Mapping[str, Step]) -> Model:
+    def standard_errors(z: Floats) -> Any:
+        frames, pixels = len(z), z[0].size
+        stays = np.nanstd(np.nanmean(z, axis=0), ddof=1) / math.sqrt(steps["patches"](pixels))
+        moves = np.nanstd(np.nanmean(z, axis=(1, 2)), ddof=1) / math.sqrt(steps["frames"](frames))
+        of_std = _pooled(z) / math.sqrt(steps["squares"](pixels, frames))
+        return np.array([steps["sum"](stays, moves), of_std])
+
+    return standard_errors
+
+
+def _errors_case(shape: tuple[int, int, int], seed: int) -> tuple[Floats]:
+    rng = np.random.default_rng(seed)
+    z = 450 + rng.normal(0, 0.4, shape[1:]) + rng.normal(0, 0.7, shape)
+    z += rng.normal(0, 0.3, shape[0])[:, None, None]
+    if seed:
+        z.flat[rng.choice(z.size, 20, replace=False)] = np.nan
+    return (z.round(3),)
+
+
+STANDARD_ERRORS = Exercise(
+    name="depth_noise.standard_errors",
+    build=_build_standard_errors,
+    steps={
+        "patches": lambda pixels: pixels / 12**2,
+        "frames": lambda n: n,
+        "sum": math.hypot,
+        "squares": lambda pixels, n: 2 * (n - 1) * pixels / 8**2,
+    },
+    cases=[_errors_case((5 + 3 * i, 12 + 8 * i, 12 + 9 * i), i) for i in range(3)],
+    per_row=0,
+    unit="mm",
+    tolerance=1e-9,
+    describe=lambda args: f"z of shape {args[0].shape}, {np.sum(np.isnan(args[0]))} of it NaN",
+    show=TABLE_ROW.show,
+    nan_answers=True,
+)
+STANDARD_ERRORS.read_mistakes(globals())

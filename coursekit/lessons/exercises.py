@@ -23,9 +23,9 @@ import inspect
 import itertools
 import traceback
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +78,8 @@ class Exercise:
     result has rows and the first `per_row` arguments have the same, one row of them is shown;
     otherwise (a result that is one number, say) the whole case. Results agree within `tolerance`
     (in `unit`) or 1e-9 of their size, and NaN with NaN. Where `nan_answers`, NaN is an answer
-    like any other; otherwise a wrong model that comes to NaN or infinity has overflowed. An
+    like any other; otherwise a wrong model that comes to NaN or infinity has overflowed. ways:
+    other right answers, what each does and the steps that do it; `way` is what the model does. An
     attempt that leaves out what is beyond the `core` is judged by the core cases alone: by an
     exercise that has only those, and is `part_of` this one.
     """
@@ -93,6 +94,8 @@ class Exercise:
     describe: Callable[[tuple[Any, ...]], str]
     show: Callable[[Floats], str]
     nan_answers: bool = False
+    way: str = ""
+    ways: list[tuple[str, dict[str, Step]]] = field(default_factory=list)
     core: Core | None = None
     mistakes: list[Mistake] = field(default_factory=list)
     part_of: Exercise | None = field(default=None, repr=False)
@@ -119,12 +122,16 @@ class Exercise:
             says, ask = (" ".join(text.split()) for text in texts[name])
             self.mistakes.append(Mistake(name, says, ask, step, instead, alone or not step))
 
-    def read_mistakes(self, names: dict[str, Any]) -> None:
-        """Add the wrong steps that stand in the TOML file; names: what their Python may use."""
+    def read_mistakes(self, names: dict[str, Any], in_pairs: Sequence[str] = ()) -> None:
+        """Add the wrong steps that stand in the TOML file; names: what their Python may use.
+
+        in_pairs: the steps whose mistakes are also tried two at a time; all, where none is named.
+        """
         for name, ways in self._written("wrong")[self.function].items():
-            self.add_mistakes(
-                *((step, name, eval(" ".join(code.split()), names)) for step, code in ways)
-            )
+            for step, code in ways:
+                alone = bool(in_pairs) and step not in in_pairs
+                wrong = eval(" ".join(code.split()), names)
+                self.add_mistakes((step, name, wrong), alone=alone)
 
     def _written(self, table: str) -> dict[str, Any]:
         return dict(questions.lesson_texts(self.name.partition(".")[0])[table])
@@ -144,7 +151,17 @@ class Exercise:
         """The verdict on a learner's function, without noting it."""
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            return self._verdict(function)
+            verdicts = [exercise._verdict(function) for exercise in (*self._others, self)]
+        known = ("right", *(m.name for m in self.mistakes))
+        return min(verdicts[::-1], key=lambda v: (v.named or v.kind) not in known)
+
+    @cached_property
+    def _others(self) -> list[Exercise]:
+        """The exercise as those see it who answer it in another right way, without the device."""
+        others = [replace(self, way=w, steps=self.steps | own, ways=[]) for w, own in self.ways]
+        for other in others:
+            other._edits.extend(([], []))
+        return others
 
     def _verdict(self, function: Callable[..., Any]) -> Verdict:
         if not callable(function):
@@ -227,7 +244,8 @@ class Exercise:
             core, others = self.part_of.core, len(self.part_of.cases) - count
             text = f"the core is right: all {count} cases {core.which} agree."
             return self._say("core right", f"{text} Deeper: the other {others} use {core.rest}.")
-        text = f"right. All {count} cases agree to {self.tolerance:g} {self.unit}."
+        way = f", {self.way}" if self.way else ""
+        text = f"right{way}. All {count} cases agree to {self.tolerance:g} {self.unit}."
         return self._say("right", text)
 
     def _judged(

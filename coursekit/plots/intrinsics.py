@@ -21,7 +21,6 @@ from coursekit.plots.style import (
     COLORS,
     LessonFigure,
     cross,
-    figure,
     image_axes,
     panels,
     plain_ticks,
@@ -174,16 +173,9 @@ def residuals(result: IntrinsicsResult) -> LessonFigure:
     )
 
 
-def _arrows(
-    ax: Any,
-    at: Floats,
-    vectors: Floats,
-    times: float,
-    color: str = "measured",
-    width: float = 0.003,
-) -> None:
+def _arrows(ax: Any, at: Floats, vectors: Floats, times: float, width: float = 0.003) -> None:
     ax.quiver(*at.T, *(times * vectors.T), angles="xy", scale_units="xy", scale=1, width=width,
-              color=COLORS[color])  # fmt: skip
+              color=COLORS["measured"])  # fmt: skip
 
 
 def uncertainty(results: Mapping[str, IntrinsicsResult], range_m: float) -> LessonFigure:
@@ -285,14 +277,11 @@ def rules(rows: Mapping[str, IntrinsicsResult], range_m: float) -> LessonFigure:
 
 def rooms(results: Mapping[str, IntrinsicsResult]) -> LessonFigure:
     """What failures leave: the RMS of each view, and a pattern in the view that suffers most."""
-    n, columns = len(results), 3
-    fig = figure(9.6, 4.1 * -(-n // columns))
-    bands = fig.subfigures(-(-n // columns), 1, squeeze=False).ravel()
-    rows = [band.subplots(2, columns, height_ratios=(1, 2.4)) for band in bands]
-    bars = np.concatenate([row[0] for row in rows])
-    views = np.concatenate([row[1] for row in rows])
-    for empty in (*bars[n:], *views[n:]):
-        empty.set_visible(False)
+    columns = min(len(results), 3)
+    rows = -(-len(results) // columns)
+    heights = (1, 2.4) * rows
+    fig, axes = panels(2 * rows * columns, columns, 9.6, 2.0, height_ratios=heights)
+    bars, views = np.moveaxis(np.reshape(axes, (rows, 2, columns)), 1, 0).reshape(2, -1)
     usual = float(np.median([np.median(r.per_view_rms_px) for r in results.values()]))
     for bar, view, (name, result) in zip(bars, views, results.items(), strict=False):
         rms = result.per_view_rms_px
