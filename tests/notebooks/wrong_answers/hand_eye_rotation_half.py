@@ -50,7 +50,7 @@ changed(
 )
 
 
-@wrong("mirror_image")
+@wrong("mirrored")
 def kabsch_without_the_determinant(R_A, R_B):
     a, b = _axis_times_angle(R_A), _axis_times_angle(R_B)
     U, _, Vt = np.linalg.svd(a.T @ b)
