@@ -43,7 +43,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return options.run(options) or 0
     except (ck.cameras.CameraError, OSError, ValueError) as error:
         name, colon, said = str(error).partition(": ")
-        print(f"coursekit: {_typed(OPTIONS.get(name, name) + colon + said)}", file=sys.stderr)
+        said = _typed(OPTIONS.get(name, name) + colon + said)
+        print(f"coursekit: {said}", file=sys.stderr)
         return 1
     except KeyboardInterrupt as stopped:
         print(f"coursekit: {stopped or 'stopped, nothing was written'}", file=sys.stderr)
