@@ -93,16 +93,11 @@ def _least_squares(seed: int, rows: int, columns: int, sigma: float) -> tuple[Fl
     return J, noise - J @ np.linalg.lstsq(J, noise, rcond=None)[0]
 
 
-def _freedom(J: Floats, residuals: Floats) -> int:
-    M, P = J.shape
-    return M - P
-
-
 FOCAL_SIGMA = Exercise(
     name="intrinsics.focal_sigma",
     build=_build_sigma,
     steps={
-        "freedom": _freedom,
+        "freedom": lambda J, residuals: J.shape[0] - J.shape[1],
         "noise": lambda residuals, freedom: residuals @ residuals / freedom,  # a variance
         "information": lambda J: J.T @ J,
         "first": lambda information: np.linalg.inv(information)[0, 0],
