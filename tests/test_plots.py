@@ -89,7 +89,7 @@ def test_there_is_a_figure_of_every_function(figures) -> None:
         if function.__annotations__["return"] == "LessonFigure"
     }
     assert drawing == {name.partition(" ")[0] for name in figures}
-    assert len(drawing) == 38
+    assert len(drawing) == 39
 
 
 def test_similar_triangles_shows_f_x_over_z() -> None:
