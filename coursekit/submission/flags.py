@@ -6,21 +6,26 @@ A flag takes no points. It says what was seen, and what else could explain it.
 from __future__ import annotations
 
 import base64
+import contextlib
+import csv
 import hashlib
+import io
 import json
 import math
 import re
 import unicodedata
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from coursekit import specifications
 from coursekit.arrays import Bools, Floats, NDArray
+from coursekit.checks import want
 from coursekit.submission.format import CameraFacts, Stack, Submission
 from coursekit.submission.recompute import SEEN, Recomputed, grading_rules
 
@@ -32,6 +37,16 @@ FRAMES_FOUND = 8  # of these, for the stacks to be the same measurement
 CLIPPED_AT = 4.0  # times what is typical: a few changed values must not hide a copy
 PERFECT_CLOCK_S = 1e-8  # no real clock keeps step so well
 WORDS_IN_A_ROW = 3  # words in a row, by which paragraphs are compared
+MOODLE = re.compile(
+    r"(?:^|/)(?P<at>(?P<name>[^/]+?)_(?P<id>\d+)_assignsubmission_(?:file|onlinetext)_?)"
+)
+CANVAS = re.compile(r"(?:^|/)(?P<name>[^/_]+)(?P<late>_LATE)?_(?P<id>\d{2,})_\d{2,}_[^/]+$")
+NAMES = ("name", "full name", "student", "student name")  # columns of a roster
+FIRST_AND_LAST = ("first name", "last name", "surname")
+IDS = (
+    *("id", "identifier", "student id", "id number", "number", "sis user id", "sis login id"),
+    *("login", "username", "email", "email address", "e-mail"),
+)
 SHARED_RUNS = 0.7  # part of the runs of the shorter of two paragraphs that the other one has too
 
 
@@ -447,12 +462,151 @@ def _nearly(groups: Mapping[str, tuple[str, ...]], prints: Mapping[str, Fingerpr
     return copies_found
 
 
-# --- who shares words -----------------------------------------------------------------------
+# --- who is who -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Place:
+    """What the name of a file says that Moodle or Canvas made; all but `feedback` empty elsewhere.
+
+    feedback: the name of a student's page in a zip that the same LMS takes back.
+    """
+
+    feedback: str
+    lms: str = ""
+    name: str = ""
+    id: str = ""
+    late: bool = False
+
+
+def place(file: str) -> Place:
+    """Whose a file is by its name.
+
+    >>> place("Ada Lovelace_17_assignsubmission_file_/studio_1.zip")
+    Place(feedback='Ada Lovelace_17_assignsubmission_file_/feedback.html', lms='Moodle', \
+name='Ada Lovelace', id='17', late=False)
+    >>> place("lovelaceada_LATE_1234_56789_studio_1.zip").feedback
+    'lovelaceada_LATE_1234_56789_studio_1.html'
+    """
+    if found := MOODLE.search(file):
+        within = "/" * file[found.end() :].startswith("/")
+        return Place(f"{found['at']}{within}feedback.html", "Moodle", found["name"], found["id"])
+    stem = file.rpartition("/")[2].rpartition(".")[0] or file.rpartition("/")[2]
+    if found := CANVAS.search(file):
+        return Place(f"{stem}.html", "Canvas", found["name"], found["id"], bool(found["late"]))
+    return Place(f"{stem}.html")
+
+
+def words_of(name: str) -> list[str]:
+    """The words of a name; case, accents and signs without a width do not matter."""
+    plain = unicodedata.normalize("NFKD", unicodedata.normalize("NFKD", name).casefold())
+    kept = "".join(sign for sign in plain if unicodedata.category(sign) not in ("Mn", "Cf"))
+    return re.findall(r"[^\W_]+", kept)
+
+
+def spellings(name: str) -> set[str]:
+    """A name as one word, beginning with any of its words: "Lovelace, Ada" is "Ada Lovelace"."""
+    words = words_of(name)
+    return {"".join(words[i:] + words[:i]) for i in range(len(words))}
 
 
 def person(name: str) -> str:
-    """A student's name for telling whether two are one: case and spaces do not matter."""
-    return " ".join(unicodedata.normalize("NFKC", name).casefold().split())
+    """A name for telling whether two are one."""
+    return min(spellings(name), default="")
+
+
+@dataclass(frozen=True)
+class Person:
+    """Somebody of the class. key: one a person; row: what the roster says, by column."""
+
+    key: str
+    name: str
+    row: Mapping[str, str] = field(default_factory=dict)
+
+
+class Roster:
+    """A class: the rows of a table, and whoever an LMS names besides."""
+
+    def __init__(self, rows: Sequence[Mapping[str, str]] = ()) -> None:
+        self.people: dict[str, Person] = {}
+        self._known: dict[str, set[str]] = {}
+        for row in rows:
+            cells = {column.strip().casefold(): value for column, value in row.items()}
+            name = next((cells[c] for c in NAMES if cells.get(c)), "")
+            name = name or " ".join(filter(None, (cells.get(c) for c in FIRST_AND_LAST)))
+            ids = {column: cells[column] for column in IDS if cells.get(column)}
+            if person(name) in ("", "pointspossible") and not ids:
+                continue  # an empty line, or the second one of Canvas
+            key = next(iter(ids.values()), person(name))
+            want(key not in self.people, "roster", key, "every student once")
+            clues = [*(f"#{column} {value}" for column, value in ids.items()), *ids.values()]
+            self._add(Person(key, name or key, row), clues)
+
+    def _add(self, one: Person, clues: Iterable[str]) -> None:
+        self.people[one.key] = one
+        for clue in {*spellings(one.name), *map(str.casefold, clues)}:
+            self._known.setdefault(clue, set()).add(one.key)
+
+    def find(self, *clues: str) -> Person | None:
+        """Who it is by the first of these names or ids that is one person's."""
+        for clue in clues:
+            hits: set[str] = set(self._known.get(clue.casefold(), ()))
+            hits = hits.union(*(self._known.get(spelling, ()) for spelling in spellings(clue)))
+            if len(hits) == 1:
+                return self.people[hits.pop()]
+        return None
+
+    def of_place(self, at: Place) -> Person:
+        """Who hands in from a place of an LMS: of the roster, or new."""
+        key = f"{at.lms} {at.id}"
+        clue = f"#identifier participant {at.id}" if at.lms == "Moodle" else f"#id {at.id}"
+        known = self.people.get(key) or self.find(clue, at.name)
+        if known is None or (known.key != key and not known.row):  # another of the same name
+            known = Person(key, at.name)
+            self._add(known, [key])
+        return known
+
+    def of_file(self, file: str, typed: str) -> Person:
+        """Who handed in a file: by the LMS's name of it, by a folder's, then by what was typed."""
+        at, folders = place(file), file.split("/")[:-1]
+        if at.lms:
+            return self.of_place(at)
+        stem = at.feedback.removesuffix(".html").removeprefix("studio_1_").replace("_", " ")
+        found = self.find(*folders, *([typed] if typed else [stem]))
+        return found or Person(person(typed) or f"file {file}", typed)
+
+    def other_name(self, one: Person, typed: str) -> Iterator[Flag]:
+        """What to say where the name in a bundle is not that of who handed it in."""
+        if not typed or spellings(typed) & spellings(one.name) or typed.strip() in one.row.values():
+            return
+        other = self.find(typed)
+        if other is not None and other.key != one.key:
+            yield _flag("another_student", typed=typed, name=one.name)
+        else:
+            alike = bool({*words_of(typed)} & {*words_of(one.name)})
+            yield replace(_flag("other_name", typed=typed, name=one.name), note=alike)
+
+
+def read_table(path: Path) -> list[dict[str, str]]:
+    """The rows of a table as a spreadsheet writes it: `,`, `;` or tabs; UTF-8, UTF-16 or Windows'.
+
+    Raises ValueError for a file that is none.
+    """
+    data = path.read_bytes()
+    codes = ["utf-16"] if data[:2] in (b"\xff\xfe", b"\xfe\xff") else ["utf-8-sig", "cp1252"]
+    for code in codes:
+        with contextlib.suppress(UnicodeDecodeError):
+            text = data.decode(code)
+            sign = max(",;\t", key=text.partition("\n")[0].count)
+            try:
+                rows = list(csv.DictReader(io.StringIO(text, newline=""), delimiter=sign))
+            except csv.Error as error:
+                raise ValueError(f"{path.name}: is no table ({error})") from None
+            return [{k: (v or "").strip() for k, v in row.items() if k} for row in rows]
+    raise ValueError(f"{path.name}: is no table of text; save it as CSV, UTF-8")
+
+
+# --- who shares words -----------------------------------------------------------------------
 
 
 def same_words(said: Mapping[str, tuple[str, str]]) -> list[Copy]:

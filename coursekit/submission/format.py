@@ -334,7 +334,7 @@ def read_bundle(source: bytes | Path) -> Submission:
 def _bytes_of(path: Path) -> bytes:
     """The bytes of a file, one more than allowed at most: then it is too large."""
     try:
-        if not path.is_file():  # opening a pipe would wait for ever
+        if path.is_symlink() or not path.is_file():  # opening a pipe would wait for ever
             raise Refused("not_a_file", f"{shown(path.name)} is not there, or no plain file")
         with path.open("rb") as file:
             return file.read(MAX_FILE + 1)
