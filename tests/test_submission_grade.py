@@ -249,7 +249,7 @@ def test_a_wrong_std_is_named_once():
     only_there = with_part(EXACT, "plot", measured_mm=(near, 10 * middle, far))
     wrong = with_row(only_there, 1, depth_std_mm=10 * middle)
     assert [says.partition(":")[0] for says in shortcomings(wrong)] == ["Std of depth at 0.45 m"]
-    assert "in your table, which is judged there (0.45 m)" in item(wrong, "plot").says
+    assert item(wrong, "plot").verdict == "right"
     assert item(only_there, "plot").verdict == "partial"  # not in the table: the plot's own fault
 
 
