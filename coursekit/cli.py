@@ -17,6 +17,16 @@ from typing import Any
 import coursekit as ck
 from coursekit import doctor
 
+OPTIONS = {  # what the functions call what is typed here
+    "path": "--out",
+    "n": "--frames",
+    "which": "--camera",
+    "square_m": "--square-mm (here in m)",
+    "marker_m": "--marker-mm (here in m)",
+    "distance_m": "--distance",
+    **{name: f"--{name}" for name in ("squares", "paper", "dictionary", "workers", "timeout")},
+}
+INSTEAD = {"overwrite=True": "--overwrite", "run this cell again": "run this again"}
 CAMERAS = "auto (default), simulated, a serial number or a recording"
 
 
@@ -27,6 +37,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     bundles; a bundle to hand in is done when it is written. Wrong usage exits with 2, as argparse
     does.
     """
+    if (sys.argv[1:] if arguments is None else list(arguments)) == ["--version"]:
+        print(f"coursekit {doctor.edition()}")
+        return 0
     options = _parser().parse_args(arguments)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -34,16 +47,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return options.run(options) or 0
     except (ck.cameras.CameraError, OSError, ValueError) as error:
-        said = str(error).replace("overwrite=True", "--overwrite")  # which is Python's way
-        print(f"coursekit: {said}", file=sys.stderr)
+        name, colon, said = str(error).partition(": ")
+        print(f"coursekit: {_typed(OPTIONS.get(name, name) + colon + said)}", file=sys.stderr)
         return 1
     except KeyboardInterrupt as stopped:
         print(f"coursekit: {stopped or 'stopped, nothing was written'}", file=sys.stderr)
         return 130
 
 
+def _typed(text: str) -> str:
+    """The text as somebody reads it who types options and not Python."""
+    for python, option in INSTEAD.items():
+        text = text.replace(python, option)
+    return text
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="coursekit", description="The course's tools.")
+    parser.add_argument("--version", action="store_true", help="say which course this is, and end")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     def command(name: str, run: Callable[..., Any], says: str, **more: Any) -> Any:
@@ -58,10 +79,12 @@ def _parser() -> argparse.ArgumentParser:
     the.add_argument("--overwrite", action="store_true", help="replace an existing file")
 
     the = command("board", _board, "print a calibration board to true scale")
-    the.add_argument("--kind", choices=("checkerboard", "charuco"), default="charuco")
+    kinds = "charuco (default): chessboard with markers, may be seen in part"
+    the.add_argument("--kind", choices=("checkerboard", "charuco"), default="charuco", help=kinds)
     squares = "columns x rows of squares (inner corners are one fewer each way)"
     the.add_argument("--squares", required=True, type=_squares, metavar="9x6", help=squares)
-    the.add_argument("--square-mm", required=True, type=float, metavar="MM")
+    side = "the side of a square"
+    the.add_argument("--square-mm", required=True, type=float, metavar="MM", help=side)
     the.add_argument("--marker-mm", type=float, metavar="MM", help="default: 0.75 of a square")
     the.add_argument("--dictionary", metavar="NAME", help="of a ChArUco board's markers")
     the.add_argument("--paper", default="A4", metavar="NAME", help="A4 (default) to A0, Letter")
@@ -84,10 +107,7 @@ def _parser() -> argparse.ArgumentParser:
 
     _add_grade(command)
     _add_export(command)
-
-    says = "say what works here, and what to do about the rest"
-    the = command("doctor", lambda options: doctor.run(options.camera), says)
-    the.add_argument("--camera", default="auto", metavar="WHICH", help=CAMERAS)
+    _add_doctor(command)
     return parser
 
 
@@ -113,10 +133,18 @@ def _add_grade(command: Callable[..., Any]) -> None:
     the.add_argument("--late-after", type=datetime.fromisoformat, metavar="MOMENT", help=late)
     the.add_argument("--separator", choices=(",", ";"), default=",", help="of the tables' cells")
     the.add_argument("--workers", type=int, metavar="N", help="processes, default: one a core")
-    timeout = "seconds of a processor a bundle, default: 10"
+    timeout = "seconds a bundle, default: 10"
     the.add_argument("--timeout", type=float, default=10.0, metavar="S", help=timeout)
     finished = "replace a finished report; only what has changed is graded"
     the.add_argument("--overwrite", action="store_true", help=finished)
+
+
+def _add_doctor(command: Callable[..., Any]) -> None:
+    says = "say what works here, and what to do about the rest"
+    more = "A line for each thing that must work: Python, packages, browser, camera and its link."
+    the = command("doctor", lambda o: doctor.run(o.camera, o.json), says, description=more)
+    the.add_argument("--camera", default="auto", metavar="WHICH", help=CAMERAS)
+    the.add_argument("--json", action="store_true", help="the same for programs, and for a report")
 
 
 def _export(options: argparse.Namespace) -> None:
@@ -150,7 +178,7 @@ def _squares(text: str) -> tuple[int, int]:
 
 def _record(options: argparse.Namespace) -> None:
     with ck.open_camera(options.camera) as camera:
-        print(camera)
+        print(_typed(str(camera)))
         path = camera.record(options.out, options.frames, overwrite=options.overwrite)
     print(f"Wrote {path}. Play it with ck.open_camera({str(path)!r}).")
 

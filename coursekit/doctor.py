@@ -14,10 +14,12 @@ import contextlib
 import importlib
 import io
 import itertools
+import json
 import os
 import platform
 import re
 import shutil
+import subprocess
 import sys
 import tempfile
 import textwrap
@@ -25,15 +27,25 @@ import time
 import webbrowser
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 Condition = Literal["ok", "note", "problem"]
 
-OLDEST, NEWEST_TESTED = (3, 11), (3, 13)
+OLDEST, NEWEST_TESTED, TOO_NEW = (3, 11), (3, 13), (3, 15)
 PINS = Path(__file__).resolve().parents[1] / "requirements.txt"
+WITHOUT_PACKAGES = {
+    ("win32", "ARM64"): (
+        "Windows on ARM",
+        "install the Python for x86-64 (64-bit, not ARM64), which runs there; or use a hub",
+    ),
+    ("darwin", "x86_64"): (
+        "Intel processors under macOS",
+        "on an Apple-silicon Mac take the arm64 Python; else use another computer or a hub",
+    ),
+}
 LOADED = ("numpy", "scipy", "cv2", "numba", "matplotlib", "ipywidgets")
 UDEV_FOLDERS = tuple(map(Path, ("/etc/udev/rules.d", "/usr/lib/udev/rules.d", "/lib/udev/rules.d")))
 LEAST_FREE_BYTES = 100_000_000  # results, recordings, bundles
@@ -86,11 +98,16 @@ class CheckUp:
 Check = Callable[..., CheckUp | Iterable[CheckUp] | None]
 
 
-def run(camera: str = "auto") -> int:
+def run(camera: str = "auto", as_json: bool = False) -> int:
     """Print a line for each check as it is made; 0 when nothing is a problem, 1 otherwise.
 
-    camera: what `open_camera` takes: "auto", "simulated", a serial number or a recording.
+    camera: what `open_camera` takes: "auto", "simulated", a serial number or a recording. as_json:
+    one object for programs instead, when all are made.
     """
+    if as_json:
+        lines = list(checks(camera))
+        print(json.dumps({"coursekit": edition(), "checks": list(map(asdict, lines))}, indent=1))
+        return int(any(line.verdict == "problem" for line in lines))
     if isinstance(sys.stdout, io.TextIOWrapper):  # a pipe on Windows cannot show every letter
         sys.stdout.reconfigure(errors="replace")
     found = Counter[Condition]()
@@ -139,16 +156,28 @@ def _python() -> CheckUp:
         return CheckUp("problem", f"{says}: too old, want {wanted} or newer", install)
     elif sys.maxsize < 2**32:
         return CheckUp("problem", f"{says}: a 32-bit Python, it lacks the packages", install)
-    elif (sys.platform, platform.machine()) == ("darwin", "x86_64"):
-        return CheckUp(
-            "problem",
-            f"{says}: some packages no longer exist for Intel processors under macOS",
-            "on an Apple-silicon Mac take the arm64 Python; else use another computer or a hub",
-        )
+    elif sys.version_info[:2] >= TOO_NEW:
+        return CheckUp("problem", f"{says}: too new, some packages do not exist for it", install)
+    elif (computer := (sys.platform, platform.machine())) in WITHOUT_PACKAGES:
+        lacks, remedy = WITHOUT_PACKAGES[computer]
+        return CheckUp("problem", f"{says}: some packages do not exist for {lacks}", remedy)
     elif sys.version_info[:2] > NEWEST_TESTED:
         return CheckUp("note", f"{says}: newer than what the course was tested with", install)
     else:
         return CheckUp("ok", says)
+
+
+def edition() -> str:
+    """The course's version, and in a clone the commit."""
+    version, git = _version("coursekit") or "not installed", ["git", "rev-parse", "--short", "HEAD"]
+    if not (PINS.parent / ".git").exists() or shutil.which("git") is None:
+        return version
+    said = subprocess.run(git, cwd=PINS.parent, capture_output=True, text=True, check=False)
+    return f"{version}, commit {said.stdout.strip()}" if said.returncode == 0 else version
+
+
+def _course() -> CheckUp:
+    return CheckUp("ok", edition())
 
 
 class Pin(NamedTuple):
@@ -232,6 +261,17 @@ def _loading() -> CheckUp:
     return _ok_if(not failed, says, INSTALL, "problem")
 
 
+def _opencv() -> CheckUp:
+    """Whether one package brings cv2, and it is what was loaded: of two the last one wins."""
+    import cv2
+
+    brings = sorted(set(metadata.packages_distributions().get("cv2", ())))
+    says = f"cv2 {cv2.__version__} comes from {' and '.join(brings) or 'no package'}"
+    good = len(brings) == 1 and _version(brings[0]).startswith(cv2.__version__)
+    away = f"`pip uninstall {' '.join(brings)}`, then {INSTALL}"
+    return _ok_if(good and hasattr(cv2, "calibrateHandEye"), says, away, "problem")
+
+
 def _kernel() -> CheckUp:
     """Whether the notebooks' kernel is this environment's; it is not started."""
     from jupyter_client.kernelspec import KernelSpecManager, NoSuchKernel
@@ -257,7 +297,7 @@ def _kernel() -> CheckUp:
 def _browser() -> CheckUp:
     elsewhere = (
         "`python3 course.py lab` prints an address: open it in a browser on this computer, or from "
-        "another one through `ssh -L 8888:localhost:8888 ...`"
+        "another one through `ssh -L PORT:localhost:PORT ...`, PORT being the number in it"
     )
     if "JUPYTERHUB_SERVICE_PREFIX" in os.environ:
         return CheckUp("ok", "a hub serves the notebooks to the browser that you have open")
@@ -293,9 +333,11 @@ def _results() -> CheckUp:
 
 
 COMPUTER = (
+    ("Course", _course),
     ("Python", _python),
     ("Packages", _packages),
     ("Loading", _loading),
+    ("OpenCV", _opencv),
     ("Kernel", _kernel),
     ("Browser", _browser),
     ("results/", _results),

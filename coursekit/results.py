@@ -53,14 +53,17 @@ class MeasuringCamera(Protocol):
 
 @dataclass(frozen=True)
 class Origin:
-    """What stands in for a camera where somebody else's took the images: photographs in a folder.
+    """What stands in for a camera where one took the images that is none of ours: photographs.
 
-    >>> Origin("photographs in desk").source
+    color: what it reports of its own lens, nothing.
+
+    >>> Origin("photographs in my_photos").source
     'recorded'
     """
 
     name: str
     source: Source = "recorded"
+    color: None = None
 
 
 @dataclass(frozen=True)
@@ -185,8 +188,12 @@ class Result:
 
 
 def folder() -> Path:
-    """Where the hand-over files are: COURSEKIT_RESULTS, else `results/` beside the package."""
-    return Path(os.environ.get("COURSEKIT_RESULTS") or ROOT / "results")
+    """Where the hand-over files are: COURSEKIT_RESULTS, else `results/` of the course.
+
+    Where the package was installed without the course: of the folder that one works in.
+    """
+    course = ROOT if (ROOT / "course.py").is_file() else Path.cwd()
+    return Path(os.environ.get("COURSEKIT_RESULTS") or course / "results")
 
 
 def save(

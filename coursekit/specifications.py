@@ -19,7 +19,8 @@ from coursekit import checks
 from coursekit.arrays import Floats
 from coursekit.geometry import Intrinsics, make_transform
 
-DATA = Path(__file__).resolve().parents[1] / "data"
+PACKAGE = Path(__file__).resolve().parent
+DATA = next(p for p in (PACKAGE / "data", PACKAGE.parent / "data") if p.is_dir())  # wheel, checkout
 
 
 @dataclass(frozen=True)

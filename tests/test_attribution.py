@@ -22,9 +22,17 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import f, f_oneway, ncf, t
 
 from coursekit.arm import widowx
-from coursekit.attribution import Entry, Ledger, attribute, significance, simulate_misses
+from coursekit.attribution import (
+    Entry,
+    Ledger,
+    attribute,
+    four_sets,
+    significance,
+    simulate_misses,
+)
 from coursekit.attribution.ledger import LEDGER_HEADER
 from coursekit.attribution.significance import mean_test, place_test, pose_columns, pose_test
+from coursekit.attribution.verdict import REMEDY
 
 SETS = 1000 if NIGHTLY else 120
 SOME = 400 if NIGHTLY else 50  # where repeats are
@@ -445,6 +453,16 @@ def test_the_same_seed_gives_the_same_misses_and_the_truth_adds_up():
         own = one.misses - one.constant_m - one.by_pose_m
         std = 0.006 if kind == "cannot_tell_yet" else 0.002
         assert own.std() == pytest.approx(std, rel=0.4)  # of 45 numbers
+
+
+def test_each_unit_has_four_sets_of_its_own_one_of_each_kind():
+    kinds = {}
+    for unit in (7, 3):
+        sets = four_sets(unit)
+        said = {name: attribute(s.misses, s.T_base_gripper).verdict for name, s in sets.items()}
+        assert sorted(said.values()) == sorted(REMEDY)
+        kinds[unit] = [*said.values()]
+    assert kinds[7] != kinds[3]
 
 
 def test_an_arm_error_is_as_large_as_said_and_has_no_constant_over_the_table():

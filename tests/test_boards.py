@@ -409,6 +409,7 @@ def test_a_folder_names_every_file_it_does_not_use(mixed_folder, capfd):
         detect_all(mixed_folder / "folder.png", CHARUCO)
     assert said.startswith("3 views with 120 corners, 6 not used\n  turned.jpg: 40 corners in 640")
     assert "\n  not used: empty.png: the file is empty" in said
+    assert "\n  not used: cut.jpg: the file is cut off, its end is missing (and 1 more)" in said
     assert capfd.readouterr() == ("", "")
 
 

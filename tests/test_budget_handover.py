@@ -90,24 +90,6 @@ def test_intrinsics_use_the_correlations(folders: tuple[Path, Path]) -> None:
     assert covariance[0, 1] == pytest.approx(expected, rel=1e-6)  # base -y, -x: the signs cancel
 
 
-def test_what_propagate_takes(folders: tuple[Path, Path]) -> None:
-    write(YOURS)
-    handed = hand_over(folders[1])
-    given = handed.covariances(handed.view().moved(distance_m=0.6))
-    assert given.names == K
-    assert np.diag(given.intrinsics)[4] == pytest.approx(0.004**2)
-    twist = np.sqrt(np.diag(given.hand_eye))  # rad and m, from the sigmas: no covariance was kept
-    assert np.degrees(twist[:3]) == pytest.approx([0.05, 0.06, 0.07])
-    assert 1e3 * twist[3:] == pytest.approx([0.6, 0.8, 1.0])
-    f_B = 430.0 * handed.view().baseline_m
-    assert given.depth_sigma_m == pytest.approx(0.36 * 0.07 / f_B)
-    C = np.full((6, 6), 0.5) + 0.5 * np.eye(6)
-    results.save("04_hand_eye", YOURS, mounted([1.0] * 6), {"X": Covariance(TWIST, C)})
-    kept = np.asarray(hand_over(folders[1]).covariances(handed.view()).hand_eye)
-    assert kept[0, 5] == pytest.approx(0.5 * math.radians(1) * 1e-3)
-    assert kept[1, 1] == pytest.approx(math.radians(1) ** 2)
-
-
 def test_nothing_yet(folders: tuple[Path, Path]) -> None:
     handed = hand_over(folders[1])
     for lesson, found in zip(NEEDED, handed, strict=True):

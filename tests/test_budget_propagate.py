@@ -146,18 +146,6 @@ def test_where_first_order_fails() -> None:
     assert bad.mean_m[2] == pytest.approx(0.25 * math.radians(5) ** 2, rel=0.02)
 
 
-def test_depth_from_disparity_is_skewed_far_away() -> None:
-    view = eb.Chain(eb.lesson_view())
-    small = eb.Covariances(depth_sigma_m=0.45 * 0.01)
-    assert eb.check_first_order(view, small, 200_000, through_disparity=True).worst < 0.02
-    large = eb.Covariances(depth_sigma_m=0.45 * 0.2)
-    check = eb.check_first_order(view, large, 200_000, through_disparity=True)
-    assert check.ratio[2] < 0.9
-    assert check.mean_m[2] < -0.01  # looking down: deeper is lower
-    wild = eb.monte_carlo(view, eb.Covariances(depth_sigma_m=0.45), 1000, through_disparity=True)
-    assert 0.1 < np.isnan(wild[:, 2]).mean() < 0.25  # P(n > 1) = 0.16: no depth
-
-
 def test_the_parts_add() -> None:
     where, all_of_it = chain("eye_in_hand", LENS, 0.5, 701.0, 92.0), errors(0.5, 0.5, lens=True)
     nothing = eb.Covariances(names=PARAMETERS)

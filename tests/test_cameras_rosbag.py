@@ -164,9 +164,7 @@ def depth_m(depth, k):
 def test_a_recording_without_depth_is_named_for_what_it_is(tmp_path, name):
     driver = Driver(tmp_path / name)
     driver.messages = lambda: [("/lidar/image", 1.0, driver.image(1.0, "lidar", "mono8", grey(1)))]
-    with pytest.raises(
-        CameraError, match=r"ROS topics \(/lidar/image \.\.\.\) without depth"
-    ):
+    with pytest.raises(CameraError, match=r"ROS topics \(/lidar/image \.\.\.\) without depth"):
         open_camera(driver.write())
 
 

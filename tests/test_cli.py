@@ -37,14 +37,22 @@ def test_record_writes_a_recording_and_says_how_to_play_it(tmp_path, capsys):
     assert cli.main([*arguments, "--overwrite"]) == 0
 
 
+def test_it_says_which_course_this_is(capsys):
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"coursekit {cli.doctor.edition()}\n"
+
+
 FAILURES = [
-    ("record --out a.bag --frames 3 --camera simulated", "path: got 'a.bag', want"),
-    ("record --out a.db3 --frames 0 --camera simulated", "n: got 0, want a whole"),
-    ("record --out a.db3 --frames 3 --camera bogus", "which: got 'bogus', want"),
-    ("record --out a.db3 --frames 3 --camera=", "which: got '', want"),
-    ("board --out a.pdf --squares 9x6 --square-mm 40", "paper: a board of 360 x 240 mm does"),
-    ("board --out a.pdf --squares 9x1 --square-mm 25", "squares: got (9, 1), want (columns, "),
-    ("board --out a.pdf --squares 9x6 --square-mm -1", "square_m: got -0.001, want 0.000"),
+    ("record --out a.bag --frames 3 --camera simulated", "--out: got 'a.bag', want"),
+    ("record --out a.db3 --frames 0 --camera simulated", "--frames: got 0, want a whole"),
+    ("record --out a.db3 --frames 3 --camera bogus", "--camera: got 'bogus', want"),
+    ("record --out a.db3 --frames 3 --camera=", "--camera: got '', want"),
+    ("board --out a.pdf --squares 9x6 --square-mm 40", "--paper: a board of 360 x 240 mm does"),
+    ("board --out a.pdf --squares 9x1 --square-mm 25", "--squares: got (9, 1), want (columns, "),
+    (
+        "board --out a.pdf --squares 9x6 --square-mm -1",
+        "--square-mm (here in m): got -0.001, want 0.000",
+    ),
 ]
 
 

@@ -91,15 +91,15 @@ def test_the_vendors_inverse_model_is_the_named_misconception() -> None:
 def test_a_learners_functions_beside_them() -> None:
     rows = conventions.measure(geometry.project, geometry.deproject)
     assert all(row.yours_px == row.project_px for row in rows)
-    off_mm = {(r.model, r.coefficients): r.yours_mm for r in rows}
-    assert off_mm["brown_conrady", "radial and tangential"] < 0.1
-    assert off_mm["modified_brown_conrady", "radial"] == pytest.approx(282.5, abs=0.1)
+    off_m = {(r.model, r.coefficients): r.yours_m for r in rows}
+    assert off_m["brown_conrady", "radial and tangential"] < 1e-4
+    assert off_m["modified_brown_conrady", "radial"] == pytest.approx(0.2825, abs=1e-4)
     core = conventions.measure(lambda *_: None, lambda p, z, K, _: geometry.deproject(p, z, K))
     assert {row.yours_px for row in core} == {None}
     assert core[4].model == "modified_brown_conrady"  # theirs leaves the distortion in
-    assert core[4].yours_mm < 0.1
-    assert core[2].yours_mm > 100
-    assert str(core[4]).endswith("37.326 px           -    0.000 mm")
+    assert core[4].yours_m < 1e-4
+    assert core[2].yours_m > 0.1
+    assert str(core[4]).endswith("37.326      -  0.000")
 
 
 def test_the_stored_table_serves_without_the_library(monkeypatch: pytest.MonkeyPatch) -> None:

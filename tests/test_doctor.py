@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import re
 import subprocess
 import sys
@@ -77,20 +78,51 @@ def test_this_computer_with_the_simulated_camera(capsys):
     ("owner", "attribute", "value", "verdict", "says"),
     [
         (sys, "version_info", (3, 10, 4), "problem", "3.10.4 .* too old, want 3.11 or newer"),
-        (sys, "version_info", (3, 15, 0), "note", "newer than what the course was tested with"),
+        (sys, "version_info", (3, 14, 0), "note", "newer than what the course was tested with"),
+        (sys, "version_info", (3, 15, 0), "problem", "too new, some packages do not exist"),
         (sys, "version_info", (3, 12, 1), "ok", "3.12.1 on"),
         (sys, "maxsize", 2**31 - 1, "problem", "a 32-bit Python"),
         (doctor.platform, "machine", lambda: "x86_64", "problem", "Intel processors"),
+        (doctor.platform, "machine", lambda: "ARM64", "problem", "Windows on ARM"),
     ],
 )
 def test_python(monkeypatch, owner, attribute, value, verdict, says):
     if attribute == "machine":
-        monkeypatch.setattr(sys, "platform", "darwin")
+        system = "win32" if value() == "ARM64" else "darwin"
+        monkeypatch.setattr(sys, "platform", system)
     monkeypatch.setattr(owner, attribute, value)
     found = doctor._python()
     assert found.verdict == verdict
     assert re.search(says, found.says)
     assert ("Python 3.13" in found.remedy or "a hub" in found.remedy) == (verdict != "ok")
+
+
+@pytest.mark.parametrize(
+    ("brings", "version", "verdict"),
+    [
+        (["opencv-python-headless"], "", "ok"),
+        (["opencv-python-headless", "opencv-python"], "", "problem"),
+        (["opencv-python-headless"], "5.0.0", "problem"),
+        ([], "", "problem"),
+    ],
+)
+def test_one_package_brings_opencv(monkeypatch, brings, version, verdict):
+    if version:
+        monkeypatch.setattr("cv2.__version__", version)
+    monkeypatch.setattr(doctor.metadata, "packages_distributions", lambda: {"cv2": brings})
+    found = doctor._opencv()
+    assert found.verdict == verdict
+    assert ("pip uninstall" in found.remedy) == (verdict == "problem")
+
+
+def test_the_same_for_programs(monkeypatch, capsys):
+    monkeypatch.setattr(doctor, "COMPUTER", (("Python", doctor._python),))
+    monkeypatch.setattr(doctor, "_cameras", lambda which: CheckUp("problem", f"no {which}", "buy"))
+    assert doctor.run("auto", as_json=True) == 1
+    said = json.loads(capsys.readouterr().out)
+    assert said["coursekit"] == doctor.edition()
+    camera = {"verdict": "problem", "says": "no auto", "remedy": "buy", "check": "Camera"}
+    assert said["checks"][-1] == camera
 
 
 PINS = """\

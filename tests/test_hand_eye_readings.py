@@ -141,7 +141,7 @@ def test_arms_that_err_at_each_pose_are_not_accused() -> None:
 
 def test_random_rotations_get_no_name() -> None:
     """Many candidates fit a few poses by chance; "nothing fits" is the honest word."""
-    for seed, n in ((1, 8), (3, 15), (4, 25)):
+    for seed, n in ((1, 8), (3, 15), (4, 25)) if NIGHTLY else ((1, 8),):
         given = session(seed, n)
         T = given.T_base_gripper.copy()
         T[:, :3, :3] = Rotation.random(n, rng=np.random.default_rng(seed)).as_matrix()

@@ -18,10 +18,12 @@ from coursekit.hand_eye import observability
 from coursekit.hand_eye.poses import camera_board
 from coursekit.hand_eye.session import HandEyeSession
 from coursekit.simulation.arm_sessions import (
+    FOLDER_VIEWS,
     SECONDS,
     HandEyeMistakes,
     hand_eye_session,
     rendered_session,
+    session_folder,
     truth_of,
 )
 from coursekit.simulation.corner_sessions import Effects
@@ -253,12 +255,13 @@ def read(folder: Path, **options) -> HandEyeSession:
 
 def test_shipped_sessions_are_what_make_data_makes(shipped) -> None:
     for folder, session in zip(SHIPPED, shipped, strict=True):
-        assert len(session) == make_data.HAND_EYE_VIEWS
+        assert len(session) == FOLDER_VIEWS
         assert session.skipped == ()
         assert sum(path.stat().st_size for path in folder.iterdir()) < 1.6e6
         truth = truth_of(folder)
         assert truth.mount == session.mount
-        seed, _ = make_data.HAND_EYE[session.mount]
+        seed = make_data.HAND_EYE_SEED
+        assert session_folder(session.mount, seed, folder) == folder
         made, _ = hand_eye_session(session.mount, seed, len(session), 0.0, ArmErrors())
         np.testing.assert_allclose(session.q, made.q, atol=1e-7)
         np.testing.assert_allclose(session.T_base_gripper, made.T_base_gripper, atol=1e-7)

@@ -104,7 +104,7 @@ def test_i2_tilt_makes_the_focal_length_known() -> None:
         if tilt not in (percent if NIGHTLY else (2, 20)):
             continue
         rng, focal, sigmas = np.random.default_rng(tilt), [], []
-        for _ in range(300 if NIGHTLY else 50):
+        for _ in range(300 if NIGHTLY else 20):
             noisy = [replace(d, pixels=d.pixels + rng.normal(0, 0.2, (54, 2))) for d in clean]
             try:
                 found = intrinsics.calibrate(noisy, CHECKERBOARD, model="none")

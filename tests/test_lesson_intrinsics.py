@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -15,6 +18,7 @@ from coursekit.lessons import CHECKPOINTS
 from coursekit.lessons import intrinsics as lesson
 from coursekit.plots import intrinsics as figures
 from coursekit.simulation.corner_sessions import Effects, corner_session
+from tools import build_notebooks
 
 BOARD = ck.boards.Board("charuco", squares=(9, 6), square_m=0.025)
 CHECKERBOARD = ck.boards.Board("checkerboard", squares=(10, 7), square_m=0.025)
@@ -120,13 +124,67 @@ def test_a_bowed_board_spoils_fx_and_not_the_rms() -> None:
     assert abs(result.intrinsics.fx - LENS.fx) > 5 * result.sigma("fx")
 
 
+X, Y = (a.ravel() for a in np.meshgrid(np.linspace(-0.1, 0.1, 9), np.linspace(-0.06, 0.06, 6)))
+
+
+def predict(f: float, Z: float, tilt: float) -> np.ndarray:
+    """The notebook's board of three unknowns."""
+    depth = Z + X * np.sin(tilt)
+    return np.concatenate([f * X * np.cos(tilt) / depth, f * Y / depth])
+
+
+def test_three_facts_give_f_and_its_sigma_goes_as_one_over_the_tilt_squared() -> None:
+    for tilt_deg, ratio in ((10, 1.07), (40, 1.30)):  # at the same Z
+        near, *_, far = predict(600, 0.5, np.radians(tilt_deg))[-9:]  # v along the lower edge
+        assert near / far == pytest.approx(ratio, abs=0.01)
+        assert (near - far) / (near + far) / 0.1 == pytest.approx(
+            np.sin(np.radians(tilt_deg)) / 0.5
+        )
+
+    def sigma_px(tilt_deg: float, free: int) -> float:
+        at, steps = np.array([600, 0.5, np.radians(tilt_deg)]), 1e-6 * np.eye(3)[:free]
+        J = np.stack([(predict(*(at + h)) - predict(*(at - h))) / 2e-6 for h in steps], axis=1)
+        return float(lesson.FOCAL_SIGMA.model()(J, np.full(108, 0.1)))
+
+    assert sigma_px(2, 3) / sigma_px(4, 3) == pytest.approx(4, rel=0.03)
+    assert sigma_px(2, 3) / sigma_px(8, 3) == pytest.approx(16, rel=0.08)
+    assert sigma_px(2, 2) / sigma_px(4, 2) == pytest.approx(2, rel=0.01)  # the tilt known
+    assert sigma_px(2, 3) == pytest.approx(162 * np.sqrt(108 / 105), abs=1)
+
+
+def test_the_corners_of_p_accept_both_cameras_and_those_of_q_only_one() -> None:
+    of = {
+        "P": corner_session(BOARD, LENS, seed=27, effects=Effects(max_tilt_deg=3))[0],
+        "Q": corner_session(BOARD, LENS, seed=22)[0],
+    }
+    K = {name: ck.intrinsics.calibrate(views, BOARD) for name, views in of.items()}
+    rms = {
+        (k, c): ck.intrinsics.rms_under(K[k].intrinsics, of[c], BOARD.points)
+        for k in of
+        for c in of
+    }
+    assert {pair: f"{value:.3f}" for pair, value in rms.items()} == {
+        ("P", "P"): "0.108", ("Q", "P"): "0.108", ("Q", "Q"): "0.107", ("P", "Q"): "0.355",
+    }  # fmt: skip
+    assert rms["P", "P"] == pytest.approx(K["P"].rms_px, rel=1e-3)
+
+
+def test_halves_tell_bow_and_shutter_from_noise_and_share_the_bias() -> None:
+    rooms = {"bow": Effects(bow_m=1e-3), "shutter": Effects(readout_s=0.02, speed_m_s=0.1)}
+    rooms |= {"healthy": Effects(), "blur": Effects(blur_px=3), "one": Effects(spoiled_px=3)}
+    both = {
+        name: ck.intrinsics.halves(corner_session(BOARD, LENS, 5, effects=effects)[0], BOARD)
+        for name, effects in rooms.items()
+    }
+    assert {name: h.noise_p_value < 1e-6 for name, h in both.items()} == {
+        "bow": True, "shutter": True, "healthy": False, "blur": False, "one": False,
+    }  # fmt: skip
+    assert all(h.p_value > 0.01 for h in both.values())  # the stated sigmas count the views
+    off = [half.value("fx") - LENS.fx for half in (both["bow"].first, both["bow"].second)]
+    assert off == pytest.approx([-24, -12], abs=0.6)
+
+
 def test_the_smallest_rms_is_that_of_scipys_fit() -> None:
-    X, Y = (a.ravel() for a in np.meshgrid(np.linspace(-0.1, 0.1, 9), np.linspace(-0.06, 0.06, 6)))
-
-    def predict(f: float, Z: float, tilt: float) -> np.ndarray:
-        depth = Z + X * np.sin(tilt)
-        return np.concatenate([f * X * np.cos(tilt) / depth, f * Y / depth])
-
     noise = np.random.default_rng(0).normal(0, 0.1, 2 * X.size)
     for tilt in (0.0, 5.0, 20.0, 45.0):
         seen = predict(600, 0.5, np.radians(tilt)) + noise
@@ -138,3 +196,26 @@ def test_the_smallest_rms_is_that_of_scipys_fit() -> None:
                 for a in (0.05, 0.4, 0.8)
             )
             assert rms[k] == pytest.approx(np.sqrt(4 * cost / seen.size), rel=1e-3)
+
+
+def test_photographs_count_from_their_folder_to_the_file_that_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "my_photos"
+    folder.mkdir()
+    for number in range(6):
+        shutil.copy(ck.specifications.DATA / f"intrinsics_session/view_0{number}.jpg", folder)
+    monkeypatch.setenv("COURSEKIT_RESULTS", str(tmp_path / "results"))
+    notebook = build_notebooks.read(build_notebooks.NOTEBOOKS / "03_intrinsics.ipynb")
+    source = {c["id"]: build_notebooks.joined(c["source"]) for c in notebook["cells"]}
+    own = source["capture"].replace("my_photos = None", f"my_photos = {str(folder)!r}")
+    camera = ck.open_camera("simulated", seed=7)
+    names = {"ck": ck, "np": np, "camera": camera, "board": BOARD, "my_fx_px": (600, 620)}
+    cells = map(source.get, ("views-figure", "fit", "factory-code", "reveal", "save"))
+    for cell in (own, *cells):
+        exec(str(cell), names)
+    said = capsys.readouterr().out
+    assert "come without a factory's K" in said
+    assert "Nobody knows this lens's truth" in said
+    kept = ck.results.load("03_intrinsics")
+    assert (kept.source, kept.camera) == ("recorded", f"photographs in {folder}")

@@ -89,7 +89,7 @@ def test_there_is_a_figure_of_every_function(figures) -> None:
         if function.__annotations__["return"] == "LessonFigure"
     }
     assert drawing == {name.partition(" ")[0] for name in figures}
-    assert len(drawing) == 38
+    assert len(drawing) == 39
 
 
 def test_similar_triangles_shows_f_x_over_z() -> None:
@@ -229,12 +229,12 @@ def depth_noise_figures() -> dict[str, plots.LessonFigure]:
         "prices": depth_noise.prices({"D405": (425.0, 0.018), "D435": (431.0, 0.050)}, 0.08),
         "infrared_pair": depth_noise.infrared_pair(image, image, (424, 240), 48.3, 5),
         "cost_curve": depth_noise.cost_curve(costs, 48.3),
-        "depth_image": depth_noise.depth_image(np.ones((480, 848)), {"card": (300.0, 200.0)}),
+        "depth_image": depth_noise.depth_image(
+            np.ones((480, 848)), {"card": (300.0, 200.0)}, np.eye(480, 848) > 0),
         "noise_law": depth_noise.noise_law([0.3, 1.0], [0.3, 3.7], [0.01, 0.1],
                                            (z, law, 0.9 * law, 1.1 * law), {"other": (z, law)}),
-        "averaging": depth_noise.averaging(
-            [1, 2, 4], [1.0, 0.8, 0.7], [0.1, 0.1, 0.2], [1.0, 0.71, 0.5]
-        ),
+        "two_eyes": depth_noise.two_eyes(431.0, 0.05, 0.5),
+        "averaging": depth_noise.averaging([1, 2, 4], [1.0, 0.8, 0.7], 0.65),
     }  # fmt: skip
 
 
@@ -279,13 +279,13 @@ def intrinsics_figures() -> dict[str, plots.LessonFigure]:
     return {
         "best_fits": intrinsics.best_fits(X, Y, {"30 deg": seen}, 600.0),
         "board": intrinsics.board(BOARD),
-        "views": intrinsics.views(SESSION, boards.detect_all(shipped, BOARD, False)),
+        "views": intrinsics.views(str(SESSION), boards.detect_all(shipped, BOARD, False)),
         "coverage": intrinsics.coverage(two["Q"]),
         "residuals": intrinsics.residuals(two["Q"]),
         "uncertainty": intrinsics.uncertainty(two, 0.45),
         "two_sessions": intrinsics.two_sessions(two),
         "rules": intrinsics.rules(two, 0.45),
-        "signature": intrinsics.signature(two),
+        "rooms": intrinsics.rooms(two),
         "power": intrinsics.power(stored_power()),
         "difference": intrinsics.difference(compare(two["Q"], D435.color)),
     }
@@ -330,7 +330,7 @@ def hand_eye_figures() -> dict[str, plots.LessonFigure]:
     counts = (12, 25)
     return {
         "mounts": hand_eye.mounts(rigs, joints),
-        "diversity": hand_eye.diversity({"this session": session.T_base_gripper}),
+        "diversity": hand_eye.diversity(session.T_base_gripper),
         "study": hand_eye.study(error_study(trials=5)),
         "more_poses": hand_eye.more_poses(counts, {"a": [3.0, 2.9]}, {"a": [1.0, 0.7]}),
         "agreement": hand_eye.agreement(unknown_sessions(11)),

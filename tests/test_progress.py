@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -50,6 +51,20 @@ def test_first_tries_later_ones_and_results() -> None:
     assert now.next.startswith("Next: ")
     assert "02_depth_noise" in now.next
     assert "D435 on the bench" in now._repr_html_()
+
+
+def test_the_hand_in() -> None:
+    said = []
+    assert ck.progress().hand_in.startswith("nothing measured yet")
+    for n, name in enumerate(("studio_1.measured", "studio_1_ada.zip", "studio_1.measured")):
+        path = results.folder() / name
+        path.touch()
+        os.utime(path, (n, n))
+        said.append(ck.progress().hand_in)
+    assert said[0].startswith("measured, and not packed yet")
+    assert said[1] == "studio_1_ada.zip in results/"
+    assert said[2].endswith("older than what you measured: pack again")
+    assert f"Hand-in: {said[2]}." in repr(ck.progress())
 
 
 def test_a_damaged_result_is_named() -> None:

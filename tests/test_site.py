@@ -291,8 +291,8 @@ def test_every_checkpoint_keeps_its_explanation_closed(pages):
         ({"data": {"text/plain": ""}}, ""),
         ({"data": {"text/html": ""}}, ""),
         ({"data": {"text/html": '<details class="alt"><summary>The figure in words'}}, ""),
-        ({"data": {"text/plain": "a < b"}}, '<pre class="output">a &lt; b</pre>\n'),
-        ({"text": ["a", " & b\n"]}, '<pre class="output">a &amp; b</pre>\n'),
+        ({"data": {"text/plain": "a < b"}}, '<pre class="output" tabindex="0">a &lt; b</pre>\n'),
+        ({"text": ["a", " & b\n"]}, '<pre class="output" tabindex="0">a &amp; b</pre>\n'),
         ({"data": {"text/html": "<b>x</b>", "text/plain": "x"}}, "<b>x</b>"),
     ],
 )
@@ -315,11 +315,11 @@ def test_links_between_sources_become_links_between_pages():
     html = build_site.markdown(
         page,
         "[a](02_depth_noise.ipynb#Start) [b](../data/corrections.md) [c](../data/lenses.toml)"
-        " [d](https://example.org/) [e](#start)",
+        " [d](https://example.org/) [e](#Exercise-1:-project)",
     )
     targets = re.findall(r'href="([^"]+)"', html)
     assert targets[:3] == ["02_depth_noise.html#Start", "corrections.html", "data/lenses.toml"]
-    assert targets[3:] == ["https://example.org/", "#start"]
+    assert targets[3:] == ["https://example.org/", "#exercise-1-project"]
     assert [*page.files] == ["data/lenses.toml"]
 
 
@@ -327,6 +327,14 @@ def test_links_between_sources_become_links_between_pages():
 def test_a_link_to_nothing_is_refused(url):
     with pytest.raises(ValueError, match="is no file of this project"):
         build_site.markdown(a_page(), f"[x]({url})")
+
+
+def test_what_is_collapsed_in_a_cell_is_collapsed_on_its_page():
+    text = "Is $x$?\n\n<details><summary>The *answer*</summary>\n\n- $y$\n\n</details>\n\nOn."
+    page = BeautifulSoup(build_site.markdown(a_page(), text), "html.parser")
+    (closed,) = page.select("details.reveal")
+    assert (closed.summary.text.strip(), closed.li.math.text) == ("The answer", "y")
+    assert [p.text for p in page.find_all("p", recursive=False)] == ["Is x?", "On."]
 
 
 def test_headings_of_the_same_text_get_ids_of_their_own():
@@ -408,6 +416,11 @@ def declared(style, kind):
 def test_contrast_is_known_where_it_is_known():
     assert contrast("#000000", "#ffffff") == pytest.approx(21)
     assert contrast("#777777", "#ffffff") == pytest.approx(4.48, abs=0.005)
+
+
+def test_every_line_of_a_figure_can_be_seen():
+    for name, color in COLORS.items():
+        assert name == "faint" or contrast(color, "#ffffff") >= 3, name
 
 
 def test_every_text_can_be_read_on_every_ground(style):

@@ -222,7 +222,6 @@ def test_holes_jumps_and_frozen_pixels_are_counted_and_left_out():
     invalid = 1 - (np.isfinite(stack) & (stack > 0)).mean()
     assert stats.invalid_fraction == pytest.approx(invalid)
     assert stats.n_mismatches == pytest.approx(58, rel=0.15)
-    assert f"{stats.n_mismatches} mismatches left out" in " ".join(str(stats).split())
     assert not stats.not_gaussian
     assert stats.pixel_std_m == pytest.approx(5e-4, rel=0.03)
     assert stats.depth_m == pytest.approx(0.5, abs=2e-4)
@@ -237,10 +236,6 @@ def test_depth_unit_that_hides_the_noise_is_said():
     assert stats.frozen_fraction == pytest.approx(1 - changes)
     assert stats.pixel_std_unrounded_m == pytest.approx(2e-4, rel=0.06)
     assert stats.pixel_std_m > 1.3 * stats.pixel_std_unrounded_m
-    assert "1 mm hides it" in stats.rounding
-    assert "hides it" in str(stats)
-    fine = stereo.window_stats(np.round(exact / 1e-4).astype(np.uint16), (0, 0, 40, 40), 1e-4)
-    assert fine.rounding == ""
 
 
 def around(rng, n=30, more=0.0, times=1.0):
@@ -283,7 +278,6 @@ def test_a_window_that_is_not_one_gaussian_noise_widens_its_interval_and_says_wh
     says, make = NOT_ONE_NOISE[kind]
     stats = stereo.window_stats(make(np.random.default_rng(5)), (0, 0, 40, 40))
     assert re.search(says, "; ".join(stats.not_gaussian)), stats.not_gaussian
-    assert "not one Gaussian noise, so the interval is wider" in " ".join(str(stats).split())
     assert stats.pixel_dof < (25_000 if "tails" in says else 40)  # of 46,425, and of 650
     if "surfaces" in says:  # the depth's interval reaches both
         apart = 0.008 if kind == "near surfaces" else 0.05
@@ -341,7 +335,6 @@ def test_one_frame_gives_no_noise_over_time():
     assert stats.depth_m == pytest.approx(0.5, abs=2e-4)
     nothing = (stats.pixel_std_m, stats.pixel_std_error_m, stats.mean_std_m)
     assert np.isnan([*nothing, *stats.pixel_std_interval_m]).all()
-    assert "no std over time from 1 frame" in str(stats)
 
 
 def test_window_without_a_valid_pixel_is_nan():
@@ -349,7 +342,6 @@ def test_window_without_a_valid_pixel_is_nan():
     assert stats.invalid_fraction == 1.0
     nothing = (stats.depth_m, stats.pixel_std_m, stats.spatial_std_m, stats.mean_std_m)
     assert np.isnan(nothing).all()
-    assert "no depth, 100% invalid" in str(stats)
 
 
 # --- averaging ---
@@ -394,21 +386,6 @@ def test_a_weak_slow_drift_is_not_taken_for_white_noise(drift, want, below):
     assert exact / 2 <= np.median([c.effective_frames for c in curves]) <= below
 
 
-def test_averaging_curve_is_the_spread_of_block_means():
-    rng = np.random.default_rng(13)
-    series = 0.5 + correlated(1e-3 * rng.standard_normal(4096), 0.5)
-    curve = stereo.averaging_curve(series)
-    assert curve.counts.tolist() == [2**k for k in range(11)]
-    for count, std in zip(curve.counts, curve.std_m, strict=True):
-        means = [m.mean() for m in np.split(series, 4096 // count)]
-        assert std == pytest.approx(np.std(means, ddof=1))
-        lags = np.arange(1, count)
-        exact = 1e-3 * math.sqrt((1 + 2 * ((1 - lags / count) * 0.5**lags).sum()) / count)
-        assert std == pytest.approx(exact, rel=4 / math.sqrt(2 * (4096 / count)))
-    assert curve.floor_m is None
-    assert curve.effective_frames == pytest.approx(4096 / 3, rel=0.2)
-
-
 def test_the_fixed_pattern_does_not_average_away():
     rng = np.random.default_rng(14)
     pattern = pixel_noise(rng, 1, 40, 8e-4)[0]
@@ -418,11 +395,10 @@ def test_the_fixed_pattern_does_not_average_away():
     assert curve.floor_m == pytest.approx(left.std(), rel=0.05)
     spatial = [
         np.mean([without_plane(mean).std() for mean in stack.reshape(-1, n, 40, 40).mean(axis=1)])
-        for n in curve.counts
+        for n in (1, 2, 4, 8, 16)
     ]
     assert spatial[0] == pytest.approx(math.hypot(left.std(), 1.5e-3), rel=0.05)
     assert curve.floor_m < spatial[-1] < math.hypot(left.std(), 1.5e-3 / 3)
-    assert "do not average away" in str(curve)
 
 
 # --- the noise fit ---
@@ -813,7 +789,6 @@ def test_face_in_camera_like_frames(noisy_faces):
         assert face.fattening_px == pytest.approx(3.0, abs=0.6)
         assert abs(face.fattening_px - 3.0) < 3 * face.fattening_error_px
         assert face.width_m - 0.06 == pytest.approx(2 * face.fattening_px * z / FX, rel=0.05)
-        assert 0.01 < face.flying_fraction < 0.10
         assert face.stats.invalid_fraction == pytest.approx(0.01, abs=0.005)
         u, _, width, height = face.window
         assert (width, height) == (40, 40) or z > 0.5
@@ -852,7 +827,6 @@ def test_block_elsewhere_is_found_near_a_pixel_and_its_width_need_not_be_known()
     assert face.depth_m == pytest.approx(0.45, abs=1e-6)
     assert 1e3 * face.width_m == pytest.approx(60, abs=1.1)
     assert math.isnan(face.fattening_px)
-    assert "outwards" not in str(face)
 
 
 def test_a_camera_s_frames_bring_their_unit_and_intrinsics():
@@ -860,7 +834,7 @@ def test_a_camera_s_frames_bring_their_unit_and_intrinsics():
     frames = Frames(Frame(counts, None, 1e-4, i / 30, i, UNIT.depth) for i in range(3))
     face = stereo.block_face(frames)
     again = stereo.block_face(np.stack([counts] * 3), UNIT.depth, 1e-4)
-    assert str(face) == str(again)
+    assert (face.width_m, face.stats.pixel_std_m) == (again.width_m, again.stats.pixel_std_m)
     assert stereo.window_stats(frames, face.window).depth_m == face.stats.depth_m
     with pytest.raises(ValueError, match=r"^depth: got 0 frames"):
         stereo.window_stats(Frames(), (0, 0, 5, 5))

@@ -343,7 +343,7 @@ def test_a_paragraph_that_is_not_utf_8_is_said_plainly(encoding, code, kept, own
 
 # --- the notebook ---
 
-CELLS = ("setup", "disparity-code", "keep", "sweep", "predict", "studio-capture", "table")
+CELLS = ("setup", "two-eyes", "keep", "sweep", "predict", "studio-capture", "table")
 CELLS += ("quantities", "hand-in-table", "hand-in-keep", "hand-in-submit")
 FILLED_IN = {
     "table": "face_stds = [f.depth_std_mm for f in faces]",

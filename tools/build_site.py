@@ -38,6 +38,7 @@ CORRECTIONS = ROOT / "data" / "corrections.md"
 FORMATS = ROOT / "data" / "formats.md"
 
 WIDE_PX = 600  # a figure wider than this scrolls by itself on a phone, rather than shrink
+COLLAPSED = re.compile(r"<details><summary>(.*?)</summary>(.*?)</details>", re.DOTALL)
 IN_WORDS = '<details class="alt">'
 MINUTES = re.compile(r"Core: about (\d+) minutes")
 OBJECTIVES = re.compile(r"^\*\*Afterwards you can\*\*\n+(.+?)\s*\Z", re.MULTILINE | re.DOTALL)
@@ -98,7 +99,7 @@ class Renderer(IPythonRenderer):
 
     def heading(self, text: str, level: int, **_: Any) -> str:
         """A heading that can be linked to."""
-        slug = re.sub(r"\W+", "-", re.sub(r"<[^>]*>", "", text).lower()).strip("-")
+        slug = _slug(re.sub(r"<[^>]*>", "", text))
         taken = {heading.id for heading in self.page.headings}
         names = (slug, *(f"{slug}-{n}" for n in range(2, len(taken) + 3)))
         unused = next(name for name in names if name not in taken)
@@ -111,7 +112,7 @@ class Renderer(IPythonRenderer):
 
     def block_math(self, body: str) -> str:
         """A formula on a line of its own, which scrolls if it must."""
-        return f'<span class="formula">{mathml(body, display=True)}</span>'
+        return f'<span class="formula" tabindex="0">{mathml(body, display=True)}</span>'
 
     def latex_environment(self, name: str, body: str) -> str:
         """A LaTeX environment outside of dollar signs."""
@@ -123,7 +124,7 @@ class Renderer(IPythonRenderer):
 
     def table(self, text: str) -> str:
         """A table, which scrolls if it must."""
-        return f'<div class="table"><table>\n{text}</table></div>\n'
+        return f'<div class="table" tabindex="0"><table>\n{text}</table></div>\n'
 
     def link(self, text: str, url: str, title: str | None = None) -> str:
         """A link, to the page that its target becomes."""
@@ -137,17 +138,27 @@ class Renderer(IPythonRenderer):
         return figure_html(target, self.page.files[target], re.sub(r"<[^>]*>", "", text))
 
 
+def _slug(heading: str) -> str:
+    return re.sub(r"\W+", "-", heading.lower()).strip("-")
+
+
 def markdown(page: Page, text: str) -> str:
     """Markdown as HTML; the page notes its headings, and what it links to."""
-    html = str(MarkdownWithMath(renderer=Renderer(page)).render(text))
+    before, *collapsed = COLLAPSED.split(text)
+    html = str(MarkdownWithMath(renderer=Renderer(page)).render(before))
+    for says, inside, after in zip(collapsed[::3], collapsed[1::3], collapsed[2::3], strict=True):
+        html += _closed("reveal", markdown(page, says), markdown(page, inside.strip()))
+        html += markdown(page, after)
     return PUNCTUATED.sub(r'<span class="together">\g<0></span>', html)
 
 
 def address(page: Page, url: str) -> str:
     """Where a link of a source leads from its page; a file that is linked to is copied along."""
     parts = urlsplit(url)
-    if parts.scheme or not parts.path:
+    if parts.scheme:
         return url
+    if not parts.path:
+        return f"#{_slug(unquote(parts.fragment))}"  # JupyterLab's has capitals
     target = (page.source.parent / unquote(parts.path)).resolve()
     if target in page_names():
         return page_names()[target] + (f"#{parts.fragment}" if parts.fragment else "")
@@ -212,7 +223,7 @@ def output_html(page: Page, cell: Cell, output: dict[str, Any]) -> str:
         return _figure(page, cell, output)
     if not text:
         return ""
-    return f'<pre class="output">{escape(text.rstrip())}</pre>\n'
+    return f'<pre class="output" tabindex="0">{escape(text.rstrip())}</pre>\n'
 
 
 def _figure(page: Page, cell: Cell, output: dict[str, Any]) -> str:

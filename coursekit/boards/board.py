@@ -372,9 +372,15 @@ class Detections(Listed[Detection]):
         lines += [f"  {view!r}" for view in self[:LISTED]]
         if len(self) > LISTED:
             lines.append(f"  and {len(self) - LISTED} more")
-        lines += [f"  not used: {skip!r}" for skip in self.skipped[:LISTED_SKIPPED]]
-        if len(self.skipped) > LISTED_SKIPPED:
-            lines.append(f"  and {len(self.skipped) - LISTED_SKIPPED} more not used")
+        alike: dict[str, list[Skipped]] = {}  # by the reason, which is often that of all
+        for skip in self.skipped:
+            alike.setdefault(skip.reason, []).append(skip)
+        lines += [
+            f"  not used: {first!r}" + f" (and {len(others)} more)" * bool(others)
+            for first, *others in list(alike.values())[:LISTED_SKIPPED]
+        ]
+        if len(alike) > LISTED_SKIPPED:
+            lines.append(f"  and others, for {len(alike) - LISTED_SKIPPED} more reasons")
         return "\n".join(lines)
 
 
@@ -528,7 +534,7 @@ BAR_MM = 100.0
 MM_PER_INCH = 25.4
 ADVICE = """\
 Print at 100 % (no "fit to page"). The bar must measure 100 mm; if not, use the measured square.
-Glue it dead flat to glass or aluminium: 1 mm of bow spoils fx by 2 %."""
+Glue it dead flat to glass or aluminium: 1 mm of bow spoils fx by 3 %."""
 
 
 def save_sheet(

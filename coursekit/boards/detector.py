@@ -195,7 +195,8 @@ def _sources(images: Any) -> list[tuple[str, Any]]:
     """Name and source (a path or an array) of each image."""
     if isinstance(images, (str, os.PathLike)):
         folder = Path(images)
-        want(folder.is_dir(), "images", os.fspath(images), "a folder that exists")
+        wanted = f"a folder that exists; there is no {folder.resolve()}"
+        want(folder.is_dir(), "images", os.fspath(images), wanted)
         files = [p for p in folder.iterdir() if p.is_file() or not p.exists()]  # a broken link
         files = [p for p in files if p.name != SESSION and not p.name.startswith(".")]
         if not files:

@@ -145,10 +145,7 @@ class Gain:
         few = abs(self.success) < FEW_DRAWS / DRAWS
         share = "<0.1" if few else f"{100 * self.success:+.1f}"
         gained = f"{share:>5} % of grasps, " if grasps else ""
-        return (
-            f"{action} {self.name + ':':<21} {gained}{1e3 * self.room_m:.1f} mm of room "
-            f"(bias {1e3 * self.worst_case_m:.1f} + 2 × noise {1e3 * self.noise_m:.2f})"
-        )
+        return f"{action} {self.name + ':':<21} {gained}{1e3 * self.room_m:.1f} mm of room"
 
     def __str__(self) -> str:
         return self.line()

@@ -16,9 +16,7 @@ import numpy as np
 
 from coursekit import checks, results
 from coursekit.arm import widowx
-from coursekit.arrays import ArrayLike
 from coursekit.budget.budget import SIGMAS, Along, ErrorBudget, ErrorTerm
-from coursekit.budget.propagation import Covariances
 from coursekit.budget.view import GRIPPER_DOWN, View
 from coursekit.checks import want
 from coursekit.geometry import Intrinsics
@@ -169,10 +167,6 @@ class HandOver:
             raise ValueError(f"{lesson}: holds no {names.replace('|', ' or ')}")
         return found
 
-    def covariance(self, lesson: str) -> Covariance | None:
-        """Of the numbers that this notebook estimated together, None where it kept none."""
-        return self[lesson].result().covariances.get(COVARIANCE_OF.get(lesson, ""))
-
     @property
     def source(self) -> Source:
         """Of the whole: "reference" as soon as one notebook's numbers are the reference's."""
@@ -202,7 +196,9 @@ class HandOver:
         baseline_m = 1e-3 * self._also("01_pinhole", "baseline", usual_mm)
         return View(Intrinsics(width, height, fx, fy, cx, cy), LESSON_DISTANCE_M, baseline_m)
 
-    def terms(self, subtract_depth_bias: bool = False, mount: str = STANDING) -> tuple[ErrorTerm, ...]:
+    def terms(
+        self, subtract_depth_bias: bool = False, mount: str = STANDING
+    ) -> tuple[ErrorTerm, ...]:
         """The rows, each with its source.
 
         subtract_depth_bias: as if every depth were corrected by the bias that notebook 2 measured,
@@ -246,30 +242,9 @@ class HandOver:
                 wrist = wrist.with_term(term)
         return wrist.at(autocorrelation=own.autocorrelation, title=own.title)
 
-    def covariances(self, view: View, arm: ArrayLike | None = None) -> Covariances:
-        """What `propagate` takes, from the same numbers: noise and what calibration left unknown.
-
-        arm (6, 6): of the gripper's twist, as `arm.fk_covariance(q).covariance`; None: exact. The
-        depth bias, which has a known size, is not in it. The mount's covariance is in the frame in
-        which notebook 4 gave X: the gripper's for a camera on the wrist, else the base's; the
-        `Chain` must be of the same mount.
-        """
-        K, X = self._known("03_intrinsics"), self._known("04_hand_eye")
-        order = [X.names.index(name) for name in MOUNT_TWIST]
-        unit = np.repeat([math.radians(1.0), 1e-3], 3)
-        depth = self._depth_noise()
-        return Covariances(
-            pixel=np.eye(2),
-            depth_sigma_m=depth.at_object_m(view)[1] / float(np.linalg.norm(view.ray)),
-            intrinsics=np.array(K.matrix),
-            names=K.names,
-            hand_eye=np.array(X.matrix)[np.ix_(order, order)] * np.outer(unit, unit),
-            arm=arm,
-        )
-
     def _known(self, lesson: str) -> Covariance:
         """The covariance that the notebook kept, else the sigmas of the numbers needed."""
-        known, names = self.covariance(lesson), NEEDED[lesson]
+        known, names = self[lesson].result().covariances.get(COVARIANCE_OF[lesson]), NEEDED[lesson]
         if known is not None and set(names) <= set(known.names) <= {*PARAMETERS, *MOUNT_TWIST}:
             return known
         sigmas = [self.quantity(lesson, name).sigma for name in names]
@@ -292,28 +267,18 @@ class HandOver:
     def _depth_bias(self, subtracted: bool) -> ErrorTerm:
         """By the law s Z - o Z²/(f B) that notebook 2 fitted; a file that holds the bias at 0.45 m
         alone has it taken for a scale, between a shift and what grows with Z²."""
-        name = NEEDED["02_depth_noise"][1]
-        notebook = self["02_depth_noise"]
-        found, known = notebook.result(name), notebook.result(name).covariances.get(LAW)
+        name, notebook = NEEDED["02_depth_noise"][1], self["02_depth_noise"]
+        found, whose = notebook.result(name), notebook.whose(name)
+        known = found.covariances.get(LAW)
         if known is None:
-            at = self.quantity("02_depth_noise", name)
-            mean, sigmas = (1e-3 / LESSON_DISTANCE_M * v for v in (at.value, at.sigma or 0.0))
-            law, root, whose = (mean, 0.0), np.array([[sigmas], [0.0]]), ", taken for a scale"
+            at, whose = self.quantity("02_depth_noise", name), whose + ", taken for a scale"
+            scale, sigma = (1e-3 / LESSON_DISTANCE_M * v for v in (at.value, at.sigma or 0.0))
+            mean, root = (scale, 0.0), np.array([[sigma], [0.0]])
         else:
-            s, o = (found.quantities[number].value for number in known.names)
-            law, root, whose = (s, o), scaled_root(np.array(known.matrix)), ""
-        factor = tuple(map(tuple, root.tolist()))
-        return ErrorTerm(
-            "depth bias",
-            "bias",
-            0.0,
-            SIGMAS,
-            "depth",
-            notebook.whose(name) + whose,
-            normal=True,
-            factor=factor,
-            mean=None if subtracted else law,
-        )
+            scale, offset = (found.quantities[number].value for number in known.names)
+            mean, root = (scale, offset), scaled_root(np.array(known.matrix))
+        rest = (True, tuple(map(tuple, root.tolist())), None if subtracted else mean)
+        return ErrorTerm("depth bias", "bias", 0.0, SIGMAS, "depth", whose, *rest)
 
     def _intrinsics(self) -> ErrorTerm:
         """By the covariance of K and lens together, where there is one; else by the sigmas.
@@ -329,8 +294,7 @@ class HandOver:
         return ErrorTerm("intrinsics", "bias", 0.0, SIGMAS, "intrinsics", whose, True, rows)
 
     def _hand_eye(self, mount: str) -> tuple[ErrorTerm, ErrorTerm]:
-        """The root mean square over the three axes: a row knows no frame. What `propagate` takes
-        is the whole covariance of the camera on the wrist."""
+        """The root mean square over the three axes: a row knows no frame."""
         notebook, known = self["04_hand_eye"], self._known("04_hand_eye")
         fixed, of = notebook.result().eye_to_hand, notebook.result().quantities["tx"].note
         order = [known.names.index(name) for name in MOUNT_TWIST]

@@ -140,21 +140,17 @@ def monte_carlo(
     covariances: Covariances,
     n: int = 1_000_000,
     seed: int = 0,
-    through_disparity: bool = False,
 ) -> Floats:
     """n draws of the point's error in the base through the exact chain, (n, 3), m.
 
-    through_disparity: the disparity is drawn from a normal distribution, not the depth; for small
-    errors they are the same. NaN where it then comes out zero or negative, no depth at all, and
-    where a drawn lens folds before it reaches the pixel.
-    Raises ValueError for n under 1.
+    NaN where a drawn lens folds before it reaches the pixel. Raises ValueError for n under 1.
     """
     n = checks.whole("n", n)
     rng, root = np.random.default_rng(seed), scaled_root(covariances.joint)
     errors = np.empty((n, 3))
     for start in range(0, n, CHUNK):
         drawn = root @ rng.standard_normal((root.shape[1], min(CHUNK, n - start)))
-        moved = displacements(chain, covariances.names, drawn, through_disparity)
+        moved = displacements(chain, covariances.names, drawn)
         errors[start : start + CHUNK] = moved.T
     return errors
 
@@ -201,21 +197,19 @@ def check_first_order(
     covariances: Covariances,
     n: int = 1_000_000,
     seed: int = 0,
-    through_disparity: bool = False,
 ) -> FirstOrderCheck:
     """Compare `propagate` with `monte_carlo`; n samples tell variances to sqrt(2 / n).
 
-    seed, through_disparity: as for `monte_carlo`. Raises ValueError where fewer than two samples
-    gave a depth.
+    seed: as for `monte_carlo`. Raises ValueError where fewer than two samples had a ray.
 
     >>> from coursekit.budget import lesson_view
     >>> known = Covariances(pixel=np.eye(2), depth_sigma_m=0.0007)
     >>> check_first_order(Chain(lesson_view()), known, n=1000).worst < 0.2
     True
     """
-    samples = monte_carlo(chain, covariances, n, seed, through_disparity)
+    samples = monte_carlo(chain, covariances, n, seed)
     valid = samples[np.isfinite(samples).all(axis=1)]
-    want(len(valid) >= 2, "n", n, f"two samples with a depth at least; {len(valid)} had one")
+    want(len(valid) >= 2, "n", n, f"two samples with a ray at least; {len(valid)} had one")
     first_order = propagate(chain, covariances)
     return FirstOrderCheck(first_order, np.cov(valid.T), valid.mean(axis=0), len(valid))
 
@@ -223,18 +217,15 @@ def check_first_order(
 # --- the exact chain ---
 
 
-def displacements(
-    chain: Chain, names: tuple[str, ...], errors: Floats, through_disparity: bool = False
-) -> Floats:
+def displacements(chain: Chain, names: tuple[str, ...], errors: Floats) -> Floats:
     """Where errors move the point less where the gripper goes, base axes, (3, m), m.
 
-    errors (15 + p, m): in the order of `jacobian`, of any size. names (p): of K and the lens.
-    through_disparity: the error of Z is one of its disparity, in the same relation to it. NaN where
-    there is no depth or no ray.
+    errors (15 + p, m): in the order of `jacobian`, of any size. names (p): of K and the lens. NaN
+    where there is no ray.
     """
     pixel, depth, K, X, arm = np.split(errors, np.cumsum([2, 1, len(names), 6]))
     view, frame, lever = chain.view, chain.R_base_frame, chain.arm_lever[:, None]
-    seen = _seen(view, names, pixel, K) * _depth(view.distance_m, depth[0], through_disparity)
+    seen = _seen(view, names, pixel, K) * (view.distance_m + depth[0])
     in_frame = _turn(X[:3], frame.T @ view.R_base_camera @ seen) + X[3:]
     moved = frame @ in_frame - view.lever_base[:, None]
     if chain.mount == "eye_to_hand":
@@ -255,13 +246,6 @@ def _seen(view: View, names: tuple[str, ...], pixel: Floats, changes: Floats) ->
     if camera.dist is not None or set(names) & set(LENS_PARAMETERS):
         x, y = _ideal(x, y, view.ray, [values[name] for name in LENS_PARAMETERS])
     return np.stack([x, y, np.ones_like(x)])
-
-
-def _depth(Z: float, error: Floats, through_disparity: bool) -> Floats:
-    if not through_disparity:
-        return np.asarray(Z + error)
-    disparity = 1 - error / Z  # over the true one: Z = f B / d
-    return np.asarray(Z / np.where(disparity > 0, disparity, np.nan))
 
 
 def _ideal(x: Floats, y: Floats, start: Floats, lens: Any) -> tuple[Floats, Floats]:

@@ -16,7 +16,6 @@ from coursekit.geometry import Intrinsics, make_transform, undistort
 from coursekit.intrinsics.derivatives import project_with_derivatives
 
 AXES = ("closing", "approach", "lateral")
-MAX_DISPARITY_PX = 126  # the vendor's search range: nearer than fx baseline / 126 nothing is seen
 GRIPPER_DOWN = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])  # R_base_gripper, fingers down
 
 
@@ -120,11 +119,6 @@ class View:
     def off_axis_deg(self) -> float:
         """The angle between the ray and the optical axis."""
         return math.degrees(math.atan(math.hypot(*self.ray[:2])))
-
-    @property
-    def minimum_range_m(self) -> float:
-        """The least depth that a search over MAX_DISPARITY_PX finds: fx baseline / 126 px."""
-        return self.intrinsics.fx * self.baseline_m / MAX_DISPARITY_PX
 
     def moved(self, off_axis_deg: float | None = None, **changes: Any) -> View:
         """This view with other fields; off_axis_deg: the object that far right of the axis.

@@ -12,7 +12,7 @@ from coursekit.cameras.frames import CameraError, Frame, Frames
 from coursekit.cameras.librealsense import LibraryMissing, connected_realsenses
 from coursekit.cameras.realsense import RealSense
 from coursekit.cameras.recording import INDEX, INTRINSICS
-from coursekit.cameras.simulated import PLUG_IN, SimulatedCamera, my_unit
+from coursekit.cameras.simulated import SimulatedCamera, my_unit
 
 __all__ = [
     "Camera", "CameraError", "Frame", "Frames", "conventions", "my_unit", "open_camera", "place",
@@ -54,7 +54,7 @@ def open_camera(
         return _recording(Path(which))
     if isinstance(which, str):
         if which == "simulated":
-            return _simulated(seed)
+            return SimulatedCamera(seed=seed)
         if which.isdecimal():
             return _live(which, infrared)
         path = Path(which)
@@ -63,16 +63,12 @@ def open_camera(
     raise ValueError(f"{argument}: got {which!r}, {CAMERA_NAMES}")
 
 
-def _simulated(seed: int | None, advice: str = PLUG_IN) -> Camera:
-    return SimulatedCamera(seed=my_unit() if seed is None else seed, advice=advice)
-
-
 def _connected_or_simulated(infrared: bool, seed: int | None) -> Camera:
     try:
         serials = connected_realsenses()
     except LibraryMissing as missing:
-        return _simulated(seed, f"The reason: {missing}.")
-    return RealSense(min(serials), infrared=infrared) if serials else _simulated(seed)
+        return SimulatedCamera(seed=seed, advice=f"The reason: {missing}.")
+    return RealSense(min(serials), infrared=infrared) if serials else SimulatedCamera(seed=seed)
 
 
 def _live(serial: str, infrared: bool) -> Camera:

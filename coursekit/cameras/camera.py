@@ -111,13 +111,12 @@ class Camera(Description, ABC):
 
         depth_fx to color_cy, depth_width and depth_height in px; the baseline in mm.
         """
-        says = {}
+        says, note = {}, "factory, sigma not given"
         for name, lens in (("depth", self.depth), ("color", self.color)):
             for entry in ("fx", "fy", "cx", "cy") if lens else ():
-                value, note = getattr(lens, entry), "factory, sigma not given"
-                says[f"{name}_{entry}"] = Quantity(value, "px", None, "bias", note)
-        for name, size in zip(("width", "height"), self.depth.size, strict=True):
-            says[f"depth_{name}"] = Quantity(size, "px")
+                says[f"{name}_{entry}"] = Quantity(getattr(lens, entry), "px", None, "bias", note)
+        for name in ("width", "height"):
+            says[f"depth_{name}"] = Quantity(getattr(self.depth, name), "px")
         if self.baseline_m is not None:
             says["baseline"] = Quantity(1000 * self.baseline_m, "mm", None, "bias", "factory")
         return says

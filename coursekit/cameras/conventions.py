@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from typing import Any
 
@@ -44,7 +44,7 @@ class Agreement:
     """One distortion model in librealsense, the largest of many points, px.
 
     project_px: its projection against `geometry.project`. round_trip_px: its own deprojection,
-    projected again, against the pixel it started from. yours_px, yours_mm: its projection and
+    projected again, against the pixel it started from. yours_px, yours_m: its projection and
     deprojection against a learner's; None where these give no such array.
     """
 
@@ -53,13 +53,12 @@ class Agreement:
     project_px: float
     round_trip_px: float
     yours_px: float | None = None
-    yours_mm: float | None = None
+    yours_m: float | None = None
 
     def __str__(self) -> str:
-        yours = [(self.yours_px, "px"), (self.yours_mm, "mm")]
-        columns = [(self.project_px, "px"), (self.round_trip_px, "px"), *yours]
-        texts = ["-" if size is None else f"{size:.3f} {unit}" for size, unit in columns]
-        return f"{self.model:22} {self.coefficients:21}" + "".join(f"{t:>12}" for t in texts)
+        sizes = self.project_px, self.round_trip_px, self.yours_px, self.yours_m
+        texts = ["-" if size is None else f"{size:.3f}" for size in sizes]
+        return f"{self.model:22} {self.coefficients:21}" + "".join(f"{t:>7}" for t in texts)
 
 
 def measure(*yours: Function) -> list[Agreement]:
@@ -70,7 +69,7 @@ def measure(*yours: Function) -> list[Agreement]:
     rng = np.random.default_rng(1)
     pixels = rng.uniform([0, 0], [CAMERA.width - 1, CAMERA.height - 1], (POINTS, 2))
     depths = rng.uniform(0.2, 4.0, POINTS)
-    return [_measure(model, name, pixels, depths, *yours) for model, name in CASES]
+    return [_measure(*case, pixels, depths, *yours) for case in CASES]
 
 
 def _measure(model: str, name: str, pixels: Floats, depths: Floats, *yours: Function) -> Agreement:
@@ -82,16 +81,14 @@ def _measure(model: str, name: str, pixels: Floats, depths: Floats, *yours: Func
     seen = zip(projected.tolist(), depths.tolist(), strict=True)
     back = np.array([rs.rs2_deproject_pixel_to_point(theirs, uv, z) for uv, z in seen])
     again = np.array([rs.rs2_project_point_to_pixel(theirs, p) for p in back])
-    ours = geometry.project(points, *lens)
-    own = Agreement(model, name, _longest(projected - ours), _longest(again - projected))
-    if not yours:
-        return own
-    project, deproject = yours
-    mm = largest(1000 * back, lambda *a: 1000 * deproject(*a), projected, depths, *lens)
-    return replace(own, yours_px=largest(projected, project, points, *lens), yours_mm=mm)
+    project, deproject = yours or (None, None)
+    ours_px = _longest(projected - geometry.project(points, *lens))
+    yours_px = largest(projected, project, points, *lens)
+    yours_m = largest(back, deproject, projected, depths, *lens)
+    return Agreement(model, name, ours_px, _longest(again - projected), yours_px, yours_m)
 
 
-def largest(right: Floats, function: Function, first: Floats, *others: Any) -> float | None:
+def largest(right: Floats, function: Any, first: Floats, *others: Any) -> float | None:
     """The largest distance between the rows of a learner's function and the right ones (n, k).
 
     None where it is not written yet, or gives no such array. `first` is passed as a copy.

@@ -60,9 +60,8 @@ def my_unit(name: str = "") -> int:
         plain = unicodedata.normalize("NFKD", name.casefold())
         letters = "".join(letter for letter in plain if letter.isalnum())
         checks.want(letters, "name", name, "one with letters or digits")
-        seed = (
-            10_000_000 + zlib.crc32(letters.encode()) % 90_000_000
-        )  # two alike: one in 90 million
+        # Of two names that are alike once in 90 million; far from what notebooks count up from 7
+        seed = 10_000_000 + zlib.crc32(letters.encode()) % 90_000_000
         results.write_json(path, {"name": name, "seed": seed})
     if not path.exists():
         return REFERENCE_UNIT
@@ -81,9 +80,9 @@ class SimulatedCamera(Camera):
     `show_board`), and its true lens is not quite the one that the camera reports.
 
     device: a name of data/devices.toml. seed: names the unit, so its hidden truth, its pattern of
-    speckle and its noise. scene: in the depth camera's frame. ambient, exposure, depth_scale_m: see
-    `set`; None for the device's own depth unit. advice: the last sentence of the description.
-    Raises ValueError for an unknown device and a bad figure.
+    speckle and its noise; None for `my_unit()`. scene: in the depth camera's frame. ambient,
+    exposure, depth_scale_m: see `set`; None for the device's own depth unit. advice: the last
+    sentence of the description. Raises ValueError for an unknown device and a bad figure.
 
     The same calls give the same bytes. `place` and `set` start a stream of random numbers that is
     named by seed, scene, distance, ambient light and exposure, and the drift somewhere of its own,
@@ -97,17 +96,19 @@ class SimulatedCamera(Camera):
     def __init__(
         self,
         device: str = "D435",
-        seed: int = REFERENCE_UNIT,
+        seed: int | None = REFERENCE_UNIT,
         scene: Scene | None = None,
         ambient: float = 0.01,
         exposure: float | Literal["auto"] = "auto",
         depth_scale_m: float | None = None,
         advice: str = PLUG_IN,
     ) -> None:
-        self.seed, self._advice, self._closed = checks.whole("seed", seed, least=0), advice, False
+        self.seed = my_unit() if seed is None else checks.whole("seed", seed, least=0)
+        self._advice, self._closed = advice, False
         profile = specifications.device(device)
         unit = profile.unit
-        self.name, self.source, self.serial = f"Simulated {device}", "simulated", f"seed-{seed}"
+        self.name, self.source = f"Simulated {device}", "simulated"
+        self.serial = f"seed-{self.seed}"
         self.depth, self.color, self.T_color_depth = unit.depth, unit.color, unit.T_color_depth
         self.baseline_m, self.depth_scale_m = unit.baseline_m, unit.depth_scale_m
         self._device, self._given = device, 0

@@ -22,5 +22,6 @@ from coursekit.intrinsics.fit import (
     calibrate,
     coverage,
     image_grid,
+    rms_under,
     tilts,
 )

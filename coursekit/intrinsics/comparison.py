@@ -45,8 +45,9 @@ class HalvesDifference:
     difference_px (rows, columns, 2): second - first where each sees the same point, after the best
     motion of the camera's frame. expected_px (rows, columns): the standard deviation of that, in
     its worst direction, from the covariances of both. Both are NaN where a half has no ray.
-    p_value: how often halves with nothing but corner noise between them have intrinsics at least
-    this far apart (Wald test).
+    p_value: how often halves whose views scatter as these do have intrinsics at least this far
+    apart (Wald test); noise_p_value: how often corners would that err each by itself, which is
+    nearly never where the model lacks something, whatever it is.
     """
 
     first: IntrinsicsResult
@@ -55,6 +56,7 @@ class HalvesDifference:
     difference_px: Floats
     expected_px: Floats
     p_value: float
+    noise_p_value: float
 
     @property
     def length_px(self) -> Floats:
@@ -63,16 +65,15 @@ class HalvesDifference:
 
     def __repr__(self) -> str:
         length, wide = self.length_px, self.expected_px
-        agree = "as corner noise explains" if self.p_value > 0.01 else "more than noise explains"
+        alone = "explains" if self.noise_p_value > 0.01 else "does not explain"
         return (
             f"two halves ({len(self.first.residuals)} and {len(self.second.residuals)} views) "
             f"differ by {np.nanmedian(length):.2f} px in the median\nof the image and "
-            f"{np.nanmax(length):.2f} px at worst, at {self.range_m:.2f} m; noise alone: sigma "
-            f"{np.nanmedian(wide):.2f} and {np.nanmax(wide):.2f} px\n"
-            + "\n".join([
-                f"{agree} ({p_text(self.p_value)})",
-                *folded_text(float(np.isnan(length).mean())),
-            ])
+            f"{np.nanmax(length):.2f} px at worst, at {self.range_m:.2f} m; by the scatter of "
+            f"the views:\nsigma {np.nanmedian(wide):.2f} and {np.nanmax(wide):.2f} px "
+            f"({p_text(self.p_value)}); corner noise alone {alone} it "
+            f"({p_text(self.noise_p_value)})"
+            + "".join(f"\n{line}" for line in folded_text(float(np.isnan(length).mean())))
         )  # fmt: skip
 
 
@@ -97,13 +98,13 @@ def halves(
     """
     if len(detections) < 6:
         raise ValueError(f"detections: got {len(detections)} views, halves need at least 6")
-    first, second = (
+    first, second = both = [
         calibrate([detections[i] for i in part], board, model, same_focal, points=points)
         for part in (range(0, len(detections), 2), range(1, len(detections), 2))
-    )
+    ]
     range_m = first.board_range_m if range_m is None else float(range_m)
     grid = image_grid(first.intrinsics, shape).reshape(-1, 2)
-    weights = 1.0 / np.hypot(*(r.uncertainty_map(range_m, shape).ravel() for r in (first, second)))
+    weights = 1.0 / np.hypot(*(r.uncertainty_map(range_m, shape).ravel() for r in both))
     weights[~np.isfinite(weights)] = 0.0  # where a half's distortion has no inverse
     difference = difference_px(first.intrinsics, second.intrinsics, grid, range_m, weights)
     difference[weights == 0] = np.nan
@@ -111,6 +112,8 @@ def halves(
     spread = _without_motion(columns, weights)
     total = first.covariance + second.covariance
     apart = np.array([second.value(name) - first.value(name) for name in first.names])
+    known = len(apart)
+    noise = [r.sigma_px**2 * r.equations.shared_covariance[:known, :known] for r in both]
     return HalvesDifference(
         first=first,
         second=second,
@@ -118,6 +121,7 @@ def halves(
         difference_px=difference.reshape(*shape, 2),
         expected_px=worst_direction(spread @ total @ np.swapaxes(spread, -1, -2)).reshape(shape),
         p_value=_wald(apart, total, min(first.dof, second.dof)),
+        noise_p_value=_wald(apart, noise[0] + noise[1], min(r.equations.dof for r in both)),
     )
 
 

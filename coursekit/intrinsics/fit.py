@@ -280,15 +280,13 @@ class IntrinsicsResult(Estimate):
         With the poses that suit it best: what a model is worth, where coefficients too many show.
         Raises ValueError where a half has fewer than 3 views, and as `calibrate`.
         """
-        squares = np.zeros(2)
+        squares = 0.0
         for part in (0, 1):
             views, others = self.detections[part::2], self.detections[1 - part :: 2]
             same = "f" in self.names
             lens = calibrate(views, self.board, self.model, same, None, self.points).intrinsics
-            for d in others:
-                off = _off_px(lens, self.points[d.ids], d.pixels)
-                squares += float(np.sum(off**2)), len(off)
-        return math.sqrt(squares[0] / squares[1])
+            squares += rms_under(lens, others, self.points) ** 2 * sum(map(len, others))
+        return math.sqrt(squares / self.corners)
 
     # --- in words ---
 
@@ -367,13 +365,20 @@ def folded_text(share: float) -> list[str]:
     return [f"in {100 * share:.1f} % of the image ({where}) {folds}"]
 
 
-def _off_px(lens: Intrinsics, points: Floats, pixels: Floats) -> Floats:
-    """How far (N, 2) the board's corners are from where the camera sees them at the best pose."""
+def rms_under(lens: Intrinsics, detections: Sequence[Detection], points: Floats) -> float:
+    """The RMS in px (2-D) of corners under a camera that is held: only the poses are fitted.
+
+    points (N, 3): the board's corners, m. A K that is wrong shows where the corners can tell.
+    """
     import cv2
 
-    _, r, t = cv2.solvePnP(points, pixels, lens.K, lens.dist)
-    at = points @ cv2.Rodrigues(r)[0].T + t.ravel()
-    return np.asarray(pixels - project(at, lens.K, lens.dist))
+    off = []
+    for view in detections:
+        corners = points[view.ids]
+        _, r, t = cv2.solvePnP(corners, view.pixels, lens.K, lens.dist)
+        at = corners @ cv2.Rodrigues(r)[0].T + t.ravel()
+        off.append(view.pixels - project(at, lens.K, lens.dist))
+    return _rms(np.concatenate(off))
 
 
 def _rms(residuals: Floats) -> float:

@@ -16,8 +16,8 @@ from coursekit.lessons.exercises import Exercise, Model, Step
 
 def _build(steps: Mapping[str, Step]) -> Model:
     def sensitivities(u: float, Z: float, fx: float, cx: float, depth_error: float) -> Floats:
-        by_u, by_Z = steps["pixel"](u, Z, fx, cx), steps["depth"](u, Z, fx, cx)
-        return steps["order"](by_u, by_Z, steps["leak"](by_u, by_Z, depth_error, Z))
+        dX_du, dX_dZ = steps["pixel"](u, Z, fx, cx), steps["depth"](u, Z, fx, cx)
+        return steps["order"](dX_du, dX_dZ, steps["leak"](dX_du, dX_dZ, depth_error, Z))
 
     return sensitivities
 
@@ -28,14 +28,14 @@ SENSITIVITIES = Exercise(
     steps={
         "pixel": lambda u, Z, fx, cx: Z / fx,
         "depth": lambda u, Z, fx, cx: (u - cx) / fx,
-        "leak": lambda by_u, by_Z, depth_error, Z: by_Z * depth_error,
-        "order": lambda by_u, by_Z, leak: np.array([by_u, by_Z, leak]),
+        "leak": lambda dX_du, dX_dZ, depth_error, Z: dX_dZ * depth_error,
+        "order": lambda dX_du, dX_dZ, leak: np.array([dX_du, dX_dZ, leak]),
     },
     cases=[
         (524.0, 0.5, 500.0, 424.0, 0.004),
         (847.0, 0.45, 447.0, 424.0, 0.005),
         (20.0, 0.30, 612.0, 322.0, 0.003),
-        (700.0, 0.80, 390.4, 331.4, -0.006),
+        (700.0, 3.70, 390.4, 331.4, -0.006),
     ],
     per_row=0,
     unit="m/px, 1 and m",
@@ -47,21 +47,7 @@ SENSITIVITIES = Exercise(
 )
 
 
-SENSITIVITIES.add_mistakes(
-    ("pixel", "distance_forgotten", lambda u, Z, fx, cx: 1 / fx),
-    ("pixel", "upside_down", lambda u, Z, fx, cx: fx / Z),
-    ("depth", "centre_forgotten", lambda u, Z, fx, cx: u / fx),
-    ("depth", "other_way", lambda u, Z, fx, cx: (cx - u) / fx),
-    ("depth", "not_differentiated", lambda u, Z, fx, cx: (u - cx) * Z / fx),
-    ("depth", "angle", lambda u, Z, fx, cx: math.atan2(u - cx, fx)),
-    ("depth", "sine", lambda u, Z, fx, cx: (u - cx) / math.hypot(u - cx, fx)),
-    ("leak", "wrong_price", lambda by_u, by_Z, depth_error, Z: by_u * depth_error),
-    ("leak", "sign_lost", lambda by_u, by_Z, depth_error, Z: abs(by_Z * depth_error)),
-    ("leak", "millimetres", lambda by_u, by_Z, depth_error, Z: 1000 * by_Z * depth_error),
-    ("leak", "landing_place", lambda by_u, by_Z, depth_error, Z: by_Z * (Z + depth_error)),
-    ("order", "all_millimetres", lambda u, Z, leak: np.array([1000 * u, Z, 1000 * leak])),
-    ("order", "exchanged", lambda by_u, by_Z, leak: np.array([by_Z, by_u, leak])),
-)
+SENSITIVITIES.read_mistakes(globals())
 
 
 # --- add_up ---
@@ -75,10 +61,17 @@ def _build_sums(steps: Mapping[str, Step]) -> Model:
         along = steps["along"]
         noises = [high * along(toward) for _, high, toward, _ in noise]
         most = [steps["most"](low, high, toward) * along(toward) for low, high, toward, _ in bias]
-        parts = [steps["third"]() if row[2] is None else along(row[2]) ** 2 for row in bias]
-        squares = [steps["square"](*row[:2]) * part for row, part in zip(bias, parts, strict=True)]
-        sigma = steps["sigma"](steps["rigs"](squares, noises), most)
-        sums = steps["noise"](noises), steps["worst"](most), steps["quadrature"](most)
+        squares, others = (
+            [
+                steps["square"](low, high) * steps["part"](toward, along)
+                for low, high, toward, _ in of
+            ]
+            for of in (bias, noise)
+        )
+        variance = steps["rigs"](squares, noises, others)
+        summed = steps["summed"](most, noises)
+        sums = steps["noise"](noises), steps["worst"](summed), steps["quadrature"](summed)
+        sigma = steps["sigma"](variance, most)
         return steps["order"](*sums, steps["share"](tolerance / sigma if sigma else math.inf))
 
     return add_up
@@ -91,6 +84,10 @@ def _sorted(rows: Rows) -> tuple[Rows, Rows]:
 
 def _along(toward: Any) -> float:
     return 1.0 if toward is None else abs(toward[0])
+
+
+def _part(toward: Any, along: Step, third: float = 1 / 3) -> float:
+    return third if toward is None else float(along(toward)) ** 2
 
 
 def _root(values: list[float]) -> float:
@@ -126,8 +123,9 @@ ADD_UP = Exercise(
         "worst": sum,
         "quadrature": _root,
         "square": lambda low, high: (low * low + low * high + high * high) / 3,
-        "third": lambda: 1 / 3,
-        "rigs": lambda squares, noises: sum(squares),
+        "part": _part,
+        "rigs": lambda squares, noises, others: sum(squares),
+        "summed": lambda most, noises: most,
         "sigma": lambda variance, most: math.sqrt(variance),
         "share": _beyond,
         "order": lambda *sums: np.array(sums),
@@ -160,36 +158,4 @@ def _third_of(toward: Any, value: float) -> float:
     return value if toward is None else abs(toward[0])
 
 
-ADD_UP.add_mistakes(
-    ("kinds", "noise_in_the_bias", lambda rows: (_sorted(rows)[0], rows)),
-    ("kinds", "bias_in_the_noise", lambda rows: (rows, _sorted(rows)[1])),
-    ("along", "not_projected", lambda toward: 1.0),
-    ("along", "direction_sign", lambda toward: 1.0 if toward is None else toward[0]),
-    ("along", "other_axis", lambda toward: 1.0 if toward is None else abs(toward[1])),
-    ("along", "any_way_nothing", lambda toward: 0.0 if toward is None else abs(toward[0])),
-    ("most", "third_of_the_worst", lambda low, high, toward: high * _third_of(toward, 3**-0.5)),
-    ("most", "least_for_most", lambda low, high, toward: low),
-    ("most", "middle_for_most", lambda low, high, toward: (low + high) / 2),
-    ("noise", "noise_added", sum),
-    ("noise", "noise_squared", lambda values: _root(values) ** 2),
-    ("noise", "noise_mean", lambda values: _root(values) / max(len(values), 1) ** 0.5),
-    ("worst", "worst_in_quadrature", _root),
-    ("quadrature", "quadrature_added", sum),
-    ("quadrature", "quadrature_squared", lambda values: _root(values) ** 2),
-    ("square", "mean_squared", lambda low, high: ((low + high) / 2) ** 2),
-    ("square", "largest_squared", lambda low, high: high * high),
-    ("square", "ends_squared", lambda low, high: (low * low + high * high) / 2),
-    ("square", "spread_squared", lambda low, high: (high - low) ** 2 / 12),
-    ("third", "third_forgotten", lambda: 1.0),
-    ("third", "third_rooted", lambda: 3**-0.5),
-    ("third", "half_for_third", lambda: 0.5),
-    ("rigs", "noise_in_the_share", lambda squares, noises: sum(squares) + _root(noises) ** 2),
-    ("sigma", "variance_for_sigma", lambda variance, most: variance),
-    ("sigma", "quadrature_for_sigma", lambda variance, most: _root(most)),
-    ("sigma", "worst_for_sigma", lambda variance, most: sum(most)),
-    ("share", "one_sided", lambda z: _beyond(z) / 2),
-    ("share", "within_for_beyond", lambda z: 1 - _beyond(z)),
-    ("share", "share_in_percent", lambda z: 100 * _beyond(z)),
-    ("share", "root_two_lost", math.erfc),
-    ("order", "sums_exchanged", lambda n, w, q, share: np.array([n, q, w, share])),
-)
+ADD_UP.read_mistakes(globals())

@@ -9,15 +9,24 @@ lesson's module, and in its TOML file, under [mistakes], what the student will r
     PROJECT.add_mistakes(("read", "p1_p2_swapped", lambda k1, k2, p1, p2, k3: (k1, k2, p2, p1, k3)))
 
     p1_p2_swapped = ["your p1 and p2 are swapped", "Which of the two multiplies r² + 2x²?"]
+
+What nobody listed is left to a general device: it edits what goes into the right answer, into each
+of its steps and out of them (a sign, a factor, a column for another), and the source of each step
+(an operator, a bracket, a name for another), and keeps the first edit that alone gives the same
+numbers. Its words are in exercises.toml.
 """
 
 from __future__ import annotations
 
+import ast
+import inspect
 import itertools
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache, cached_property, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,7 +43,8 @@ Model = Callable[..., Any]
 class Mistake:
     """One wrong step: what it says to the learner, and a question that leads on.
 
-    One that stands `alone` is not tried together with others (one of a long family, say).
+    One that stands `alone` is not tried together with others (one of a long family, say). Without
+    a step, `wrong` is what is made of the whole function. One of the `device` is not listed.
     """
 
     name: str
@@ -43,6 +53,7 @@ class Mistake:
     step: str = ""
     wrong: Step = field(default=lambda: None)
     alone: bool = False
+    device: bool = False
 
 
 @dataclass(frozen=True)
@@ -67,7 +78,8 @@ class Exercise:
     result has rows and the first `per_row` arguments have the same, one row of them is shown;
     otherwise (a result that is one number, say) the whole case. Results agree within `tolerance`
     (in `unit`) or 1e-9 of their size, and NaN with NaN. Where `nan_answers`, NaN is an answer
-    like any other; otherwise a wrong model that comes to NaN or infinity has overflowed. An
+    like any other; otherwise a wrong model that comes to NaN or infinity has overflowed. ways:
+    other right answers, what each does and the steps that do it; `way` is what the model does. An
     attempt that leaves out what is beyond the `core` is judged by the core cases alone: by an
     exercise that has only those, and is `part_of` this one.
     """
@@ -82,12 +94,16 @@ class Exercise:
     describe: Callable[[tuple[Any, ...]], str]
     show: Callable[[Floats], str]
     nan_answers: bool = False
+    way: str = ""
+    ways: list[tuple[str, dict[str, Step]]] = field(default_factory=list)
     core: Core | None = None
     mistakes: list[Mistake] = field(default_factory=list)
     part_of: Exercise | None = field(default=None, repr=False)
     _known: dict[tuple[int, ...], Floats | None] = field(
         default_factory=dict, init=False, repr=False
     )
+    _edits: list[list[Mistake]] = field(default_factory=list, init=False, repr=False)
+    _alone: list[Exercise] = field(default_factory=list, init=False, repr=False)  # the core
 
     @property
     def function(self) -> str:
@@ -99,16 +115,33 @@ class Exercise:
 
         One name may come several times: other ways to write the same misconception. What the
         student reads stands under it in the lesson's TOML file: what is wrong, and a question that
-        leads on.
+        leads on. Without a step, the wrong one is made of the whole function, and stands alone.
         """
-        texts = questions.lesson_texts(self.name.partition(".")[0])["mistakes"]
+        texts = self._written("mistakes")
         for step, name, instead in wrong:
             says, ask = (" ".join(text.split()) for text in texts[name])
-            self.mistakes.append(Mistake(name, says, ask, step, instead, alone))
+            self.mistakes.append(Mistake(name, says, ask, step, instead, alone or not step))
+
+    def read_mistakes(self, names: dict[str, Any], in_pairs: Sequence[str] = ()) -> None:
+        """Add the wrong steps that stand in the TOML file; names: what their Python may use.
+
+        in_pairs: the steps whose mistakes are also tried two at a time; all, where none is named.
+        """
+        for name, ways in self._written("wrong")[self.function].items():
+            for step, code in ways:
+                alone = bool(in_pairs) and step not in in_pairs
+                wrong = eval(" ".join(code.split()), names)
+                self.add_mistakes((step, name, wrong), alone=alone)
+
+    def _written(self, table: str) -> dict[str, Any]:
+        return dict(questions.lesson_texts(self.name.partition(".")[0])[table])
 
     def model(self, *mistakes: Mistake) -> Model:
         """The right function with these mistakes built in."""
-        return self.build(self.steps | {m.step: m.wrong for m in mistakes})
+        model = self.build(self.steps | {m.step: m.wrong for m in mistakes if m.step})
+        for mistake in mistakes:
+            model = model if mistake.step else mistake.wrong(model)
+        return model
 
     def check(self, function: Callable[..., Any]) -> Verdict:
         """The verdict on a learner's function; never raises, and notes the attempt."""
@@ -116,17 +149,37 @@ class Exercise:
 
     def judge(self, function: Callable[..., Any]) -> Verdict:
         """The verdict on a learner's function, without noting it."""
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            verdicts = [exercise._verdict(function) for exercise in (*self._others, self)]
+        known = ("right", *(m.name for m in self.mistakes))
+        return min(verdicts[::-1], key=lambda v: (v.named or v.kind) not in known)
+
+    @cached_property
+    def _others(self) -> list[Exercise]:
+        """The exercise as those see it who answer it in another right way, without the device."""
+        others = [replace(self, way=w, steps=self.steps | own, ways=[]) for w, own in self.ways]
+        for other in others:
+            other._edits.extend(([], []))
+        return others
+
+    def _verdict(self, function: Callable[..., Any]) -> Verdict:
         if not callable(function):
             return self._say("not attempted", f"got a {type(function).__name__}, not a function.")
         runs = [_run(function, args) for args in self.cases]
         if self.core and self._leaves_the_rest(self.core, function, runs):
-            cases = [args for args in self.cases if self.is_core(args)]
-            return replace(self, cases=cases, core=None, part_of=self).judge(function)
-        unfinished = self._unfinished(runs)
+            return self._core_alone()._verdict(function)
+        unfinished = self._unfinished(function, runs)
         if unfinished:
             return unfinished
         expected = [np.asarray(self._answer((), args)) for args in self.cases]
         return self._compare(runs, expected)
+
+    def _core_alone(self) -> Exercise:
+        if not self._alone:
+            cases = [args for args in self.cases if self.is_core(args)]
+            self._alone.append(replace(self, cases=cases, core=None, part_of=self))
+        return self._alone[0]
 
     def is_core(self, args: tuple[Any, ...]) -> bool:
         return self.core is None or len(self.core.of(args)) == len(args)
@@ -145,10 +198,13 @@ class Exercise:
                     return False
         return True
 
-    def _unfinished(self, runs: list[Run]) -> Verdict | None:
+    def _unfinished(self, function: Callable[..., Any], runs: list[Run]) -> Verdict | None:
         """Not attempted, raised, or something that is not an array of the right shape."""
         if all(r.value is None and r.error is None for r in runs):
-            return self._say("not attempted", "not attempted yet: it returns None.")
+            code = getattr(function, "__code__", None)
+            if code is None or len(code.co_code) <= len(_nothing.__code__.co_code):
+                return self._say("not attempted", "not attempted yet: it returns None.")
+            return self._say("wrong", "it returns None: is there a `return`?", NO_RETURN)
         for run, args in zip(runs, self.cases, strict=True):
             if isinstance(run.error, NotImplementedError):
                 return self._say("not attempted", "not attempted yet.")
@@ -174,16 +230,22 @@ class Exercise:
             if value.shape != want.shape:
                 got, wanted = _shape(value), _shape(want)
                 text = f"wrong shape: it returns {got}, and {wanted} is wanted."
+                if self.per_row and 0 < value.ndim == want.ndim and len(value) < len(want):
+                    text += f" Every row of the input has one in the result: {len(want)} of them."
                 return self._say("wrong", text, self._given(args))
         return self._judged(values, expected, formal)
 
-    def _right(self) -> Verdict:
+    def _right(self, formal: list[Mistake]) -> Verdict:
+        if formal:
+            right = f"The numbers are right.{self._later}"
+            return self._one(formal[0], right) if len(formal) == 1 else self._several(formal[0])
         count = len(self.cases)
         if self.part_of and self.part_of.core:
             core, others = self.part_of.core, len(self.part_of.cases) - count
             text = f"the core is right: all {count} cases {core.which} agree."
             return self._say("core right", f"{text} Deeper: the other {others} use {core.rest}.")
-        text = f"right. All {count} cases agree to {self.tolerance:g} {self.unit}."
+        way = f", {self.way}" if self.way else ""
+        text = f"right{way}. All {count} cases agree to {self.tolerance:g} {self.unit}."
         return self._say("right", text)
 
     def _judged(
@@ -191,28 +253,71 @@ class Exercise:
     ) -> Verdict:
         """The verdict on results of the right shape; formal: what else is wrong with them."""
         agree = [self._agrees(v, e) for v, e in zip(values, expected, strict=True)]
-        if all(agree) and formal:
-            right = f"The numbers are right.{self._later}"
-            return self._one(formal[0], right) if len(formal) == 1 else self._several(formal[0])
         if all(agree):
-            return self._right()
+            return self._right(formal)
         count = f"{sum(agree)} of {self._all_cases} agree.{self._later}"
         first = agree.index(False)
         evidence = self._evidence(first, values[first], expected[first])
         if formal:
             return self._several(formal[0], count, evidence)
+        relation = self._relation(values, expected)
+        mistakes = self._found(values, relation in ("runs_away", "constant"))
+        if len({m.name for m in mistakes}) > 1:
+            return self._several(self._seen_in(first, mistakes, expected[first]), count, evidence)
+        if self.core and not mistakes:  # what is wrong there may hide behind the rest
+            of_core = [i for i, args in enumerate(self.cases) if self.is_core(args)]
+            ours, wanted = ([of[i] for i in of_core] for of in (values, expected))
+            verdict = self._core_alone()._judged(ours, wanted, [])
+            if verdict.named:
+                return verdict
+        if relation and not mistakes:
+            mistakes = (_device(relation, "your result", "", replace),)
+        if mistakes:
+            return self._one(mistakes[0], count, evidence)
+        return self._say("wrong", f"not right yet. {count}", evidence, BY_HAND)
+
+    def _found(self, values: list[Floats], told: bool) -> tuple[Mistake, ...]:
+        """The first mistakes that give these values; told: without the device's."""
         for mistakes in self._combinations():
+            if told and mistakes[-1].device:
+                break
             if self._explains(mistakes, values):
-                if len(mistakes) > 1:
-                    seen = self._seen_in(first, mistakes, expected[first])
-                    return self._several(seen, count, evidence)
-                return self._one(mistakes[0], count, evidence)
-        return self._say(
-            "wrong",
-            f"not right yet. {count}",
-            evidence,
-            "No single mistake that this check knows gives these numbers. Work this "
-            "case by hand, one step at a time, and compare.",
+                return mistakes
+        return ()
+
+    def _relation(self, values: list[Floats], expected: list[Floats]) -> str | None:
+        """What can be said of numbers that no model gives: they run away, or are proportional."""
+        both = list(zip(values, expected, strict=True))
+        factors = np.array([np.vdot(e, v) / np.vdot(e, e) for v, e in both])
+        k = abs(factors[0])
+        straight = k > 0 and np.allclose(np.abs(factors), k, 1e-6, 0)
+        straight &= all(
+            np.allclose(v, f * e, 1e-6, self.tolerance / 10)
+            for f, (v, e) in zip(factors, both, strict=True)
+        )
+        square = expected[0].shape == (3, 3)
+        holds = {
+            "constant": all(np.array_equal(v, values[0], equal_nan=True) for v in values),
+            "rows_lost": self.per_row and all(self._agrees_but_for_rows(v, e) for v, e in both),
+            "mirrored": square and all(self._agrees(v, e) or self._mirrors(v) for v, e in both),
+            "runs_away": not self.nan_answers
+            and any(not (np.abs(v) <= 1e6 * (1 + np.abs(e).max())).all() for v, e in both),
+            "signs": straight and abs(k - 1) < 1e-6 and len(set(np.sign(factors))) > 1,
+            "factor_and_signs": straight and len(set(np.sign(factors))) > 1,
+            "factor": straight,
+        }
+        return next((kind for kind, true in holds.items() if true), None)
+
+    def _mirrors(self, matrix: Floats) -> bool:
+        return self._agrees(matrix @ matrix.T, np.eye(3)) and bool(np.linalg.det(matrix) < 0)
+
+    def _agrees_but_for_rows(self, value: Floats, want: Floats) -> bool:
+        """Whether of several rows some are right, and all others nothing: 0 or NaN."""
+        if not want.ndim or len(want) == 1:
+            return self._agrees(value, want)
+        right = [self._agrees(v, e) for v, e in zip(value, want, strict=True)]
+        return any(right) and all(
+            r or not np.nan_to_num(v).any() for r, v in zip(right, value, strict=True)
         )
 
     def _seen_in(self, case: int, mistakes: tuple[Mistake, ...], want: Floats) -> Mistake:
@@ -242,16 +347,27 @@ class Exercise:
         return self._say("wrong", text, *lines, mistake.ask, named=mistake.name)
 
     def _several(self, first: Mistake, *lines: str) -> Verdict:
-        text = f"more than one mistake. Look first at this: {first.says}."
+        text = f"{MORE_THAN_ONE}{first.says}."
         return self._say("wrong", text, *lines, first.ask, named=f"several, first {first.name}")
 
     def _combinations(self) -> Iterator[tuple[Mistake, ...]]:
-        """Each mistake alone, then each pair of different steps, earlier step first."""
+        """Each mistake alone, then each pair of different steps, earlier step first; the device's
+        edits; a mistake and an edit of the whole."""
         order = list(self.steps)
         yield from ((m,) for m in self.mistakes)
-        for a, b in itertools.combinations([m for m in self.mistakes if not m.alone], 2):
+        listed = [m for m in self.mistakes if not m.alone]
+        for a, b in itertools.combinations(listed, 2):
             if a.step != b.step:
                 yield (a, b) if order.index(a.step) < order.index(b.step) else (b, a)
+        if not self._edits:
+            self._edits += _all_edits(self)
+        single, double = self._edits
+        yield from ((m,) for m in single)
+        yield from ((m,) for m in double)
+        common = [
+            m for m in single if not m.step and m.name in FOUND["common"] and "result" in m.says
+        ]
+        yield from itertools.product(listed, common)
 
     def _explains(self, mistakes: tuple[Mistake, ...], values: list[Floats]) -> bool:
         """Whether a wrong model gives exactly these values.
@@ -260,15 +376,23 @@ class Exercise:
         agrees, and the case is left out; so one case at least must show that the model is wrong.
         """
         shown = False
-        for value, args in zip(values[::-1], self.cases[::-1], strict=True):  # the last tell most
+        for value, args in self._telling(values):
             wrong = self._answer(mistakes, args)
             if wrong is None:
+                if mistakes[-1].device:
+                    return False
                 continue
-            if not self._agrees(value, wrong):
+            if value.shape != wrong.shape or not self._agrees(value, wrong):
                 return False
             right = self._answer((), args)
             shown = shown or right is None or not self._agrees(wrong, right)
         return shown
+
+    def _telling(self, values: list[Floats]) -> list[tuple[Floats, tuple[Any, ...]]]:
+        """Results with their cases, such as tell most first: the last one of the core, the last."""
+        both = list(zip(values, self.cases, strict=True))[::-1]
+        first = next(i for i, (_, args) in enumerate(both) if self.is_core(args))
+        return [both.pop(first), *both]
 
     def _answer(self, mistakes: tuple[Mistake, ...], args: tuple[Any, ...]) -> Floats | None:
         """What a wrong model makes of a case, None where it overflows.
@@ -277,17 +401,19 @@ class Exercise:
         """
         key = (*map(id, mistakes), id(args))
         if key not in self._known:
-            value = _as_numbers(_run(self.model(*mistakes), args).value)
+            try:
+                value = _as_numbers(self.model(*mistakes)(*args))
+            except Exception:  # an edit of the device may come to nothing
+                value = None
             overflows = value is not None and not self.nan_answers and not np.isfinite(value).all()
             self._known[key] = None if overflows else value
         return self._known[key]
 
     def _agrees(self, value: Floats, want: Floats) -> bool:
         """As np.allclose says with equal_nan, in a third of its time: checks ask this often."""
-        with np.errstate(all="ignore"):
-            off = np.abs(value - want)
-            if (off > self.tolerance + 1e-9 * np.abs(want)).any():
-                return False
+        off = np.abs(value - want)
+        if (off > self.tolerance + 1e-9 * np.abs(want)).any():
+            return False
         equal = (value == want) | (np.isnan(value) & np.isnan(want))
         return bool((np.isfinite(off) | equal).all())
 
@@ -295,8 +421,7 @@ class Exercise:
         """The first failing case, or its row that is furthest off, with its input."""
         args = self.cases[index]
         if want.ndim and self.per_row:
-            with np.errstate(all="ignore"):
-                off = np.abs(value - want).reshape(len(want), -1).max(axis=1)
+            off = np.abs(value - want).reshape(len(want), -1).max(axis=1)
             row = int(np.nan_to_num(off, nan=np.inf).argmax())
             args = tuple(a[row : row + 1] for a in args[: self.per_row]) + args[self.per_row :]
             value, want = value[row], want[row]
@@ -310,6 +435,19 @@ class Exercise:
         return Verdict(self.name, kind, f"{self.function}: {text}", lines, named)
 
 
+def _nothing() -> None:
+    return None
+
+
+MORE_THAN_ONE = "more than one mistake. Look first at this: "
+NO_RETURN = (
+    "Printing or keeping a result does not give it back: `return` does. And the template's own "
+    "`return None` has to go."
+)
+BY_HAND = (
+    "No single mistake that this check knows gives these numbers. Work this case by hand, one "
+    "step at a time, and compare."
+)
 IN_PLACE = Mistake(
     "in_place",
     "your function changes the array it is given",
@@ -335,9 +473,7 @@ class Run:
 def _run(function: Callable[..., Any], args: tuple[Any, ...]) -> Run:
     own = tuple(np.array(a) if isinstance(a, np.ndarray) else a for a in args)
     try:
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")
-            value = function(*own)
+        value = function(*own)
     except (Exception, SystemExit) as error:  # whatever a learner's code does, the check goes on
         return Run(None, error, _what_was_raised(error, function))
     changed = any(
@@ -365,3 +501,278 @@ def _as_numbers(value: Any) -> Floats | None:
         return array.astype(float) if array.dtype.kind in "fiub" else None
     except (TypeError, ValueError):
         return None
+
+
+# --- the general device ---
+
+Edit = Callable[[Any], Any]
+Way = tuple[str | int, ...]
+FOUND = questions.lesson_texts("exercises")
+EDITS: dict[str, Edit] = {
+    kind: eval(f"lambda v: {formula}", {"np": np}) for kind, formula in FOUND["edits"].items()
+}
+ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh")
+NUMERIC = (int, float, np.generic, np.ndarray)
+MOST_SITES = 45  # a step with more of them is not tried with two edits
+
+
+def _all_edits(exercise: Exercise) -> tuple[list[Mistake], list[Mistake]]:
+    """Single edits of the whole function and of its steps, and pairs within one step's source."""
+    args, steps = exercise.cases[-1], exercise.steps
+    seen: dict[str, tuple[tuple[Any, ...], Any]] = {}
+
+    def watched(name: str, *values: Any) -> Any:
+        seen[name] = values, steps[name](*values)
+        return seen[name][1]
+
+    def parts(result: Any) -> Any:  # of one case: its rows have columns, or it has a few parts
+        array = np.asarray(result)
+        return array if exercise.per_row or not array.ndim else tuple(array)
+
+    result = parts(exercise.build({name: partial(watched, name) for name in steps})(*args))
+    inputs = [f"`{name}`" for name in inspect.signature(exercise.model()).parameters]
+    found: list[tuple[str, str, str, Step]] = []
+    for kind, where, edit in _edits_of(result, "your result"):
+        found.append((kind, where, "", lambda f, e=edit: lambda *a: e(parts(f(*a)))))
+    rewritten = [(name, edit) for name, step in steps.items() for edit in _rewritten(step)]
+    found += [(kind, where, name, new) for name, (n, kind, where, new) in rewritten if n == 1]
+    for kind, where, edit in _edits_of(args, inputs):
+        found.append((kind, where, "", lambda f, e=edit: lambda *a: f(*e(a))))
+    for kind, where, by in _factors(args, inputs, result):
+        found.append((kind, where, "", lambda f, by=by: lambda *a: by(a, parts(f(*a)))))
+    for name, (values, given) in seen.items():
+        step, own = steps[name], _argument_names(steps[name], len(values))
+        for kind, where, edit in _edits_of(given, f"what is made of {_listed(own)}", deep=False):
+            found.append((kind, where, name, lambda *a, e=edit, f=step: e(f(*a))))
+        for kind, where, edit in _edits_of(values, own, deep=False):
+            found.append((kind, where, name, lambda *a, e=edit, f=step: f(*e(a))))
+    pairs = [(kind, where, name, new) for name, (n, kind, where, new) in rewritten if n == 2]
+    return [_device(*edit) for edit in found], [_device(*edit, MORE_THAN_ONE) for edit in pairs]
+
+
+def _device(kind: str, where: str, step: str, wrong: Step, before: str = "") -> Mistake:
+    says, ask = (" ".join(text.split()) for text in FOUND["kinds"][kind])
+    return Mistake(kind, before + says.replace("WHERE", where), ask, step, wrong, device=True)
+
+
+def _listed(names: Iterable[str]) -> str:
+    *others, last = dict.fromkeys(names) or ["the code"]
+    return f"{', '.join(others)} and {last}" if others else last
+
+
+def _argument_names(step: Step, count: int) -> list[str]:
+    code = getattr(step, "__code__", None)
+    names = [f"`{name}`" for name in code.co_varnames] if code else []
+    return (names + ["the input"] * count)[:count]
+
+
+def _edits_of(
+    value: Any, named: str | list[str], deep: bool = True
+) -> Iterator[tuple[str, str, Edit]]:
+    """Edits of all of a value and of its parts: a kind, where it is, and what it does.
+
+    named: what the value is called, or each part of a tuple; not deep: only tuples have parts.
+    """
+    whole = named if isinstance(named, str) else _listed(named)
+    if isinstance(value, NUMERIC):
+        yield from ((kind, whole, edit) for kind, edit in EDITS.items())
+    parts = _parts(value, named) if deep or isinstance(value, tuple) else []
+    arrays = [part for part in parts if isinstance(part[2], (np.generic, np.ndarray))]
+    like = len(arrays) > 1 and len({part[2].shape for part in arrays}) == 1
+    for label, indices, part in [
+        *((label, [i], part) for label, i, part in parts),
+        *([(whole, [i for _, i, _ in arrays], arrays[0][2])] if like else []),
+    ]:
+        for kind, where, edit in _edits_of(part, label, deep):
+            yield kind, where, partial(_put, [(i, i) for i in indices], edit)
+    for (a, i, x), (b, j, y) in itertools.permutations(parts, 2):
+        if isinstance(x, NUMERIC) and isinstance(y, NUMERIC) and np.shape(x) == np.shape(y):
+            yield "copied", _listed((a, b)), partial(_put, [(i, j)], lambda v: v)
+            yield "exchanged", _listed((a, b)), partial(_put, [(i, j), (j, i)], lambda v: v)
+
+
+def _parts(value: Any, named: str | list[str]) -> list[tuple[str, Any, Any]]:
+    """What each part is called, its index and itself: of a tuple, of columns, of a pose."""
+    labels = named if isinstance(named, list) else []
+    indices: list[Any] = []
+    array: tuple[int, ...] = value.shape if isinstance(value, np.ndarray) else ()
+    if isinstance(value, tuple):
+        kind = "part" if any(isinstance(v, np.ndarray) and v.ndim for v in value) else "number"
+        labels = labels or [f"the {n} {kind} of {named}" for n in ORDINALS]
+        indices = list(range(len(value)))
+    elif array == (4, 4):
+        labels = [f"the {part} of {named}" for part in ("translation", "rotation", "last row")]
+        indices = [(slice(3), 3), (slice(3), slice(3)), 3]
+    elif len(array) == 2 and array[1] < min(4, array[0]):
+        labels = [f"the {n} column of {named}" for n in ORDINALS]
+        indices = [(..., i) for i in range(array[1])]
+    return [(label, i, value[i]) for label, i in zip(labels, indices, strict=False)]
+
+
+def _put(places: list[tuple[Any, Any]], edit: Edit, value: Any) -> Any:
+    """The value with an edit of what stands at the second of each two places at the first."""
+    new = list(value) if isinstance(value, tuple) else np.array(value, float)
+    for i, j in places:
+        new[i] = edit(value[j])
+    return tuple(new) if isinstance(value, tuple) else new
+
+
+def _factors(
+    args: tuple[Any, ...], names: list[str], result: Any
+) -> Iterator[tuple[str, str, Step]]:
+    """Edits by which the result, or a part of it, is multiplied or divided by an input."""
+    for i, (name, given) in enumerate(zip(names, args, strict=False)):
+        if isinstance(given, (float, np.ndarray)) and np.ndim(given) < 2:
+            for _, n, _ in _parts(result, "") or [("", ..., result)]:
+                for kind, by in (("factor_too_many", np.multiply), ("factor_missing", np.divide)):
+                    yield (
+                        kind,
+                        name,
+                        lambda a, v, i=i, by=by, n=n: _put([(n, n)], lambda x: by(x, a[i]), v),
+                    )
+
+
+@cache
+def _rewritten(step: Step) -> list[tuple[int, str, str, Step]]:
+    """The step with one edit of its source, or the like in several places; then with two.
+
+    Before each stands 1 or 2. A step without a source has none.
+    """
+    tree = _source(step)
+    if tree is None:
+        return []
+    space = {**step.__globals__, **inspect.getclosurevars(step).nonlocals}
+    names = {n.arg for n in ast.walk(tree) if isinstance(n, ast.arg)}
+    names |= {n.id for n in ast.walk(tree) if isinstance(n, ast.Name) and type(n.ctx) is ast.Store}
+    sites: list[tuple[int, str, str, dict[int, ast.AST]]] = []
+    groups: dict[Any, tuple[str, str, dict[int, ast.AST]]] = {}
+    for node, around, path in _walk(tree):
+        fields = tuple(field for field in path if isinstance(field, str))
+        beside = tuple(field for field in path if field not in ("left", "right"))
+        for kind, detail, new in _alternatives(node, names):
+            where = _named_in(node) or _named_in(around)
+            if kind == "function_dropped":
+                where = f"`{detail}` of {where}"
+            where = detail[1] if kind == "name" else where
+            sites.append((1, kind, where, {id(node): new}))
+            for like in ((), fields, beside, where):
+                groups.setdefault((kind, detail, like), (kind, where, {}))[2][id(node)] = new
+    pairs = itertools.combinations(sites if len(sites) <= MOST_SITES else [], 2)
+    several = [(1, *group) for group in groups.values() if len(group[2]) > 1]
+    double = [(2, kind, where, a | b) for (_, kind, where, a), (*_, b) in pairs]
+    edits = [
+        (n, kind, where, _compiled(_rebuilt(tree, swaps), space))
+        for n, kind, where, swaps in sites + several + double
+    ]
+    return [edit for edit in edits if edit[3] is not None]
+
+
+@cache
+def _module(file: str) -> ast.Module:
+    return ast.parse(Path(file).read_text(encoding="utf-8"))
+
+
+def _source(step: Step) -> ast.Lambda | ast.FunctionDef | None:
+    """The lambda or the definition that a step was made by."""
+    code = getattr(step, "__code__", None)
+    if code is None or not Path(code.co_filename).exists():
+        return None
+    places = set(code.co_positions())
+    for node in ast.walk(_module(code.co_filename)):
+        if isinstance(node, ast.FunctionDef) and node.lineno == code.co_firstlineno:
+            return node
+        if isinstance(node, ast.Lambda):
+            body = node.body
+            if (body.lineno, body.end_lineno, body.col_offset, body.end_col_offset) in places:
+                return node
+    return None
+
+
+def _walk(holder: ast.AST, path: Way = ()) -> Iterator[tuple[ast.AST, ast.AST, Way]]:
+    """Each node, the one that holds it, and the way to it: fields, and places in a list."""
+    for name, child in ast.iter_fields(holder):
+        for i, part in enumerate(child if isinstance(child, list) else [child]):
+            if isinstance(part, ast.AST) and not isinstance(part, ast.arguments):
+                way = (*path, name, i) if isinstance(child, list) else (*path, name)
+                yield part, holder, way
+                yield from _walk(part, way)
+
+
+def _other_operators(node: Any) -> Iterator[tuple[str, Any, ast.AST]]:
+    for kind, old, other in FOUND["operators"]:
+        new = getattr(ast, other)()
+        if isinstance(node, ast.BinOp) and type(node.op).__name__ == old:
+            yield kind, other, ast.BinOp(node.left, new, node.right)
+        if isinstance(node, ast.Compare) and type(node.ops[0]).__name__ == old:
+            yield kind, other, ast.Compare(node.left, [new], node.comparators)
+    if isinstance(node, ast.BinOp):
+        left, op, right = node.left, node.op, node.right
+        yield "dropped", ast.dump(right), left
+        yield "dropped", ast.dump(left), right
+        yield "turned_round", type(op), ast.BinOp(right, op, left)
+        if isinstance(op, ast.Mult):
+            yield "divided", "turned", ast.BinOp(right, ast.Div(), left)
+        if isinstance(left, ast.BinOp) and _rank(left.op) < _rank(op):  # (a + b) * c
+            yield "bracket", 0, ast.BinOp(left.left, left.op, ast.BinOp(left.right, op, right))
+        if isinstance(right, ast.BinOp) and _rank(right.op) < _rank(op) + isinstance(op, ast.Div):
+            yield "bracket", 0, ast.BinOp(ast.BinOp(left, op, right.left), right.op, right.right)
+
+
+def _alternatives(node: Any, names: set[str]) -> Iterator[tuple[str, Any, ast.AST]]:
+    """What may stand in a node's place: the kind of edit, what tells it from others, the node."""
+    yield from _other_operators(node)
+    match node:
+        case ast.Constant(int() | float() as value) if not isinstance(value, bool):
+            for number in (value + 1, value - 1, -value):
+                yield "number", (value, number), ast.Constant(number)
+        case ast.Name(name, ast.Load()) if name in names:
+            for other in sorted(names - {name}):
+                yield "name", (name, f"`{other}`"), ast.Name(other, ast.Load())
+        case ast.Call(function, [first, *_] as arguments, keywords):
+            *module, name = ast.unparse(function).split(".")
+            yield "function_dropped", name, first
+            for other in (n for f in FOUND["functions"] if name in f for n in f if n != name):
+                new = ast.parse(".".join((*module, other)), mode="eval").body
+                yield "function", (name, other), ast.Call(new, arguments, keywords)
+        case ast.Attribute(value, "T"):
+            yield "transpose_missing", 0, value
+        case ast.UnaryOp(_, operand):
+            yield "sign_missing", 0, operand
+
+
+def _rank(op: ast.operator) -> int:
+    return 0 if isinstance(op, (ast.Add, ast.Sub)) else 1 + isinstance(op, ast.Pow)
+
+
+def _named_in(*nodes: ast.AST) -> str:
+    """The first three names of quantities in some source, none for a number."""
+    inside = [n for node in nodes for n in ast.walk(node)]
+    called = {id(n.func) for n in inside if isinstance(n, ast.Call)}
+    names = [n.id for n in inside if isinstance(n, ast.Name) and id(n) not in called]
+    found = list(dict.fromkeys(f"`{name}`" for name in names if name not in ("np", "math")))
+    return _listed(found[:3]) if found else ""
+
+
+def _rebuilt(node: Any, swaps: Mapping[int, ast.AST]) -> Any:
+    """A copy of a syntax tree in which some nodes are others."""
+    if id(node) in swaps:
+        return swaps[id(node)]
+    if isinstance(node, list):
+        return [_rebuilt(part, swaps) for part in node]
+    if not isinstance(node, ast.AST):
+        return node
+    return type(node)(**{name: _rebuilt(part, swaps) for name, part in ast.iter_fields(node)})
+
+
+def _compiled(tree: Any, space: dict[str, Any]) -> Any:
+    """The function that a lambda or a definition makes; None for an edit that is no Python."""
+    own: dict[str, Any] = {}
+    if isinstance(tree, ast.Lambda):
+        tree = ast.Assign([ast.Name("step", ast.Store())], tree)
+    try:
+        exec(
+            compile(ast.fix_missing_locations(ast.Module([tree], [])), "<edit>", "exec"), space, own
+        )
+    except SyntaxError:
+        return None
+    return next(iter(own.values()))

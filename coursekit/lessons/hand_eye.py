@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -26,6 +26,9 @@ def _build_pair(steps: Mapping[str, Step]) -> Model:
     def motion_pair(
         gripper_i: Floats, gripper_j: Floats, board_i: Floats, board_j: Floats
     ) -> Floats:
+        gripper_i, gripper_j, board_i, board_j = steps["read"](
+            gripper_i, gripper_j, board_i, board_j
+        )
         invert = steps["inverse"]
         A = steps["A"](*steps["A pair"](gripper_i, gripper_j), invert)
         B = steps["B"](*steps["B pair"](board_i, board_j), invert)
@@ -64,11 +67,12 @@ MOTION_PAIR = Exercise(
     name="hand_eye.motion_pair",
     build=_build_pair,
     steps={
+        "read": lambda *poses: poses,
         "inverse": np.linalg.inv,
         "A pair": lambda i, j: (i, j),
-        "A": lambda first, second, inverse: inverse(second) @ first,  # the gripper's motion
+        "A": lambda gripper_i, gripper_j, inverse: inverse(gripper_j) @ gripper_i,
         "B pair": lambda i, j: (i, j),
-        "B": lambda first, second, inverse: second @ inverse(first),  # the camera's, by the board
+        "B": lambda board_i, board_j, inverse: board_j @ inverse(board_i),
         "order": lambda A, B: np.stack([A, B]),
     },
     cases=[_session_pair(0, plain=True), *(_session_pair(seed) for seed in range(1, 5))],
@@ -80,17 +84,7 @@ MOTION_PAIR = Exercise(
 )
 
 
-MOTION_PAIR.add_mistakes(
-    ("inverse", "transposed_pose", lambda T: T.T),
-    ("inverse", "translation_not_turned", lambda T: make_transform(T[:3, :3].T, -T[:3, 3])),
-    ("inverse", "not_inverted", lambda T: T),
-    ("A", "motion_in_base", lambda first, second, inverse: second @ inverse(first)),
-    ("A pair", "a_exchanged", lambda i, j: (j, i)),
-    ("B pair", "b_exchanged", lambda i, j: (j, i)),
-    ("B", "motion_in_board", lambda first, second, inverse: inverse(second) @ first),
-    ("order", "both_exchanged", lambda A, B: np.stack([np.linalg.inv(A), np.linalg.inv(B)])),
-    ("order", "b_first", lambda A, B: np.stack([B, A])),
-)
+MOTION_PAIR.read_mistakes(globals())
 
 
 # --- rotation_half ---
@@ -111,12 +105,19 @@ def _build_half(steps: Mapping[str, Step]) -> Model:
     return rotation_half
 
 
-def _motions(seed: int, n: int) -> Pair:
-    """n motions and what the camera saw of them, without noise."""
+def _motions(seed: int, n: int, parallel: bool = False) -> Pair:
+    """n motions and what the camera saw of them, without noise; parallel: the first two are."""
     rng = np.random.default_rng(seed)
     X = Rotation.from_rotvec(rng.uniform(-1.5, 1.5, 3))
-    A = Rotation.from_rotvec(rng.uniform(-1.2, 1.2, (n, 3)))
+    turns = rng.uniform(-1.2, 1.2, (n, 3))
+    turns[0] = turns[1] / 2 if parallel else turns[0]
+    A = Rotation.from_rotvec(turns)
     return A.as_matrix(), (X.inv() * A * X).as_matrix()
+
+
+def _parallel(R: Floats) -> bool:
+    first, second = Rotation.from_matrix(R[:2]).as_rotvec()
+    return bool(np.linalg.norm(np.cross(first, second)) < 1e-9)
 
 
 def _quarter_turns() -> Pair:
@@ -135,14 +136,21 @@ ROTATION_HALF = Exercise(
         "turn": _turn,
         "result": lambda R: R,
     },
-    cases=[_quarter_turns(), _motions(1, 2), _motions(2, 3), _motions(3, 6), _motions(4, 20)],
+    cases=[
+        _quarter_turns(),
+        *(_motions(seed, 2) for seed in (1, 5, 6, 7, 8)),
+        _motions(2, 3),
+        _motions(9, 3, parallel=True),
+        _motions(3, 6),
+        _motions(4, 20),
+    ],
     per_row=0,
     unit="(rotation matrix)",
     tolerance=1e-6,
     describe=lambda args: (
         "the arm turns by 60 degrees about x, then by 40 about y; X is a quarter turn about z"
         if np.array_equal(args[0], _quarter_turns()[0])
-        else f"{len(args[0])} motions"
+        else f"{len(args[0])} motions" + ", the first two about one axis" * _parallel(args[0])
     ),
     show=lambda R: "; ".join(" ".join(f"{v:.3f}" for v in row) for row in np.atleast_2d(R)),
 )
@@ -156,12 +164,16 @@ def _mirror_image(a: Floats, b: Floats) -> Floats:
     return mirror
 
 
-ROTATION_HALF.add_mistakes(
-    ("result", "inverse_of_x", lambda R: R.T),
-    ("turn", "mirror_image", _mirror_image),
-    ("turn", "not_a_rotation", lambda a, b: np.linalg.lstsq(b, a, rcond=None)[0].T),
-    ("used", "first_motion_only", lambda a, b: (a[:1], b[:1])),
-    ("result", "negative", lambda R: -R),
-    ("result", "not_scaled", lambda R: R / np.sqrt(3)),
-    ("result", "not_scaled_and_negative", lambda R: -R / np.sqrt(3)),
-)
+def _kabsch(product: Callable[[Floats, Floats, Floats], Floats]) -> Step:
+    """Kabsch's method with another product of U, V^T and the matrix that makes it a rotation."""
+
+    def turn(a: Floats, b: Floats) -> Floats:
+        U, S, Vt = np.linalg.svd(a.T @ b)
+        if S[2] < 1e-9:  # the third direction has the sign that rounding gives it
+            return np.full((3, 3), np.nan)
+        return product(U, Vt, np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]))
+
+    return turn
+
+
+ROTATION_HALF.read_mistakes(globals())

@@ -59,6 +59,7 @@ REPROJECTION_RMS = Exercise(
         ),
         _corners(1, 7, (0.20, 0.10), 0.3),
         _corners(2, 54, (0.10, 0.15), -0.1),
+        _corners(4, 60, (4.0, 7.0), -2.0),
         _corners(3, 120, (0.25, 0.08), 0.05),
     ],
     per_row=0,
@@ -69,39 +70,16 @@ REPROJECTION_RMS = Exercise(
 )
 
 
-def _mean_distances_everywhere(residuals: Floats, result: Floats) -> Floats:
-    distance = np.linalg.norm(residuals, axis=1)
-    return np.array([*np.abs(residuals).mean(axis=0), distance.mean()])
+def _everywhere(measure: Step) -> Step:
+    """The same measure of the errors in u, of those in v and of the distances."""
+
+    def whole(residuals: Floats, result: Floats) -> Any:
+        return measure(np.column_stack([residuals, np.linalg.norm(residuals, axis=1)]))
+
+    return whole
 
 
-# In the numbers of the two axes, whether or not the 2-D number is made of them.
-_AXIS_MISTAKES: dict[str, Step] = {
-    "mean_removed": lambda e: np.std(e, axis=0),
-    "divided_by_n_minus_1": lambda e: np.sqrt(np.sum(e**2, axis=0) / (len(e) - 1)),
-    "mean_absolute": lambda e: np.mean(np.abs(e), axis=0),
-    "signed_mean": lambda e: np.mean(e, axis=0),
-    "no_root": lambda e: np.mean(e**2, axis=0),
-    "summed": lambda e: np.sqrt(np.sum(e**2, axis=0)),
-    "axis_over_2n": lambda e: np.sqrt(np.sum(e**2, axis=0) / (2 * len(e))),
-    "largest": lambda e: np.max(np.abs(e), axis=0),
-}
-for _name, _axis in _AXIS_MISTAKES.items():
-    REPROJECTION_RMS.add_mistakes(
-        ("axis", _name, _axis),
-        ("shown", _name, lambda residuals, axes, axis=_axis: axis(residuals)),
-    )
-REPROJECTION_RMS.add_mistakes(
-    ("both", "both_over_2n", lambda residuals, axes: float(np.sqrt(np.mean(axes**2)))),
-    ("both", "mean_distance", lambda e, axes: float(np.mean(np.linalg.norm(e, axis=1)))),
-    ("both", "added", lambda residuals, axes: float(np.sum(axes))),
-    ("both", "mean_of_axes", lambda residuals, axes: float(np.mean(axes))),
-    ("both", "both_without_root", lambda residuals, axes: float(np.sum(axes**2))),
-    ("both", "norm_of_everything", lambda residuals, axes: float(np.linalg.norm(residuals))),
-    ("whole", "squares_everywhere", lambda residuals, result: result**2),
-    ("whole", "mean_distances_everywhere", _mean_distances_everywhere),
-    ("order", "v_before_u", lambda axes, both: np.array([axes[1], axes[0], both])),
-    ("order", "both_first", lambda axes, both: np.array([both, *axes])),
-)
+REPROJECTION_RMS.read_mistakes(globals())
 
 
 # --- focal_sigma ---
@@ -124,11 +102,16 @@ def _least_squares(seed: int, rows: int, columns: int, sigma: float) -> tuple[Fl
     return J, noise - J @ np.linalg.lstsq(J, noise, rcond=None)[0]
 
 
+def _freedom(J: Floats, residuals: Floats) -> int:
+    M, P = J.shape
+    return M - P
+
+
 FOCAL_SIGMA = Exercise(
     name="intrinsics.focal_sigma",
     build=_build_sigma,
     steps={
-        "freedom": lambda J, residuals: J.shape[0] - J.shape[1],
+        "freedom": _freedom,
         "noise": lambda residuals, freedom: residuals @ residuals / freedom,  # a variance
         "information": lambda J: J.T @ J,
         "first": lambda information: np.linalg.inv(information)[0, 0],
@@ -156,19 +139,4 @@ FOCAL_SIGMA = Exercise(
 )
 
 
-FOCAL_SIGMA.add_mistakes(
-    ("freedom", "nothing_fitted", lambda J, residuals: J.shape[0]),
-    ("freedom", "one_parameter", lambda J, residuals: J.shape[0] - 1),
-    ("freedom", "corners_counted", lambda J, residuals: J.shape[0] / 2 - J.shape[1]),
-    ("noise", "no_noise", lambda residuals, freedom: 1.0),
-    ("noise", "noise_not_squared", lambda e, freedom: math.sqrt(e @ e / freedom)),
-    ("noise", "noise_summed", lambda e, freedom: e @ e),
-    ("noise", "spread_of_residuals", lambda residuals, freedom: np.var(residuals)),
-    ("noise", "two_dimensional_rms", lambda residuals, freedom: 2 * np.mean(residuals**2)),
-    ("first", "others_known", lambda information: 1.0 / information[0, 0]),
-    ("first", "not_inverted", lambda information: information[0, 0]),
-    ("first", "last_parameter", lambda information: np.linalg.inv(information)[-1, -1]),
-    ("scale", "divided_by_noise", lambda noise, first: first / noise),
-    ("root", "variance", lambda value: value),
-    ("root", "ninety_five", lambda value: 1.96 * math.sqrt(value)),
-)
+FOCAL_SIGMA.read_mistakes(globals())

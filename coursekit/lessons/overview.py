@@ -123,9 +123,10 @@ class Standing:
 
 @dataclass(frozen=True)
 class Overview:
-    """All notebooks, and what to do next."""
+    """All notebooks, the studio exercise's hand-in in words, and what to do next."""
 
     standings: tuple[Standing, ...]
+    hand_in: str
 
     @property
     def next(self) -> str:
@@ -157,11 +158,13 @@ class Overview:
 
     def __repr__(self) -> str:
         head = ("notebook", "checkpoints", "exercises", "results")
-        return f"{table(head, self.rows())}\n{self.next}"
+        return f"{table(head, self.rows())}\nHand-in: {self.hand_in}.\n{self.next}"
 
     def _repr_html_(self) -> str:
         head = ("notebook", "right checkpoints", "right exercises", "results")
-        return f"{html_table(head, self.rows())}<p>{html.escape(self.next)}</p>"
+        says = f"Hand-in: {self.hand_in}."
+        texts = "".join(f"<p>{html.escape(text)}</p>" for text in (says, self.next))
+        return f"{html_table(head, self.rows())}{texts}"
 
 
 def progress() -> Overview:
@@ -190,7 +193,20 @@ def progress() -> Overview:
         )
 
     numbered = enumerate(LESSONS, start=1)
-    return Overview(tuple(standing(f"{n:02d}_{name}", f"{name}.") for n, name in numbered))
+    standings = tuple(standing(f"{n:02d}_{name}", f"{name}.") for n, name in numbered)
+    return Overview(standings, _hand_in())
+
+
+def _hand_in() -> str:
+    """What `results/` holds of the studio exercise."""
+    kept = results.folder() / "studio_1.measured"
+    if not (packed := sorted(results.folder().glob("studio_1_*.zip"))):
+        measured = "measured, and not packed yet (notebook 02, its last section)"
+        return measured if kept.exists() else "nothing measured yet (notebook 02, studio exercise)"
+    says = ", ".join(path.name for path in packed) + " in results/"
+    newest = max(path.stat().st_mtime for path in packed)
+    later = kept.exists() and kept.stat().st_mtime > newest
+    return f"{says}, older than what you measured: pack again" if later else says
 
 
 def _result(notebook: str) -> str:

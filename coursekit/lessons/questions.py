@@ -346,10 +346,12 @@ class Verdict:
 
 
 def _markup(text: str) -> str:
-    """The text as HTML, everything in it escaped but for the two kinds of marks."""
-    text = html.escape(text, quote=False)
-    text = re.sub(r"`([^`]+)`", r"<code>\1</code>", text)
-    return re.sub(r"\*([^*\s][^*]*)\*", r"<em>\1</em>", text)
+    """The text as HTML, all else escaped; within `code` stars are stars."""
+    return re.sub(
+        r"`([^`]+)`|\*([^*\s][^*]*)\*",
+        lambda found: f"<code>{found[1]}</code>" if found[1] else f"<em>{found[2]}</em>",
+        html.escape(text, quote=False),
+    )
 
 
 def noted(verdict: Verdict, answer: str = "") -> Verdict:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from coursekit.arrays import ArrayLike, Floats
+from coursekit.arrays import ArrayLike, Bools, Floats
 from coursekit.plots.style import COLORS, MARKERS, STYLES, LessonFigure, panels, plain_ticks, single
 
 RANGE_M = np.linspace(0.25, 3.0, 200)
@@ -43,6 +43,38 @@ def _at(values: Floats, distance_m: float) -> float:
     return float(np.interp(distance_m, RANGE_M, values))
 
 
+def two_eyes(fx: float, baseline_m: float, distance_m: float) -> LessonFigure:
+    """Two eyes that look at one point 30 mm to the right, from above, and both their images.
+
+    >>> two_eyes(431.0, 0.050, 0.5).axes[1].get_title()
+    'd = 25.9 - (-17.2) = 43.1 px'
+    """
+    x, eyes = 0.030, {"left": 0.0, "right": baseline_m}
+    fig, (above, image) = panels(2, 2, 9.0, 3.8)
+    u = {name: fx * (x - at) / distance_m for name, at in eyes.items()}
+    for row, (name, at) in enumerate(eyes.items()):
+        style = {"color": COLORS["measured" if row else "model"], "lw": 1.5}
+        above.plot([1000 * at, 1000 * x], [0, distance_m], **style)
+        above.plot([1000 * at] * 3, [0, 2, 2.1], "^:", markevery=[0], ms=9, **style)
+        image.plot([u[name]] * 2, [row, 2], "o:", markevery=[0], **style)
+        image.text(u[name] + 5, row, f"$u_{name[0].upper()}$", va="center", color=style["color"])
+    above.plot(1000 * x, distance_m, "o", color=COLORS["ink"])
+    ends = (0.0, 1000 * baseline_m), (u["right"], u["left"])
+    for ax, (low, high), y, what in zip((above, image), ends, (-0.2, 2.2), ("B", "d"), strict=True):
+        ax.annotate("", (low, y), (high, y), arrowprops={"arrowstyle": "<->"})
+        ax.text(high, y, f"  {what}", va="center")
+    above.set(xlim=(-40, 130), ylim=(-0.4, 2.15), xlabel="X (mm)", ylabel="Z (m)")
+    above.set_title(f"Z = {distance_m:.2f} m, B = {1000 * baseline_m:.0f} mm")
+    image.set(xlim=(-150, 100), ylim=(-0.5, 2.5), xlabel="$u - c_x$ (px)")
+    image.set_yticks([0, 1], ["left eye's\nimage", "right eye's\nimage"])
+    d = u["left"] - u["right"]
+    image.set_title(f"d = {u['left']:.1f} - ({u['right']:.1f}) = {d:.1f} px")
+    return fig.saying(
+        f"Two eyes {1000 * baseline_m:.0f} mm apart see a point at {distance_m:.2f} m at "
+        f"{u['left']:.1f} px (left) and {u['right']:.1f} px (right): a disparity of {d:.1f} px."
+    )
+
+
 def reciprocal(fx_baseline: float, distance_m: float, sigma_d_px: float) -> LessonFigure:
     """Z = f B / d with one band of disparity noise, and what it becomes in depth.
 
@@ -59,8 +91,9 @@ def reciprocal(fx_baseline: float, distance_m: float, sigma_d_px: float) -> Less
     sigma_mm = 1000 * distance_m**2 * sigma_d_px / fx_baseline
     fig, ax = single(8.0, 4.2)
     ax.plot(d, fx_baseline / d, color=COLORS["model"])
-    ax.axvspan(at - wide, at + wide, color=COLORS["depth"], alpha=0.5)
-    ax.axhspan(low, high, color=COLORS["measured"], alpha=0.35)
+    ax.axvspan(at - wide, at + wide, color=COLORS["depth"], alpha=0.5, label="±10 $\\sigma_d$")
+    ax.axhspan(low, high, color=COLORS["measured"], alpha=0.35, label="±10 $\\sigma_Z$")
+    ax.legend()
     ax.plot(at, distance_m, "o", color=COLORS["ink"])
     ax.set(xlim=(0, 130), ylim=(0, 2.6), xlabel="disparity d (px)", ylabel="depth Z (m)")
     ax.set_title(
@@ -155,9 +188,13 @@ def _flanks(ax: Any, costs: Floats, best: int, disparity_px: float) -> None:
 
 
 def depth_image(
-    depth_m: Floats, labels: Mapping[str, tuple[float, float]] | None = None
+    depth_m: Floats,
+    labels: Mapping[str, tuple[float, float]] | None = None,
+    flying: Bools | None = None,
 ) -> LessonFigure:
     """A depth image (H, W) in m, no depth in white, with labels at pixels (u, v) if there are any.
+
+    flying (H, W): pixels to be ringed.
 
     >>> depth_image(np.eye(4)).alt
     'Depth image, 75% of it without depth.'
@@ -165,12 +202,15 @@ def depth_image(
     fig, ax = single(8.5, 4.6)
     shown = ax.imshow(np.where(depth_m > 0, depth_m, np.nan), vmin=0.2, vmax=1.2)
     fig.colorbar(shown, ax=ax, label="depth Z (m)", shrink=0.8)
+    if flying is not None:
+        ax.plot(*np.nonzero(flying)[::-1], "o", mfc="none", mec=COLORS["measured"], ms=5, mew=0.8)
     for name, (u, v) in (labels or {}).items():
-        ax.annotate(name, (u, v), (u, v - 60), ha="center", fontsize=10, fontweight="bold",
+        ax.annotate(name, (u, v), (u, v + 95), ha="center", fontsize=10, fontweight="bold",
                     bbox={"fc": "white", "ec": COLORS["ink"], "pad": 2},
                     arrowprops={"arrowstyle": "->", "color": COLORS["ink"]})  # fmt: skip
     ax.set(xlabel="u (px)", ylabel="v (px)")
     said = f" Marked: {', '.join(labels)}." if labels else ""
+    said += f" {np.sum(flying)} flying pixels are ringed." if flying is not None else ""
     return fig.saying(f"Depth image, {np.mean(depth_m == 0):.0%} of it without depth.{said}")
 
 
@@ -191,7 +231,7 @@ def noise_law(
     fig, ax = single(9.5, 4.6)
     ax.plot(z, mid, color=COLORS["model"], label=law)
     ax.fill_between(z, low, high, color=COLORS["model"], alpha=0.25, label="its 95 % band")
-    ax.errorbar(distances_m, std_mm, 1.96 * np.asarray(error_mm), fmt="o", capsize=3,
+    ax.errorbar(distances_m, std_mm, 1.96 * np.asarray(error_mm), fmt="o", ms=4, capsize=4,
                 color=COLORS["measured"], label="measured, with 95 % interval")  # fmt: skip
     styles = zip(MARKERS[1:], ("truth", "color", "ink"), strict=False)
     for (marker, color), (name, (x, y)) in zip(styles, (extra or {}).items(), strict=False):
@@ -200,9 +240,10 @@ def noise_law(
     plain_ticks(ax.xaxis, (0.3, 0.45, 0.6, 1, 1.5, 2, 3))
     plain_ticks(ax.yaxis, (0.01, 0.03, 0.1, 0.3, 1, 3, 10, 30))
     ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0))
+    plain = law.translate({36: None, 92: None})  # without the signs of mathematics
     others = "".join(f"; {name}: {_listed(x, y)}" for name, (x, y) in (extra or {}).items())
     return fig.saying(
-        f"Standard deviation of depth against distance over the {law}: "
+        f"Standard deviation of depth against distance over the {plain}: "
         f"{_listed(distances_m, std_mm)}{others}."
     )
 
@@ -212,24 +253,23 @@ def _listed(distances_m: ArrayLike, std_mm: ArrayLike) -> str:
     return ", ".join(f"{s:.2f} mm at {d:.2f} m" for d, s in pairs)
 
 
-def averaging(
-    counts: ArrayLike, std_mm: ArrayLike, error_mm: ArrayLike, ideal_mm: ArrayLike
-) -> LessonFigure:
-    """Std of the mean of N frames with its error, over the 1 / sqrt(N) of independent frames, mm.
+def averaging(counts: ArrayLike, error_mm: ArrayLike, floor_mm: float) -> LessonFigure:
+    """A pixel's error (RMS) in the mean of N frames, over what stays and over 1 / sqrt(N), mm.
 
-    >>> averaging([1, 4], [1.0, 0.8], [0.1, 0.1], [1.0, 0.5]).alt[:47]
-    'Std of the mean of N frames: from 1.000 mm at N'
+    >>> averaging([1, 4], [1.0, 0.8], 0.7).alt[:47]
+    "A pixel's error in the mean of N frames: 1.00 m"
     """
+    n, e = np.asarray(counts), np.asarray(error_mm)
     fig, ax = single(8.0, 4.2)
-    ax.plot(counts, ideal_mm, color=COLORS["model"], ls="--", label="independent frames: 1/√N")
-    ax.errorbar(counts, std_mm, 1.96 * np.asarray(error_mm), fmt="o-", capsize=3,
-                color=COLORS["measured"], label="measured, with 95 % interval")  # fmt: skip
-    ax.set(xscale="log", yscale="log", xlabel="N (frames averaged)", ylabel="std of mean (mm)")
-    n, s, i = (np.asarray(a) for a in (counts, std_mm, ideal_mm))
+    ideal = e[0] / np.sqrt(n)
+    ax.plot(n, ideal, color=COLORS["model"], ls="--", label="if each frame had its own: 1/√N")
+    ax.axhline(floor_mm, color=COLORS["ink"], ls=":", label="the same in every frame")
+    ax.plot(n, e, "o-", color=COLORS["measured"], label="a pixel, measured")
+    ax.set(xscale="log", yscale="log", xlabel="N (frames averaged)", ylabel="error of a pixel (mm)")
     plain_ticks(ax.xaxis, tuple(n))
-    plain_ticks(ax.yaxis, (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2))
+    plain_ticks(ax.yaxis, (0.05, 0.1, 0.2, 0.5, 1, 2, 5))
     ax.legend()
     return fig.saying(
-        f"Std of the mean of N frames: from {s[0]:.3f} mm at N = {n[0]} to {s[-1]:.3f} mm at "
-        f"N = {n[-1]}, where independent frames would give {i[-1]:.3f} mm."
+        f"A pixel's error in the mean of N frames: {e[0]:.2f} mm at N = {n[0]} and {e[-1]:.2f} mm "
+        f"at N = {n[-1]}, where 1/√N would leave {ideal[-1]:.2f} mm; {floor_mm:.2f} mm stay."
     )

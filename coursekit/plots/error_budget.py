@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.patches import Ellipse, Rectangle
-from matplotlib.ticker import MultipleLocator
 
 from coursekit.arrays import ArrayLike, Floats
 from coursekit.attribution import SimulatedMisses
@@ -103,7 +102,7 @@ def between_fingers(
     space.set_box_aspect((1, 1, 1), zoom=1.05)
     space.yaxis.labelpad = 9
     for axis in (space.xaxis, space.yaxis, space.zaxis):
-        axis.set_major_locator(MultipleLocator(20))
+        axis.set_ticks(np.arange(-20, 21, 20))  # none at the corners, where labels would meet
     space.view_init(elev=20, azim=-65)
     above = fig.add_subplot(grid[1])
     above.plot(others[:, 0], others[:, 2], ".", ms=2, color=COLORS["ink"], alpha=0.5)

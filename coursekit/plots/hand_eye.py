@@ -116,35 +116,27 @@ def _arrow(ax: Any, name: str, start: Floats, end: Floats, color: str, taken: Fl
     return place[None]
 
 
-def diversity(sessions: Mapping[str, Floats]) -> LessonFigure:
-    """Where grippers were and how they were turned: poses (n, 4, 4) of some sessions.
+def diversity(T_base_gripper: Floats) -> LessonFigure:
+    """Where the gripper was and how it was turned at poses (n, 4, 4).
 
     Rotations are those from the session's mean, as rotation vectors along the gripper's axes.
     """
     fig, (places, *turns) = panels(3, 3, 10.0, 3.6)
-    texts, reach = [], 10.0
-    for marker, color, (name, T) in zip(
-        MARKERS, ("measured", "model", "truth"), sessions.items(), strict=False
-    ):
-        style = {"marker": marker, "ls": "", "color": COLORS[color], "label": name}
-        places.plot(T[:, 0, 3], T[:, 1, 3], **style)
-        R = Rotation.from_matrix(T[:, :3, :3])
-        vectors = np.degrees((R.mean().inv() * R).as_rotvec())
-        for ax, axis in zip(turns, (0, 2), strict=True):
-            ax.plot(vectors[:, axis], vectors[:, 1], **style)
-        reach = max(reach, 1.1 * np.abs(vectors).max())
-        texts.append(f"{name}: turned by up to {np.linalg.norm(vectors, axis=1).max():.0f} deg")
+    R = Rotation.from_matrix(T_base_gripper[:, :3, :3])
+    vectors = np.degrees((R.mean().inv() * R).as_rotvec())
+    reach = 1.1 * np.abs(vectors).max() + 1
+    places.plot(T_base_gripper[:, 0, 3], T_base_gripper[:, 1, 3], "o", color=COLORS["measured"])
     places.set(aspect="equal", xlabel="x of the base (m)", ylabel="y of the base (m)")
     places.set_title("the gripper from above")
-    for ax, name in zip(turns, "xz", strict=True):
+    for ax, column in zip(turns, (0, 2), strict=True):
         cross(ax)
+        ax.plot(vectors[:, column], vectors[:, 1], "o", color=COLORS["measured"])
         ax.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal",
-               xlabel=f"about its {name} (deg)", ylabel="about its y (deg)")  # fmt: skip
+               xlabel=f"about its {'xyz'[column]} (deg)", ylabel="about its y (deg)")  # fmt: skip
         ax.set_title("turned, from the mean")
-    if len(sessions) > 1:
-        turns[1].legend(loc="best")
     return fig.saying(
-        "Gripper places from above, and rotations from their mean. " + "; ".join(texts)
+        "Gripper places from above, and rotations from their mean, by up to "
+        f"{np.linalg.norm(vectors, axis=1).max():.0f} deg."
     )
 
 
@@ -158,28 +150,26 @@ def agreement(sessions: Mapping[str, HandEyeSession]) -> LessonFigure:
     texts = []
     for row, (name, session) in zip(np.reshape(axes, (-1, 3)), sessions.items(), strict=True):
         A, B = motions(session.T_base_gripper, session.T_camera_board, session.mount)
-        (turned, moved), (turned_seen, moved_seen) = _screw(A), _screw(B)
-        turns, shifts = (turned, turned_seen), (moved, moved_seen)
-        for ax, (arm, seen), unit in ((row[0], turns, "deg"), (row[1], shifts, "mm")):
-            top = 1.05 * float(np.max(arm))
+        arm, seen = _screw(A), _screw(B)
+        for ax, x, y, unit in zip(row[:2], arm, seen, ("deg", "mm"), strict=True):
+            top = 1.05 * float(np.max(x))
             ax.plot([0, top], [0, top], color=COLORS["faint"], lw=1)
-            ax.plot(arm, seen, ".", ms=3, color=COLORS["measured"])
+            ax.plot(x, y, ".", ms=3, color=COLORS["measured"])
             ax.set(xlabel=f"gripper ({unit})", ylabel=f"camera ({unit})", xlim=(0, top))
         fit = session.solve()
         places = 1e3 * stand_board(fit.T_base_gripper, fit.measured, fit.X, session.mount)[:, :3, 3]
         off = places - np.median(places, axis=0)
         for column, color in enumerate(("measured", "truth", "model")):
-            row[2].plot(np.arange(1, len(off) + 1), off[:, column], ".-", lw=1,
-                        color=COLORS[color], label="xyz"[column])  # fmt: skip
+            row[2].plot(np.arange(len(off)) + 1, off[:, column], ".-", lw=1, color=COLORS[color],
+                        label="xyz"[column])  # fmt: skip
         row[2].set(xlabel="pose (number)", ylabel="off the median (mm)")
-        row[0].set_title(f"{name}: turned by")
-        row[1].set_title("moved along the axis by")
-        row[2].set_title("the board in the base")
-        worst = np.abs(np.subtract(turned_seen, turned)).max()
-        ratio, wide = np.sum(moved * moved_seen) / np.sum(np.square(moved)), _rms(off) * 3**0.5
+        titles = (f"{name}: turned by", "moved along the axis by", "the board in the base")
+        for ax, title in zip(row, titles, strict=True):
+            ax.set_title(title)
         texts.append(
-            f"{name}: turns agree within {worst:.1f} deg, the camera moves {ratio:.3f} times as "
-            f"far, the board's place spreads by {wide:.1f} mm"
+            f"{name}: turns agree within {np.abs(arm[0] - seen[0]).max():.1f} deg, the camera goes "
+            f"{arm[1] @ seen[1] / (arm[1] @ arm[1]):.3f} times as far, the board spreads by "
+            f"{fit.spread_board_mm:.1f} mm"
         )
     fig.legend(*axes[2].get_legend_handles_labels(), loc="outside lower right", ncols=3)
     return fig.saying(
@@ -191,8 +181,7 @@ def _screw(T: Floats) -> tuple[Floats, Floats]:
     """How far motions (n, 4, 4) turn (n,), deg, and how far along the axis of that, mm."""
     turns = Rotation.from_matrix(T[:, :3, :3]).as_rotvec()
     angles = np.linalg.norm(turns, axis=1)
-    along = np.abs(np.sum(turns * T[:, :3, 3], axis=1)) / angles
-    return np.degrees(angles), 1e3 * along
+    return np.degrees(angles), 1e3 * np.abs(np.sum(turns * T[:, :3, 3], axis=1)) / angles
 
 
 def study(points: Sequence[StudyPoint]) -> LessonFigure:

@@ -8,7 +8,9 @@ from typing import Any
 
 import cv2
 import numpy as np
+from matplotlib.colors import LogNorm
 from matplotlib.patches import Polygon
+from matplotlib.patheffects import withStroke
 
 from coursekit.arrays import Floats
 from coursekit.boards import Board, Detection
@@ -27,6 +29,7 @@ from coursekit.plots.style import (
 
 F_PX = np.linspace(300, 1200, 181)
 ARROWS = 150  # residuals are drawn so many times too long
+LEVELS_PX = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100)
 
 
 # --- what is fitted ---
@@ -39,18 +42,19 @@ def best_fits(X: Floats, Y: Floats, seen: Mapping[str, Floats], f_px: float) -> 
     first all u, then all v. f_px: the true focal length. The model is a board that is turned by
     `tilt` about its Y axis: u = f X cos(tilt) / (Z + X sin(tilt)), v = f Y / (Z + X sin(tilt)).
     """
-    fig, ax = single(8.0, 4.2)
+    fig, ax = single(9.0, 4.0)
     texts = []
     styles = zip(("-", "--", "-.", ":"), ("model", "cube", "color", "measured"), strict=True)
     for (style, color), (name, pixels) in zip(styles, seen.items(), strict=False):
         rms = _best_rms(X, Y, pixels)
-        ax.plot(F_PX, rms, style, color=COLORS[color], label=name)
         good = F_PX[rms < 1.1 * rms.min()]
+        label = f"{name}: {good[0]:.0f} to {good[-1]:.0f}"
+        ax.plot(F_PX, rms, style, color=COLORS[color], label=label)
         texts.append(f"{name}: within a tenth of the best from {good[0]:.0f} to {good[-1]:.0f} px")
     ax.axvline(f_px, color=COLORS["truth"], lw=1.5, label="true f")
     ax.set(xlim=(F_PX[0], F_PX[-1]), ylim=(0, 3), xlabel="assumed focal length f (px)",
            ylabel="smallest RMS (px)")  # fmt: skip
-    fig.legend(loc="outside right upper")
+    fig.legend(loc="outside right upper", title="f (px) within a tenth\nof the smallest RMS")
     return fig.saying(f"The smallest RMS against the assumed focal length. {'; '.join(texts)}.")
 
 
@@ -101,13 +105,13 @@ def board(board: Board) -> LessonFigure:
     )
 
 
-def views(folder: Path, detections: Sequence[Detection]) -> LessonFigure:
+def views(folder: str | Path, detections: Sequence[Detection]) -> LessonFigure:
     """The images of a folder with the corners that were found in them."""
     if not len(detections):
         raise ValueError("detections: there are none to show; print them to see why")
     fig, axes = panels(len(detections), 3, 9.0, 2.35, 0.3, sharex=True, sharey=True)
     for ax, found in zip(axes, detections, strict=True):
-        image = cv2.imread(str(folder / found.name), cv2.IMREAD_GRAYSCALE)
+        image = cv2.imread(str(Path(folder) / found.name), cv2.IMREAD_GRAYSCALE)
         ax.imshow(image, cmap="gray", vmin=0, vmax=255)
         ax.plot(found.pixels[:, 0], found.pixels[:, 1], ".", ms=3, color=COLORS["measured"])
         ax.set_title(f"{found.name}: {len(found.ids)} corners", fontsize=10)
@@ -169,39 +173,38 @@ def residuals(result: IntrinsicsResult) -> LessonFigure:
     )
 
 
-def _arrows(
-    ax: Any,
-    at: Floats,
-    vectors: Floats,
-    times: float,
-    color: str = "measured",
-    width: float = 0.003,
-) -> None:
+def _arrows(ax: Any, at: Floats, vectors: Floats, times: float, width: float = 0.003) -> None:
     ax.quiver(*at.T, *(times * vectors.T), angles="xy", scale_units="xy", scale=1, width=width,
-              color=COLORS[color])  # fmt: skip
+              color=COLORS["measured"])  # fmt: skip
 
 
 def uncertainty(results: Mapping[str, IntrinsicsResult], range_m: float) -> LessonFigure:
     """Maps of the standard deviation of a projected pixel, with one scale for all of them."""
     maps = {name: r.uncertainty_map(range_m, (30, 40)) for name, r in results.items()}
-    top = max(float(np.nanmax(m)) for m in maps.values())  # NaN where a lens folds back
-    fig, axes = panels(len(maps), len(maps), 4.7 * len(maps) + 0.6, 3.9, sharey=True)
-    levels = np.array([0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100])
+    ends = [f([f(m) for m in maps.values()]) for f in (np.nanmin, np.nanmax)]  # a lens may fold
+    fig, axes = panels(len(maps), len(maps), 3.1 * len(maps) + 0.7, 2.7)
+    edge = [withStroke(linewidth=2.5, foreground=COLORS["ink"])]
     for ax, (name, sigma) in zip(axes, maps.items(), strict=True):
         width, height = results[name].intrinsics.size
         u, v = np.linspace(0, width - 1, sigma.shape[1]), np.linspace(0, height - 1, len(sigma))
-        shown = ax.pcolormesh(u, v, sigma, vmin=0, vmax=top, shading="gouraud", cmap="cividis")
-        lines = ax.contour(u, v, sigma, levels, colors="white", linewidths=1)
-        ax.clabel(lines, fmt="%g px", fontsize=9)
+        shown = ax.pcolormesh(u, v, sigma, norm=LogNorm(*ends), shading="gouraud", cmap="cividis")
+        levels = [x for x in LEVELS_PX if 0.02 < np.mean(sigma < x) < 0.99]  # room for a label
+        lines = ax.contour(u, v, sigma, levels, colors="white", linewidths=1.2)
+        lines.set_path_effects(edge)
+        ends_at = np.array([width, height]) - 1
+        drawn = [path.vertices for path in lines.get_paths() if len(path)]
+        inside = [at[np.minimum(at, ends_at - at).min(axis=1).argmax()] for at in drawn]
+        ax.clabel(lines, fmt="%g px", fontsize=9, inline_spacing=1, manual=inside)
+        for text in lines.labelTexts:
+            text.set_path_effects(edge)
         image_axes(ax, width, height)
-        ax.label_outer()
-        ax.set_title(f"{name} at {range_m:g} m" if name else f"at {range_m:g} m")
-    fig.colorbar(shown, ax=axes, label="σ of a projected pixel (px)", shrink=0.9)
+        ax.set_title(f"{name}: {np.nanmin(sigma):.2g} to {np.nanmax(sigma):.2g} px", fontsize=10)
+    bar = fig.colorbar(shown, ax=axes, label="σ of a projected pixel (px)", shrink=0.9)
+    plain_ticks(bar.ax.yaxis, LEVELS_PX)
     return fig.saying(
         f"Standard deviation of a projected pixel over the image, for points {range_m:g} m away: "
         + "; ".join(
-            f"{name or 'this calibration'} from {np.nanmin(m):.3f} to {np.nanmax(m):.3f} px"
-            for name, m in maps.items()
+            f"{name} from {np.nanmin(m):.3f} to {np.nanmax(m):.3f} px" for name, m in maps.items()
         )
         + "."
     )
@@ -246,17 +249,18 @@ def rules(rows: Mapping[str, IntrinsicsResult], range_m: float) -> LessonFigure:
     names = [f"{name} ({r.rms_px:.2f} px)" for name, r in rows.items()]
     fx = [100 * r.sigma("fx") / r.intrinsics.fx for r in rows.values()]
     worst = [float(np.nanmax(r.uncertainty_map(range_m, (12, 16)))) for r in rows.values()]
-    fig, axes = panels(2, 2, 9.0, 0.55 * len(names) + 1.4, sharey=True)
+    fig, axes = panels(2, 2, 9.0, 0.45 * len(names) + 1.2, sharey=True)
     for ax, values, label in (
         (axes[0], fx, "σ of fx (%)"),
         (axes[1], worst, f"σ of the worst pixel at {range_m:g} m (px)"),
     ):
-        ax.barh(names, values, color=COLORS["model"], height=0.6)
-        ax.set(xscale="log", xlabel=label, xlim=(0.5 * min(values), 3 * max(values)))
-        ticks = (t for t in (0.1, 0.3, 1, 3, 10, 30) if t > 0.5 * min(values))
-        plain_ticks(ax.xaxis, ticks, widen=True)
+        ax.plot(values, names, "o", color=COLORS["model"], ms=8)
+        ax.grid(axis="y", color=COLORS["faint"], lw=0.8)
+        ax.set(xscale="log", xlabel=label, xlim=(0.6 * min(values), 3 * max(values)))
+        plain_ticks(ax.xaxis, (0.1, 0.3, 1, 3, 10, 30))
         for y, value in enumerate(values):
-            ax.text(1.1 * value, y, f"{value:.2g}", va="center", fontsize=10)
+            ax.annotate(f"{value:.2g}", (value, y), (9, 0), textcoords="offset points", va="center",
+                        fontsize=10, bbox={"fc": "white", "ec": "none", "pad": 1})  # fmt: skip
     axes[0].invert_yaxis()
     axes[0].set_ylabel(" ")
     return fig.saying(
@@ -271,13 +275,25 @@ def rules(rows: Mapping[str, IntrinsicsResult], range_m: float) -> LessonFigure:
 # --- the museum ---
 
 
-def signature(results: Mapping[str, IntrinsicsResult]) -> LessonFigure:
-    """The residuals that failures leave in the view that suffers most, one panel each."""
-    fig, axes = panels(len(results), 3, 9.6, 3.3)
-    for ax, (name, result) in zip(axes, results.items(), strict=True):
-        _worst_view(ax, name, result)
+def rooms(results: Mapping[str, IntrinsicsResult]) -> LessonFigure:
+    """What failures leave: the RMS of each view, and a pattern in the view that suffers most."""
+    columns = min(len(results), 3)
+    rows = -(-len(results) // columns)
+    heights = (1, 2.4) * rows
+    fig, axes = panels(2 * rows * columns, columns, 9.6, 2.0, height_ratios=heights)
+    bars, views = np.moveaxis(np.reshape(axes, (rows, 2, columns)), 1, 0).reshape(2, -1)
+    usual = float(np.median([np.median(r.per_view_rms_px) for r in results.values()]))
+    for bar, view, (name, result) in zip(bars, views, results.items(), strict=False):
+        rms = result.per_view_rms_px
+        bar.bar(np.arange(1, len(rms) + 1), rms, color=COLORS["measured"])
+        bar.set(ylim=(0, 3 * usual), xlabel="view (number)", ylabel="RMS (px)")
+        bar.set_title(f"{name}: RMS {result.rms_px:.2f} px", fontsize=10)
+        for at in np.flatnonzero(rms > 3 * usual):
+            bar.annotate(f"{rms[at]:.1f} px", (at + 1, 3 * usual), (6, -4), va="top",
+                         textcoords="offset points", fontsize=9)  # fmt: skip
+        _pattern(view, result)
     return fig.saying(
-        "Residuals in the worst view of each session: "
+        "RMS of each view, and the residuals of the worst one, smoothed: "
         + "; ".join(
             f"{name}, RMS of all views {r.rms_px:.2f} px, of the worst one "
             f"{r.per_view_rms_px.max():.2f} px"
@@ -286,20 +302,22 @@ def signature(results: Mapping[str, IntrinsicsResult]) -> LessonFigure:
     )
 
 
-def _worst_view(ax: Any, name: str, result: IntrinsicsResult) -> None:
-    """The corners of one view with their residuals, the longest as long as corners are apart."""
+def _pattern(ax: Any, result: IntrinsicsResult) -> None:
+    """The worst view: each corner's arrow is the mean of its residual and its neighbours'."""
     worst = int(np.argmax(result.per_view_rms_px))
-    pixels, errors = result.detections[worst].pixels, result.residuals[worst]
+    seen, pixels = result.detections[worst], result.detections[worst].pixels
+    square = np.stack(np.divmod(seen.ids, result.board.corners[0]), axis=1)
+    near = np.abs(square[:, None] - square).max(axis=2) <= 1
+    errors = near @ result.residuals[worst] / near.sum(axis=1, keepdims=True)
     apart = np.sqrt(np.prod(np.ptp(pixels, axis=0)) / len(pixels))
-    times = float(f"{1.2 * apart / np.linalg.norm(errors, axis=1).max():.1g}")
+    times = min(100.0, float(f"{1.5 * apart / np.linalg.norm(errors, axis=1).max():.1g}"))
     ax.plot(*pixels.T, ".", ms=4, color=COLORS["model"])
-    _arrows(ax, pixels, errors, times, width=0.006)
-    low, high = pixels.min(axis=0) - 1.2 * apart, pixels.max(axis=0) + 1.2 * apart
-    ax.set(xlim=(low[0], high[0]), ylim=(high[1], low[1]), aspect="equal",
-           xlabel="u (px)", ylabel="v (px)")  # fmt: skip
-    ax.set_title(
-        f"{name}\nRMS {result.per_view_rms_px[worst]:.2f} px here, x{times:g}", fontsize=10
-    )
+    _arrows(ax, pixels, errors, times, width=0.007)
+    middle, half = (pixels.min(axis=0) + pixels.max(axis=0)) / 2, np.ptp(pixels, axis=0) / 2
+    rim = 1.2 * max(half[0], half[1] / 0.75) * np.array([1, 0.75])  # of one shape in all of them
+    (left, top), (right, bottom) = middle - rim, middle + rim
+    ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="u (px)", ylabel="v (px)")
+    ax.set_title(f"view {worst + 1}, arrows x{times:g}", fontsize=10)
 
 
 def power(table: Mapping[str, Mapping[str, Any]]) -> LessonFigure:
@@ -310,19 +328,19 @@ def power(table: Mapping[str, Mapping[str, Any]]) -> LessonFigure:
     fig, axes = panels(len(table), len(table), 9.6, 3.2, sharey=True)
     texts = []
     for ax, (effect, row) in zip(axes, table.items(), strict=True):
-        share = np.asarray(row["named"]) / row["sessions"]
+        share = 100 * np.asarray(row["named"]) / row["sessions"]
         ax.plot(row["sizes"], share, "o-", color=COLORS["model"])
-        ax.set(xscale="log", ylim=(-0.03, 1.03),
+        ax.set(xscale="log", ylim=(-3, 103),
                xlabel=f"{effect.replace('_', ' ')} ({row['unit']})")  # fmt: skip
-        plain_ticks(ax.xaxis, row["sizes"][::3], widen=True)
+        plain_ticks(ax.xaxis, (0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1, 2))
         texts.append(
             f"{effect}: "
             + ", ".join(
-                f"{100 * s:.0f} % at {x:g} {row['unit']}"
+                f"{s:.0f} % at {x:g} {row['unit']}"
                 for x, s in zip(row["sizes"], share, strict=True)
             )
         )
-    axes[0].set_ylabel("share named (1)")
+    axes[0].set_ylabel("sessions that it is named in (%)")
     return fig.saying("Share of sessions in which the cause is named. " + "; ".join(texts))
 
 

@@ -101,7 +101,7 @@ def entries_of_K(scene: tuple[Box, ...], camera: Intrinsics, **moved: float) -> 
     moved: new values, px, of fx, fy, cx or cy. Raises ValueError for another name.
     """
     changed = Intrinsics.from_dict(camera.to_dict() | moved)
-    fig, ax = single(8.0, 4.8)
+    fig, ax = single(7.0, 4.1)
     for intrinsics, color, style, name in (
         (camera, COLORS["model"], "-", "K of the camera"),
         (changed, COLORS["measured"], "--", "your K"),
@@ -197,8 +197,7 @@ def displacement(lenses: Mapping[str, Intrinsics]) -> LessonFigure:
         grid, arrows = geometry.pixel_grid(*lens.size)[some, some], shift[some, some]
         ax.quiver(*np.moveaxis(grid, -1, 0), *np.moveaxis(arrows, -1, 0), angles="xy",
                   scale_units="xy", scale=1 / longer, color="white", width=0.005)  # fmt: skip
-        arrows_are = "true to scale" if longer == 1 else f"{longer} times too long"
-        title = f"{name}: edge {edge:.1f} px, corner {corner:.1f} px\narrows {arrows_are}"
+        title = f"{name}\nedge {edge:.1f} px, corner {corner:.1f} px, arrows ×{longer}"
         ax.set_title(title, fontsize=10)
         image_axes(ax, *lens.size)
         texts.append(f"{name}, {edge:.1f} px at an edge, {corner:.1f} px in a corner")
@@ -265,11 +264,11 @@ def point_cloud(points: NDArray[np.float32]) -> LessonFigure:
     low, high = np.quantile(near, (0.01, 0.99), axis=0)
     near = near[((near >= low - 0.03) & (near <= high + 0.03)).all(axis=1)]  # some stray dots stay
     some = np.random.default_rng(0).permutation(len(near))[:30_000]  # a stride makes moiré
-    fig = figure(9.0, 4.2)
+    fig = figure(9.0, 3.9)
     fig.set_layout_engine("none")  # the 3-D axes reserve far more room than they use
     colors = {"vmin": cloud[:, 2].min(), "vmax": cloud[:, 2].max()}
     _solid(fig.add_axes((0.05, 0.0, 0.45, 0.94), projection="3d"), near[some], colors)
-    above = fig.add_axes((0.55, 0.14, 0.34, 0.74))
+    above = fig.add_axes((0.55, 0.15, 0.34, 0.75))
     flat = cloud[np.abs(cloud[:, 1]) < SLICE_M]
     dots = above.scatter(flat[:, 0], flat[:, 2], s=1.5, c=flat[:, 2], linewidths=0, **colors)
     bar = fig.add_axes((0.91, 0.2, 0.015, 0.6), label="<colorbar>")
@@ -298,4 +297,4 @@ def _solid(ax: Any, cloud: NDArray[np.float32], colors: Mapping[str, float]) -> 
     ax.locator_params(nbins=4)
     ax.locator_params(axis="y", nbins=2)
     ax.view_init(elev=18, azim=-110)
-    ax.set_box_aspect(np.maximum(np.ptp(cloud[:, [0, 2, 1]], axis=0), 0.05), zoom=0.85)
+    ax.set_box_aspect(np.maximum(np.ptp(cloud[:, [0, 2, 1]], axis=0), 0.05), zoom=0.8)

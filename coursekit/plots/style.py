@@ -18,15 +18,16 @@ from matplotlib.figure import Figure
 
 from coursekit.checks import want
 
-# Okabe-Ito, distinguishable with any colour vision; the same thing has the same colour everywhere.
+# Okabe-Ito, its two lightest darker for 3:1 on white: distinguishable with any colour vision; the
+# same thing has the same colour everywhere.
 COLORS = {
     "model": "#0072B2",  # what theory, a specification or a fit says
     "measured": "#D55E00",  # what was measured, or what a slider did
     "truth": "#009E73",
-    "depth": "#56B4E9",  # the depth camera
+    "depth": "#3A98D2",  # the depth camera
     "color": "#CC79A7",  # the colour camera
     "block": "#7F7F7F",
-    "cube": "#E69F00",
+    "cube": "#C48600",
     "ink": "#222222",
     "faint": "#BBBBBB",
 }
@@ -45,7 +46,7 @@ mpl.rcParams.update(
         "lines.linewidth": 2,
         "legend.frameon": False,
         "image.cmap": DEPTH_COLORMAP,
-        "axes.prop_cycle": cycler(color=["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9"]),
+        "axes.prop_cycle": cycler(color=["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#3A98D2"]),
     }
 )
 

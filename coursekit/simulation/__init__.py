@@ -14,4 +14,12 @@ from coursekit.simulation.arm_sessions import (
 )
 from coursekit.simulation.corner_sessions import Effects, corner_session
 from coursekit.simulation.rig import Rig, RigView, cost_curve, match
-from coursekit.simulation.scenes import Box, Scene, artefact_scene, render, tabletop, wall_scene
+from coursekit.simulation.scenes import (
+    Box,
+    Scene,
+    artefact_scene,
+    flying_pixels,
+    render,
+    tabletop,
+    wall_scene,
+)

@@ -38,6 +38,7 @@ from coursekit.simulation.arm_poses import Setup
 from coursekit.simulation.board_images import render_board
 from coursekit.simulation.corner_sessions import Effects, corner_noise, printed, with_street_errors
 from coursekit.specifications import DATA, device
+from coursekit.words import counting
 
 Design = Literal["careful", "grid", "single_axis", "small_rotations"]
 Degrees = Literal["", "joints", "rotation_vectors"]
@@ -228,24 +229,20 @@ def unknown_sessions(seed: int) -> dict[str, HandEyeSession]:
 
 
 def rendered_session(
-    mount: Mount,
-    seed: int,
-    n: int = 20,
-    arm_errors: ArmErrors | None = None,
-    progress: bool = False,
+    mount: Mount, seed: int, n: int = 20, arm_errors: ArmErrors | None = None
 ) -> tuple[HandEyeSession, HandEyeTruth, list[Grey]]:
     """A healthy session of rendered images (h, w), whose corners `boards.detect` found.
 
-    As `hand_eye_session`, at about 0.1 s an image, with a bar of progress if asked. Raises
+    As `hand_eye_session`, at 0.1 to 0.3 s an image, which are counted where there are many. Raises
     BoardNotFound where the board is not found in one, which the poses are chosen to avoid.
     """
     truth, q, dq = _poses(mount, seed, n, arm_errors, HandEyeMistakes())
-    from tqdm.auto import tqdm
-
-    rendered = tqdm(
-        images_of(truth, seed), total=n, unit="image", leave=False, disable=not progress
-    )
-    images, board = list(rendered), truth.setup.board
+    images: list[Grey] = []
+    with counting(n, "image", n >= FOLDER_VIEWS) as counts:
+        for image in images_of(truth, seed):
+            images.append(image)
+            counts()
+    board = truth.setup.board
     found = [detect(image, board, f"view_{i:02d}") for i, image in enumerate(images)]
     return _reported(truth, q, dq, Detections(found)), truth, images
 
@@ -261,16 +258,11 @@ def session_folder(mount: Mount, seed: int, into: str | os.PathLike[str]) -> Pat
         card = folder / SESSION
         if card.is_file() and json.loads(card.read_text("utf-8"))["seed"] == seed:
             return folder
-    session, _, images = rendered_session(mount, seed, FOLDER_VIEWS, ArmErrors(), True)
+    session, _, images = rendered_session(mount, seed, FOLDER_VIEWS, ArmErrors())
     names = tuple(f"{name}.jpg" for name in session.names)
     encoded = (cv2.imencode(".jpg", image, JPEG_OPTIONS)[1].tobytes() for image in images)
-    about = {
-        "camera": f"Simulated {WHOSE_LENS[mount]}",
-        "source": SIMULATED,
-        "seed": seed,
-        "views": FOLDER_VIEWS,
-        "origin": FOLDER_ORIGIN,
-    }
+    about = {"camera": f"Simulated {WHOSE_LENS[mount]}", "source": SIMULATED, "seed": seed}
+    about |= {"views": FOLDER_VIEWS, "origin": FOLDER_ORIGIN}
     replace(session, names=names).save(made, dict(zip(names, encoded, strict=True)), about)
     return made
 

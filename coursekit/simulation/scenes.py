@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coursekit.arrays import ArrayLike, Floats, NDArray
+from coursekit.arrays import ArrayLike, Bools, Floats, NDArray
 from coursekit.checks import array, choice, instance, number, positive, transform, want
 from coursekit.geometry import Intrinsics, deproject, invert_transform, make_transform, pixel_grid
 from coursekit.simulation import raycast
@@ -204,6 +204,17 @@ def render(
     corners, pixel = corner_rays(intrinsics), 1.0 / intrinsics.fx
     raycast.render_color(boxes, paint, textures, corners, LAMP_M, pixel, color)
     return RenderResult(depth, index, color)
+
+
+def flying_pixels(depth_m: Floats, scene: Scene, intrinsics: Intrinsics) -> Bools:
+    """Which pixels (H, W) of a depth image (H, W) m, 0 for none, hang in the air: 3 cm and more off
+    what they see, and in the middle half between the nearest and farthest surface within 7 px."""
+    from scipy import ndimage
+
+    true = render(scene, intrinsics).depth_m
+    near, far = ndimage.minimum_filter(true, 15), ndimage.maximum_filter(true, 15)
+    between = np.abs(depth_m - (near + far) / 2) < (far - near) / 4
+    return np.asarray((depth_m > 0) & (np.abs(depth_m - true) > 0.03) & between)
 
 
 def rays(intrinsics: Intrinsics, pixels: Floats) -> Floats:

@@ -40,4 +40,11 @@ from coursekit.stereo.law import (
     rounded_variance,
     unrounded_std,
 )
-from coursekit.stereo.windows import AveragingCurve, WindowStats, averaging_curve, window_stats
+from coursekit.stereo.windows import (
+    AveragingCurve,
+    WindowStats,
+    averaging_curve,
+    off_plane,
+    window_stats,
+    without_mismatches,
+)

@@ -19,17 +19,16 @@ from coursekit.geometry import Intrinsics, deproject
 from coursekit.stereo import windows
 from coursekit.stereo.law import rounded_variance, unrounded_std
 from coursekit.stereo.windows import WindowStats
-from coursekit.words import wrapped
 
 HALF_WINDOW_PX = 5.5  # of the matching window; edges are pushed out by up to that
-EDGE_BAND_PX = 8  # on either side of an edge, where flying pixels are counted
+EDGE_BAND_PX = 8  # beside an edge, where pixels may fly
 GAP_PX = 4  # holes up to this wide do not end a face
 FACE_WINDOW_PX = 40
 USUAL_WIDTH_M = 0.060
 NEAR_FACE = 0.35  # of the width: tilt, noise and pattern move no pixel of a face farther
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False)
 class BlockFace:
     """The front face of a block, from a depth stack; lengths in m.
 
@@ -40,8 +39,7 @@ class BlockFace:
     widths_m (N,): the width in each frame, with its edges found anew; width_std_m: std of that.
     width_held_std_m: std of the width when the edges are held and only the plane's depth changes.
     fattening_px: what each edge is pushed outwards if the depth is right, against the known width,
-    and standard error. flying_fraction: of the valid pixels within 8 px of the edges, those on
-    neither the face nor what is behind it. window: on the face. stats: of `window_stats` there.
+    and standard error. window: on the face. stats: of `window_stats` there.
     """
 
     depth_m: float
@@ -54,7 +52,6 @@ class BlockFace:
     width_held_std_m: float
     fattening_px: float
     fattening_error_px: float
-    flying_fraction: float
     window: Window
     stats: WindowStats
     widths_m: Floats
@@ -73,20 +70,6 @@ class BlockFace:
     def width_std_error_m(self) -> float:
         """Standard error of `width_std_m`, frames taken as `averaging_curve` finds them."""
         return windows.std_error(*windows.series_std(self.widths_m - self.widths_m.mean()))
-
-    def __repr__(self) -> str:
-        text = (
-            f"face at Z = {1e3 * self.depth_m:.2f} ± {1e3 * self.depth_error_m:.2f} mm, tilted "
-            f"{self.tilt_deg:.1f} deg, "
-            f"{1e3 * self.width_m:.2f} ± {1e3 * self.width_error_m:.2f} mm wide"
-        )
-        if not math.isnan(self.fattening_px):
-            text += (
-                f", edges {self.fattening_px:+.2f} ± {self.fattening_error_px:.2f} px outwards "
-                "if its depth is right"
-            )
-        said = f"{text}, {self.flying_fraction:.1%} flying pixels at its edges"
-        return wrapped(said, 84, indent="    ")
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +165,6 @@ def block_face(
         width_held_std_m=_std(held),
         fattening_px=math.nan if width_m is None else (width - width_m) / per_pixel / 2,
         fattening_error_px=math.nan if width_m is None else edge_error / 2,
-        flying_fraction=_flying(patch, edges),
         window=window,
         stats=stats,
         widths_m=np.array(widths),
@@ -365,25 +347,3 @@ def _face_window(patch: _Patch) -> Window:
     size = max(min(FACE_WINDOW_PX, room), 1)
     u, v = ((side.start + side.stop - size) // 2 for side in (columns, rows))
     return patch.left + u, patch.top + v, size, size
-
-
-def _flying(patch: _Patch, edges: Floats) -> float:
-    """The fraction of flying pixels in the bands along both edges.
-
-    What is behind is taken row by row from the pixels next to the band.
-    """
-    plane = 1 / windows.plane_image(patch.plane, patch.z.shape[1:])[patch.rows]
-    z = patch.z[:, patch.rows]
-    flying = valid = 0
-    for side, outwards in ((0, -1), (1, 1)):
-        at = round(float(np.nanmedian(edges[side])))
-        band = slice(max(at - EDGE_BAND_PX, 0), at + EDGE_BAND_PX)
-        start, stop = sorted((at + outwards * EDGE_BAND_PX, at + outwards * 2 * EDGE_BAND_PX))
-        behind = z[..., max(start, 0) : max(stop, 0)]
-        far = np.ma.median(np.ma.masked_invalid(behind), axis=(0, 2)).filled(np.inf)[:, None]
-        part, face = z[..., band], plane[:, band]
-        slack = patch.tolerance * np.maximum((far / face) ** 2, 1.0)
-        with np.errstate(invalid="ignore"):
-            flying += int(((part > face + patch.tolerance) & (part < far - slack)).sum())
-        valid += int(np.isfinite(part).sum())
-    return flying / valid if valid else math.nan

@@ -379,7 +379,7 @@ class BiasFit(LawFit):
         """(s, o) of the bias s Z - o Z^2 / (fx B), to first order, and their covariance (2, 2).
 
         s: `scale_error`; o in px, 0 where one distance could not tell. The covariance is wide
-        enough that 1.96 standard deviations are the 95 % of `interval`.
+        enough that 1.96 standard deviations are the 95 % of `Estimate.interval`.
         """
         n = min(len(self.theta), 1 + ("disparity_offset_px" in self.names))
         known, theta = np.zeros((2, 2)), np.array([self.scale_error, *self.theta[1:n], 0.0])[:2]
@@ -490,7 +490,8 @@ def _bias_notes(fit: BiasFit) -> Iterator[str]:
     else:
         of_both = fit.sigma("baseline_error") * fit.sigma("disparity_offset_px")
         correlation = fit.covariance[0, 1] / of_both
-        if abs(correlation) > 0.9:
+        ends = fit.interval("baseline_error"), fit.interval("disparity_offset_px")
+        if abs(correlation) > 0.9 and any(low <= 0 <= high for low, high in ends):
             yield (
                 f"these distances hardly tell the two apart (correlation {correlation:.2f}): "
                 "use their sum, the bias at a distance"

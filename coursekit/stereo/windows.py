@@ -18,7 +18,6 @@ import numpy as np
 from coursekit.arrays import AnyArray, ArrayLike, Bools, Floats, Integers, Interval, Window
 from coursekit.checks import array, positive, want
 from coursekit.stereo.law import unrounded_std
-from coursekit.words import counted, wrapped
 
 CORRELATION_PX = 12  # disparities farther apart than the matching window (11 px) are independent
 JUMP_SIGMAS = 8.0  # a sample this far from the rest is a mismatch, not noise
@@ -88,7 +87,7 @@ def clip_window(window: Window, stack: AnyArray) -> Window:
 # --- one window ---
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False)
 class WindowStats:
     """What a stack of depth images says in one window; lengths in m, NaN where nothing says it.
 
@@ -133,39 +132,6 @@ class WindowStats:
         ends = chi2.ppf([0.975, 0.025], self.pixel_dof) / self.pixel_dof
         low, high = self.pixel_std_m / np.sqrt(ends)
         return float(low), float(high)
-
-    @property
-    def rounding(self) -> str:
-        """What the depth unit does to `pixel_std_m`, in words; empty when it does little."""
-        std, step = self.pixel_std_unrounded_m, self.depth_scale_m
-        if step is None or math.isnan(std) or std >= step / 2:
-            return ""
-        return (
-            f"the depth unit of {1e3 * step:g} mm hides it: {self.frozen_fraction:.0%} of the "
-            f"pixels never change, before rounding it was {1e3 * std:.3f} mm if true depths lie "
-            "anywhere between two steps"
-        )
-
-    def __repr__(self) -> str:
-        start = f"{self.n_pixels} px, {counted(self.n_frames, 'frame')}"
-        if math.isnan(self.depth_m):
-            return f"{start}: no depth, {self.invalid_fraction:.0%} invalid"
-        text = f"{start}: Z = {1e3 * self.depth_m:.2f} ± {1e3 * self.depth_error_m:.2f} mm, "
-        if math.isnan(self.pixel_std_m):
-            return f"{text}no std over time from {counted(self.n_frames, 'frame')}"
-        low, high = self.pixel_std_interval_m
-        text += (
-            f"std of a pixel {1e3 * self.pixel_std_m:.3f} mm (95 %: {1e3 * low:.3f} to "
-            f"{1e3 * high:.3f}), of the window's mean {1e3 * self.mean_std_m:.3f} mm, "
-            f"{self.invalid_fraction:.1%} invalid"
-        )
-        if self.n_mismatches:
-            text += f", {counted(self.n_mismatches, 'mismatch', 'mismatches')} left out"
-        if self.not_gaussian:
-            why = "; ".join(self.not_gaussian)
-            text += f"; not one Gaussian noise, so the interval is wider: {why}"
-        said = f"{text}; {self.rounding}" if self.rounding else text
-        return wrapped(said, 84, indent="    ")
 
 
 def window_stats(depth: Any, window: Window, depth_scale_m: float | None = None) -> WindowStats:
@@ -473,42 +439,25 @@ def _drift_models(n: int) -> tuple[Floats, Floats, Floats, Floats, Integers]:
 # --- averaging ---
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True)
 class AveragingCurve:
     """What averaging N frames buys.
 
-    counts (K,): N = 1, 2, 4, ... std_m (K,): std over time of the mean of N frames; errors_m (K,):
-    their standard errors. ideal_m (K,): std_m[0] / sqrt(N), for independent frames. n_frames: all
-    there are. effective_frames: how many independent ones they are worth, and its interval.
-    gain: how much quieter the mean of all frames is than one; sqrt(n_frames) at best.
+    n_frames: all there are. effective_frames: how many independent ones they are worth, and its
+    interval. gain: how much quieter the mean of all frames is than one; sqrt(n_frames) at best.
     floor_m: the pattern that every frame repeats, RMS over the pixels about a plane; None for a
     series without pixels.
     """
 
-    counts: Integers
-    std_m: Floats
-    errors_m: Floats
-    ideal_m: Floats
     n_frames: int
     effective_frames: float
     effective_frames_interval: Interval
     gain: float
     floor_m: float | None
 
-    def __repr__(self) -> str:
-        low, high = self.effective_frames_interval
-        text = (
-            f"{self.n_frames} frames are worth {self.effective_frames:.0f} independent ones "
-            f"(95 %: {low:.0f} to {high:.0f});\n    their mean is {self.gain:.1f} times quieter "
-            f"than one frame ({math.sqrt(self.n_frames):.1f} if they were independent)"
-        )
-        if self.floor_m is None:
-            return text
-        return f"{text};\n    {1e3 * self.floor_m:.3f} mm do not average away"
-
 
 def averaging_curve(series_m: ArrayLike) -> AveragingCurve:
-    """The std of the mean of N frames against N.
+    """What the mean of N frames gains over one, and what stays in each pixel.
 
     series_m: (N,) values of one pixel or of a window's mean, or (N, h, w) depths of a window on a
     smooth surface, m, NaN invalid (pixels not valid in every frame are left out).
@@ -518,9 +467,8 @@ def averaging_curve(series_m: ArrayLike) -> AveragingCurve:
     pixels share the drift, so more of them do not narrow it.
     Raises ValueError for fewer than 8 frames, where no autocorrelation can be had.
 
-    >>> print(averaging_curve(0.5 + 0.001 * np.random.default_rng(1).standard_normal(64)))
-    64 frames are worth 64 independent ones (95 %: 2 to 64);
-        their mean is 8.0 times quieter than one frame (8.0 if they were independent)
+    >>> round(averaging_curve(np.random.default_rng(1).standard_normal(64)).effective_frames)
+    64
     """
     values = array("series_m", series_m, leading=True)
     long = values.ndim in (1, 3) and len(values) >= 8
@@ -533,8 +481,6 @@ def averaging_curve(series_m: ArrayLike) -> AveragingCurve:
     if pixels.shape[1] == 0:
         raise ValueError("series_m: no pixel is valid in every frame")
     deviation = pixels - pixels.mean(axis=0)
-    counts = 2 ** np.arange(int(math.log2(n // 4)) + 1)
-    std = np.sqrt([_means(deviation, c).var(axis=0, ddof=1).mean() for c in counts])
     effective, interval = effective_frames(deviation)
     floor = None
     if values.ndim == 3:
@@ -542,22 +488,12 @@ def averaging_curve(series_m: ArrayLike) -> AveragingCurve:
         noise = np.square(own).sum() / own.shape[1] / (n - 1) / (n / _correlation_time(own))
         floor = math.sqrt(max(off_plane(values.mean(axis=0)[None]) ** 2 - noise, 0.0))
     return AveragingCurve(
-        counts=counts,
-        std_m=std,
-        errors_m=std / np.sqrt(2 * (n // counts - 1)),
-        ideal_m=std[0] / np.sqrt(counts),
         n_frames=n,
         effective_frames=effective,
         effective_frames_interval=interval,
         gain=math.sqrt(effective),
         floor_m=floor,
     )
-
-
-def _means(values: Floats, count: Any) -> Floats:
-    """Means of consecutive blocks of `count` frames: (N // count, ...)."""
-    blocks = len(values) // count
-    return values[: blocks * count].reshape(blocks, count, *values.shape[1:]).mean(axis=1)
 
 
 # --- means, planes and errors, where NaN is invalid ---

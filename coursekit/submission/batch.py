@@ -174,7 +174,7 @@ def grade_folder(
 
     folder: or the zip that an LMS makes of all that was handed in. out: a folder for the report:
     new, empty, or one that holds a report; default NAME_report, here. workers: processes,
-    default one a core. timeout_s: of a processor, for a bundle. memory_bytes: for a process, above
+    default one a core. timeout_s: for a bundle. memory_bytes: for a process, above
     its resting size. overwrite: replace a finished report; what was graded and has not changed is
     not graded again, unless the grader has changed. An unfinished one is gone on with in any case.
     Raises ValueError for a folder that will not do, before any work, Stopped on Ctrl-C, and

@@ -19,7 +19,7 @@ from playwright.sync_api import expect
 
 import coursekit as ck
 from coursekit.lessons.questions import Choice
-from tools import build_notebooks
+from tools import build_notebooks, copies
 
 pytestmark = pytest.mark.browser
 
@@ -41,16 +41,19 @@ def name(request):
 
 @pytest.fixture(scope="module")
 def server_at(browser, tmp_path_factory):
-    """Where a JupyterLab of its own serves copies of the notebooks; {} is the notebook's name."""
+    """Where a JupyterLab, started as by course.py, serves copies: of {0}, in the workspace {1}."""
     home = tmp_path_factory.mktemp("home")
     served = tmp_path_factory.mktemp("served")
     (home / "overrides.json").write_text(json.dumps(SETTINGS), encoding="utf-8")
+    (served / "notebooks").mkdir()
     for name in NAMES:
-        shutil.copy(build_notebooks.NOTEBOOKS / f"{name}.ipynb", served)
+        shutil.copy(build_notebooks.NOTEBOOKS / f"{name}.ipynb", served / "notebooks")
+    copies.make(served)
     token, port = secrets.token_hex(16), free_port()
     command = [sys.executable, "-m", "jupyterlab", "--no-browser", "--allow-root"]
     command += [f"--port={port}", "--ServerApp.port_retries=0", "--log-level=ERROR"]
     command += [f"--ServerApp.root_dir={served}", f"--LabApp.app_settings_dir={home}"]
+    command += [f"--config={build_notebooks.ROOT / 'tools' / 'jupyter_server_config.py'}"]
     environment = build_notebooks.kernel_environment(home)
     environment |= {"HOME": str(home), "JUPYTER_TOKEN": token, "JUPYTER_CONFIG_DIR": f"{home}/c"}
     environment |= {"JUPYTER_DATA_DIR": f"{home}/d", "JUPYTER_RUNTIME_DIR": f"{home}/r"}
@@ -58,7 +61,7 @@ def server_at(browser, tmp_path_factory):
         server = subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.STDOUT)
     try:
         wait_for(f"http://127.0.0.1:{port}/api", server, home / "log")
-        yield f"http://127.0.0.1:{port}/lab/workspaces/{{0}}/tree/{{0}}.ipynb?token={token}"
+        yield f"http://127.0.0.1:{port}/lab/workspaces/{{1}}/tree/{{0}}.ipynb?token={token}"
     finally:
         server.terminate()
         server.wait()
@@ -83,15 +86,21 @@ def wait_for(url, server, log):
 @pytest.fixture(scope="module")
 def opened(server_at, browser, name):
     """The page with the notebook as it opens, before anything has run."""
+    page = open_page(browser, server_at.format(name, name))
+    yield page
+    if not page.is_closed():
+        stop_kernel(page)
+        page.close()
+
+
+def open_page(browser, address):
     page = browser.new_page(viewport={"width": 1280, "height": 900})
     page.set_default_timeout(PATIENCE_MS)
-    page.goto(server_at.format(name))
+    page.goto(address)
     page.locator(".jp-CodeCell").last.wait_for(state="attached")
     page.locator(".jp-KernelName", has_text="Python 3").wait_for()  # idle until then, too
     page.locator(".jp-Notebook-ExecutionIndicator[data-status=idle]").wait_for()
-    yield page
-    stop_kernel(page)
-    page.close()
+    return page
 
 
 def stop_kernel(page):
@@ -173,7 +182,7 @@ def test_each_checkpoint_and_figure_becomes_a_widget(page, name):
     assert cells.count() == len(checkpoints(name))
     assert cells.get_by_role("button", name="Commit").count() == cells.count()
     figures = cell_with(page, "ck.drag(")
-    assert figures.locator("img.widget-image").count() == figures.count()
+    assert figures.locator(".jupyter-widgets img[alt]").count() == figures.count()
 
 
 def test_every_checkpoint_explains_wrong_and_right_answers(page, name):
@@ -181,8 +190,7 @@ def test_every_checkpoint_explains_wrong_and_right_answers(page, name):
         cell = cell_with(page, f'"{checkpoint.name}"')
         for give, said in attempts(checkpoint):
             give(cell)
-            cell.get_by_role("button", name="Commit").click()
-            expect(cell.locator(".widget-html-content").last).to_contain_text(plain(said))
+            expect(cell.get_by_role("alert")).to_contain_text(plain(said))
 
 
 def attempts(checkpoint):
@@ -190,22 +198,29 @@ def attempts(checkpoint):
     if isinstance(checkpoint, Choice):
         options = sorted(checkpoint.lettered().items(), key=lambda item: item[1].right)
         for letter, option in (options[0], options[-1]):
-            label = f"{letter}. {option.text}"
-            yield lambda cell, label=label: radio(cell, label).check(), option.why
+            yield lambda cell, letter=letter: choose(cell, letter), option.why
     else:
         wrong = checkpoint.classics[0]
         for value, why in ((wrong.value, wrong.why), (checkpoint.value, checkpoint.why)):
-            yield lambda cell, v=value: cell.get_by_role("textbox").last.fill(f"{v:.6g}"), why
+            yield lambda cell, v=value: type_in(cell, v), why
 
 
-def radio(cell, label):
-    return cell.get_by_role("radio", name=label, exact=True)
+def choose(cell, letter):
+    """By keyboard."""
+    cell.get_by_role("radio", name=letter, exact=True).press("Space")
+    cell.get_by_role("button", name="Commit").press("Enter")
+
+
+def type_in(cell, value):
+    field = cell.get_by_label("Your answer")
+    field.fill(f"{value:.6g}")
+    field.press("Enter")
 
 
 def test_each_slider_redraws_its_figure(page):
     cells = cell_with(page, "ck.drag(")
     for number in range(cells.count()):
-        image = cells.nth(number).locator("img.widget-image")
+        image = cells.nth(number).locator(".jupyter-widgets img")
         for handle in cells.nth(number).locator(".noUi-handle").all():
             before = shown(image)
             handle.focus()
@@ -221,3 +236,26 @@ def shown(image):
     """The bytes of the PNG file that the page shows."""
     read = "async e => Array.from(new Uint8Array(await (await fetch(e.src)).arrayBuffer()))"
     return bytes(image.evaluate(read))
+
+
+def test_on_the_next_day_every_answer_and_every_figure_is_there(browser, server_at, page, name):
+    """The copy is saved, its kernel ended, and opened again: nothing runs in it."""
+    drawn = cell_with(page, "ck.drag(").count()
+    with page.expect_response(lambda r: r.request.method == "PUT" and "/contents/" in r.url):
+        page.keyboard.press("Control+s")
+    stop_kernel(page)
+    page.close()
+    later = open_page(browser, server_at.format(name, f"{name}-later"))
+    try:
+        assert later.get_by_text("model not found").count() == 0
+        assert later.locator(".jupyter-widgets").count() == 0
+        for checkpoint in checkpoints(name):
+            cell = cell_with(later, f'"{checkpoint.name}"')
+            why = checkpoint.explanation().lines[0]
+            expect(cell.locator(".jp-OutputArea-child").last).to_contain_text(plain(why))
+        figures = cell_with(later, "ck.drag(").locator("img")
+        assert figures.count() == drawn
+        assert all(figures.nth(n).evaluate("e => e.naturalWidth > 300") for n in range(drawn))
+    finally:
+        stop_kernel(later)
+        later.close()
