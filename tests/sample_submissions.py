@@ -319,6 +319,11 @@ COPIES: dict[str, Callable[[Counts, Random], Counts]] = {
     "subset": lambda counts, r: counts[
         np.sort(r.permutation(len(counts))[: len(counts) * 6 // 10])
     ],
+    "mirrored": lambda counts, _: counts[:, :, ::-1],
+    "turned": lambda counts, _: np.rot90(counts, 1, (1, 2)),
+    "transposed": lambda counts, _: counts.transpose(0, 2, 1),
+    "rolled": lambda counts, _: np.roll(counts, (7, 3), (1, 2)),
+    "rescaled": lambda counts, _: np.rint(counts * 1.004),
     "constant_added": lambda counts, _: np.where(counts, counts + 3, 0),
 }
 

@@ -52,7 +52,7 @@ class Page(HTMLParser):
 
 ALLOWED = {"html", "head", "meta", "title", "style", "body", "h1", "h2", "p", "a", "ul", "li"}
 ALLOWED |= {"span", "strong", "div", "table", "thead", "tbody", "tr", "th", "td", "blockquote"}
-ALLOWED |= {"details", "summary"}
+ALLOWED |= {"details", "summary", "main"}
 ALLOWED |= {"svg", "desc", "line", "text", "path", "circle", "rect"}
 
 
