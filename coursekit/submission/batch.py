@@ -45,7 +45,7 @@ from tqdm.auto import tqdm
 from coursekit import results
 from coursekit.checks import positive, want
 from coursekit.submission import report
-from coursekit.submission.flags import Roster, as_json, place, read_table
+from coursekit.submission.flags import Roster, as_json, class_table, place_of
 from coursekit.submission.format import DOCUMENTS, MANIFEST, NO_TEXT, TURNING_SIGNS, is_junk, slug
 from coursekit.submission.recompute import LABELS, grading_rules
 from coursekit.words import counted
@@ -188,7 +188,7 @@ def grade_folder(
         workers = len(free(0)) if free else os.cpu_count() or 1
     for name, value in (("workers", workers), ("timeout_s", timeout_s), ("memory", memory_bytes)):
         positive(name, value)
-    roster = Roster(read_table(Path(choices.roster)) if choices.roster else ())
+    roster = Roster(class_table(Path(choices.roster)) if choices.roster else ())
     _own_points(out / OWN_POINTS)
     _check_out(out, overwrite)
     limits = Limits(workers, timeout_s, memory_bytes)
@@ -345,7 +345,7 @@ def find_bundles(folder: Path, out: Path) -> tuple[list[Bundle], tuple[str, ...]
 
 def _whose(name: str) -> str:
     """What tells whose a file is without a look inside: the LMS's number, or the first folder."""
-    at = place(name)
+    at = place_of(name)
     return f"{at.lms} {at.id}" if at.lms else name.partition("/")[0] * ("/" in name)
 
 
@@ -695,7 +695,7 @@ def _write_feedback(out: Path, lines: Sequence[report.ReportLine]) -> None:
     buffer, seen = io.BytesIO(), set[str]()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as packed:
         for line in lines:
-            name = place(line.file).feedback
+            name = place_of(line.file).feedback
             if line.counts and line.page and name not in seen:
                 seen.add(name)
                 page = (out / line.page).read_bytes()
@@ -706,7 +706,7 @@ def _write_feedback(out: Path, lines: Sequence[report.ReportLine]) -> None:
 def _own_points(path: Path) -> dict[str, dict[str, str]]:
     """The instructor's own points, by person; none if there is no such file. Raises ValueError."""
     found = {}
-    for row in read_table(path) if path.exists() else ():
+    for row in class_table(path) if path.exists() else ():
         for column in ("paragraph", "late", "overrule"):
             try:
                 report.number_of(row.get(column, ""))

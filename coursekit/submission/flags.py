@@ -30,7 +30,9 @@ from coursekit.submission.format import CameraFacts, Stack, Submission
 from coursekit.submission.recompute import SEEN, Recomputed, grading_rules
 
 LARGEST_WAVE = 6  # so many of them across a window; finer ones hold what was added
-WAVES = 27  # numbers in a spectrum: pairs of 0 to 6 waves down and across, in any order, but (0, 0)
+N_WAVES = (
+    27  # numbers in a spectrum: pairs of 0 to 6 waves down and across, in any order, but (0, 0)
+)
 FRAME_LIKENESS = 0.73  # of two frames' spectra; the 8th best of strangers' 12 reaches 0.65
 COMPARED, MOST_FRAMES = 150_000, 40_000  # pairs of stacks in all, and frames for each, at most
 FRAMES_ASKED = 12  # frames of a stack that are looked for in others
@@ -41,7 +43,7 @@ MOODLE = re.compile(
     r"(?:^|/)(?P<at>(?P<name>[^/]+?)_(?P<id>\d+)_assignsubmission_(?:file|onlinetext)_?)"
 )
 CANVAS = re.compile(r"(?:^|/)(?P<name>[^/_]+)(?P<late>_LATE)?_(?P<id>\d{2,})_\d{2,}_[^/]+$")
-NAMES = ("name", "full name", "student", "student name")  # columns of a roster
+NAME_COLUMNS = ("name", "full name", "student", "student name")  # columns of a roster
 FIRST_AND_LAST = ("first name", "last name", "surname")
 IDS = (
     *("id", "identifier", "student id", "id number", "number", "sis user id", "sis login id"),
@@ -237,7 +239,7 @@ class StackPrint:
     """What is remembered of a stack: spectra of its noise, which do not change when all frames are
     mirrored, turned or rolled, or a constant is added.
 
-    digest: of its bytes. level (WAVES,): the mean spectrum. frames (N, WAVES): of each frame what
+    digest: of its bytes. level (N_WAVES,): the mean spectrum. frames (N, N_WAVES): of each frame what
     is not in that, scaled to a largest value of 127. The order of frames does not matter.
     """
 
@@ -264,7 +266,7 @@ class Fingerprint:
         """The fingerprint whose JSON `as_json` made."""
 
         def rows(text: str) -> NDArray[np.int8]:
-            return np.frombuffer(base64.b64decode(text), np.int8).reshape(-1, WAVES)
+            return np.frombuffer(base64.b64decode(text), np.int8).reshape(-1, N_WAVES)
 
         stacks = tuple(
             StackPrint(s["distance_m"], s["digest"], tuple(s["level"]), rows(s["frames"]))
@@ -311,7 +313,7 @@ def _stack_print(stack: Stack) -> StackPrint:
     _, height, width = counts.shape
     digest = hashlib.blake2b(repr(counts.shape).encode() + counts.tobytes(), digest_size=16)
     if min(height, width) <= 2 * LARGEST_WAVE:
-        return StackPrint(stack.distance_m, digest.hexdigest(), (), np.zeros((0, WAVES), np.int8))
+        return StackPrint(stack.distance_m, digest.hexdigest(), (), np.zeros((0, N_WAVES), np.int8))
     valid = counts > 0
     mean = counts.sum(axis=0) / np.maximum(valid.sum(axis=0), 1)
     off = (counts - mean.astype(np.float32)) * valid
@@ -368,7 +370,7 @@ def copies(prints: Mapping[str, Fingerprint]) -> list[Copy]:
     compared with those of the nearest level, so that the work is bounded.
     """
     stacks = [(k, s) for k, p in prints.items() for s in p.stacks if len(s.frames) >= FRAMES_FOUND]
-    levels = np.array([stack.level for _, stack in stacks]).reshape(len(stacks), WAVES)
+    levels = np.array([stack.level for _, stack in stacks]).reshape(len(stacks), N_WAVES)
     pairs: dict[tuple[str, str], dict[float, tuple[int, bool]]] = {}
     first: dict[tuple[str, ...], str] = {}
     for key, fingerprint_of in prints.items():
@@ -453,13 +455,13 @@ class Place:
     late: bool = False
 
 
-def place(file: str) -> Place:
+def place_of(file: str) -> Place:
     """Whose a file is by its name.
 
-    >>> place("Ada Lovelace_17_assignsubmission_file_/studio_1.zip")
+    >>> place_of("Ada Lovelace_17_assignsubmission_file_/studio_1.zip")
     Place(feedback='Ada Lovelace_17_assignsubmission_file_/feedback.html', lms='Moodle', \
 name='Ada Lovelace', id='17', late=False)
-    >>> place("lovelaceada_LATE_1234_56789_studio_1.zip").feedback
+    >>> place_of("lovelaceada_LATE_1234_56789_studio_1.zip").feedback
     'lovelaceada_LATE_1234_56789_studio_1.html'
     """
     if found := MOODLE.search(file):
@@ -506,7 +508,7 @@ class Roster:
         self._known: dict[str, set[str]] = {}
         for row in rows:
             cells = {column.strip().casefold(): value for column, value in row.items()}
-            name = next((cells[c] for c in NAMES if cells.get(c)), "")
+            name = next((cells[c] for c in NAME_COLUMNS if cells.get(c)), "")
             name = name or " ".join(filter(None, (cells.get(c) for c in FIRST_AND_LAST)))
             ids = {column: cells[column] for column in IDS if cells.get(column)}
             if person(name) in ("", "pointspossible") and not ids:
@@ -542,7 +544,7 @@ class Roster:
 
     def of_file(self, file: str, typed: str) -> Person:
         """Who handed in a file: by the LMS's name of it, by a folder's, then by what was typed."""
-        at, folders = place(file), file.split("/")[:-1]
+        at, folders = place_of(file), file.split("/")[:-1]
         if at.lms:
             return self.of_place(at)
         stem = at.feedback.removesuffix(".html").removeprefix("studio_1_").replace("_", " ")
@@ -561,7 +563,7 @@ class Roster:
             yield replace(_flag("other_name", typed=typed, name=one.name), note=alike)
 
 
-def read_table(path: Path) -> list[dict[str, str]]:
+def class_table(path: Path) -> list[dict[str, str]]:
     """The rows of a table as a spreadsheet writes it: `,`, `;` or tabs; UTF-8, UTF-16 or Windows'.
 
     Raises ValueError for a file that is none.

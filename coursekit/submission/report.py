@@ -35,7 +35,7 @@ from coursekit.submission.flags import (
     Person,
     Roster,
     copies,
-    place,
+    place_of,
     same_words,
     words_of,
 )
@@ -49,12 +49,19 @@ HEADER = (
     *("points", "of", "percent", *LABELS, "total", "comment", "lost", "flags", "says"),
     *("page", "code"),
 )
-MOODLE = (
+MOODLE_COLUMNS = (
     *("Identifier", "Full name", "Email address", "Grade", "Maximum Grade"),
     *("Last modified (grade)", "Feedback comments"),
 )
-CANVAS = ("Student", "ID", "SIS User ID", "SIS Login ID", "Section", "Studio exercise 1")
-OWN = ("who", "student", "paragraph", "late", "overrule", "comment")  # the instructor's own table
+CANVAS_COLUMNS = ("Student", "ID", "SIS User ID", "SIS Login ID", "Section", "Studio exercise 1")
+OWN_COLUMNS = (
+    "who",
+    "student",
+    "paragraph",
+    "late",
+    "overrule",
+    "comment",
+)  # the instructor's own table
 FORMULA = tuple("=+-@\t\r\n＝＋－＠")  # what makes a spreadsheet calculate a cell
 HERE = Path(__file__).parent
 
@@ -209,7 +216,7 @@ def across(
     """
     roster, own = roster or Roster(), own or {}
     for line in lines:  # first, so that a typed name can be known as somebody else's
-        if (at := place(line.file)).lms:
+        if (at := place_of(line.file)).lms:
             roster.of_place(at)
     who = {line.file: roster.of_file(line.file, line.student) for line in lines}
     done = [line for line in lines if line.points is not None]
@@ -229,7 +236,7 @@ def across(
     chosen = {key: _that_counts(some) for key, some in theirs.items()}
     found = []
     for line in lines:
-        one, at = who[line.file], place(line.file)
+        one, at = who[line.file], place_of(line.file)
         last, more = chosen[one.key] if line.points is not None else (line, ())
         late = at.late or (late_after is not None and _moment(line) > late_after.timestamp())
         flags = [*line.flags, *about.get(line.file, ()), *more, *_clock(line)]
@@ -264,7 +271,7 @@ def _that_counts(some: Sequence[ReportLine]) -> tuple[ReportLine, tuple[Flag, ..
     that takes points away from another.
     """
     newest = max(some, key=_moment)
-    if len(some) == 1 or place(newest.file).lms:
+    if len(some) == 1 or place_of(newest.file).lms:
         return newest, ()
     best = max(some, key=lambda line: line.points or 0.0)
     if (newest.points or 0.0) >= (best.points or 0.0):
@@ -641,7 +648,7 @@ def exports(lines: Sequence[ReportLine], separator: str = ",") -> dict[str, str]
     tables: dict[str, str] = {}
     moodle, canvas = [], []
     for line in lines:
-        at, row = place(line.file), {k.casefold(): v for k, v in line.row.items()}
+        at, row = place_of(line.file), {k.casefold(): v for k, v in line.row.items()}
         if not (line.counts and (line.points is not None or line.reason == "missing")):
             continue
         name, grade_of = line.name or line.student, _points(line.total)
@@ -651,20 +658,22 @@ def exports(lines: Sequence[ReportLine], separator: str = ",") -> dict[str, str]
             moodle.append((identifier, name, email, grade_of, "100", "", _feedback(line)))
         number = at.id if at.lms == "Canvas" else row.get("id", "")
         if number and not identifier:
-            sis = (row.get(column, "") for column in CANVAS[2:5])
+            sis = (row.get(column, "") for column in CANVAS_COLUMNS[2:5])
             canvas.append((name, number, *sis, grade_of))
     if moodle:
-        tables["moodle.csv"] = _csv([MOODLE, *moodle], separator)
+        tables["moodle.csv"] = _csv([MOODLE_COLUMNS, *moodle], separator)
     if canvas:
         possible = ("    Points Possible", "", "", "", "", "100")
-        tables["canvas.csv"] = _csv([CANVAS, possible, *canvas], separator)
+        tables["canvas.csv"] = _csv([CANVAS_COLUMNS, possible, *canvas], separator)
     return tables
 
 
 def own_table(lines: Sequence[ReportLine], separator: str = ",") -> str:
     """A table for the instructor's own points, with a row for everybody."""
     names = {line.who: line.name or line.student for line in lines if line.name}
-    return _csv([OWN, *((who, name, "", "", "", "") for who, name in names.items())], separator)
+    return _csv(
+        [OWN_COLUMNS, *((who, name, "", "", "", "") for who, name in names.items())], separator
+    )
 
 
 def _feedback(line: ReportLine) -> str:
