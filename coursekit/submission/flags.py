@@ -33,10 +33,12 @@ LARGEST_WAVE = 6  # so many of them across a window; finer ones hold what was ad
 N_WAVES = (
     27  # numbers in a spectrum: pairs of 0 to 6 waves down and across, in any order, but (0, 0)
 )
-FRAME_LIKENESS = 0.73  # of two frames' spectra; the 8th best of strangers' 12 reaches 0.65
+FRAME_LIKENESS = (
+    0.8  # of two frames' spectra; strangers' 8th best of 12 reaches 0.74 in a small window
+)
 COMPARED, MOST_FRAMES = 150_000, 40_000  # pairs of stacks in all, and frames for each, at most
 FRAMES_ASKED = 12  # frames of a stack that are looked for in others
-FRAMES_FOUND = 8  # of these, for the stacks to be the same measurement
+FRAMES_FOUND = 9  # of these, for the stacks to be the same measurement
 PERFECT_CLOCK_S = 1e-8  # no real clock keeps step so well
 WORDS_IN_A_ROW = 3  # words in a row, by which paragraphs are compared
 MOODLE = re.compile(
@@ -239,7 +241,7 @@ class StackPrint:
     """What is remembered of a stack: spectra of its noise, which do not change when all frames are
     mirrored, turned or rolled, or a constant is added.
 
-    digest: of its bytes. level (N_WAVES,): the mean spectrum. frames (N, N_WAVES): of each frame what
+    digest: of its bytes. level (27,): the mean spectrum. frames (N, 27): of each frame what
     is not in that, scaled to a largest value of 127. The order of frames does not matter.
     """
 

@@ -61,7 +61,7 @@ OWN_COLUMNS = (
     "late",
     "overrule",
     "comment",
-)  # the instructor's own table
+)
 FORMULA = tuple("=+-@\t\r\n＝＋－＠")  # what makes a spreadsheet calculate a cell
 HERE = Path(__file__).parent
 
