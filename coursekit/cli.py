@@ -17,15 +17,9 @@ from typing import Any
 import coursekit as ck
 from coursekit import doctor
 
-OPTIONS = {  # what the functions call what is typed here
-    "path": "--out",
-    "n": "--frames",
-    "which": "--camera",
-    "square_m": "--square-mm (here in m)",
-    "marker_m": "--marker-mm (here in m)",
-    "distance_m": "--distance",
-    **{name: f"--{name}" for name in ("squares", "paper", "dictionary", "workers", "timeout")},
-}
+OPTIONS = {"path": "--out", "n": "--frames", "which": "--camera", "distance_m": "--distance"}
+OPTIONS |= {f"{name}_m": f"--{name}-mm (here in m)" for name in ("square", "marker")}
+OPTIONS |= {name: f"--{name}" for name in ("squares", "paper", "dictionary", "workers", "timeout")}
 INSTEAD = {"overwrite=True": "--overwrite", "run this cell again": "run this again"}
 CAMERAS = "auto (default), simulated, a serial number or a recording"
 
@@ -48,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return options.run(options) or 0
     except (ck.cameras.CameraError, OSError, ValueError) as error:
         name, colon, said = str(error).partition(": ")
-        print(f"coursekit: {_typed(OPTIONS.get(name, name) + colon + said)}", file=sys.stderr)
+        print("coursekit:", _typed(OPTIONS.get(name, name) + colon + said), file=sys.stderr)
         return 1
     except KeyboardInterrupt as stopped:
         print(f"coursekit: {stopped or 'stopped, nothing was written'}", file=sys.stderr)

@@ -36,15 +36,9 @@ Condition = Literal["ok", "note", "problem"]
 
 OLDEST, NEWEST_TESTED, TOO_NEW = (3, 11), (3, 13), (3, 15)
 PINS = Path(__file__).resolve().parents[1] / "requirements.txt"
-WITHOUT_PACKAGES = {
-    ("win32", "ARM64"): (
-        "Windows on ARM",
-        "install the Python for x86-64 (64-bit, not ARM64), which runs there; or use a hub",
-    ),
-    ("darwin", "x86_64"): (
-        "Intel processors under macOS",
-        "on an Apple-silicon Mac take the arm64 Python; else use another computer or a hub",
-    ),
+WITHOUT_PACKAGES = {  # how it is called, and the Python that runs there all the same
+    ("win32", "ARM64"): ("Windows on ARM", "the Python for x86-64"),
+    ("darwin", "x86_64"): ("Intel processors under macOS", "on Apple silicon the arm64 Python"),
 }
 LOADED = ("numpy", "scipy", "cv2", "numba", "matplotlib", "ipywidgets")
 UDEV_FOLDERS = tuple(map(Path, ("/etc/udev/rules.d", "/usr/lib/udev/rules.d", "/lib/udev/rules.d")))
@@ -159,7 +153,8 @@ def _python() -> CheckUp:
     elif sys.version_info[:2] >= TOO_NEW:
         return CheckUp("problem", f"{says}: too new, some packages do not exist for it", install)
     elif (computer := (sys.platform, platform.machine())) in WITHOUT_PACKAGES:
-        lacks, remedy = WITHOUT_PACKAGES[computer]
+        lacks, runs = WITHOUT_PACKAGES[computer]
+        remedy = f"install {runs}; or use another computer, or a hub"
         return CheckUp("problem", f"{says}: some packages do not exist for {lacks}", remedy)
     elif sys.version_info[:2] > NEWEST_TESTED:
         return CheckUp("note", f"{says}: newer than what the course was tested with", install)
@@ -169,15 +164,11 @@ def _python() -> CheckUp:
 
 def edition() -> str:
     """The course's version, and in a clone the commit."""
-    version, git = _version("coursekit") or "not installed", ["git", "rev-parse", "--short", "HEAD"]
-    if not (PINS.parent / ".git").exists() or shutil.which("git") is None:
-        return version
-    said = subprocess.run(git, cwd=PINS.parent, capture_output=True, text=True, check=False)
-    return f"{version}, commit {said.stdout.strip()}" if said.returncode == 0 else version
-
-
-def _course() -> CheckUp:
-    return CheckUp("ok", edition())
+    commit = ""
+    if (PINS.parent / ".git").exists() and shutil.which("git"):
+        git = ["git", "-C", str(PINS.parent), "rev-parse", "--short", "HEAD"]
+        commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip()
+    return f"{_version('coursekit') or 'not installed'}{commit and ', commit '}{commit}"
 
 
 class Pin(NamedTuple):
@@ -332,8 +323,8 @@ def _results() -> CheckUp:
     return CheckUp("ok", f"{folder} can be written, {free / 1e9:.1f} GB free")
 
 
-COMPUTER = (
-    ("Course", _course),
+COMPUTER: tuple[tuple[str, Check], ...] = (
+    ("Course", lambda: CheckUp("ok", edition())),
     ("Python", _python),
     ("Packages", _packages),
     ("Loading", _loading),

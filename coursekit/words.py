@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import html
 import textwrap
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Self, TypeVar, overload
+from typing import Self, TypeVar, overload
 
 from coursekit.arrays import Interval
 from coursekit.checks import is_number, want
@@ -40,36 +39,26 @@ def counted(n: int, thing: str, several: str = "") -> str:
     return f"{n} {thing}" if n == 1 else f"{n} {several or thing + 's'}"
 
 
-@contextlib.contextmanager
-def counting(total: int, thing: str, shown: bool = True) -> Iterator[Callable[[], Any]]:
-    """A line that counts, and is gone at the end; yields what to call after each thing.
+def counting(things: Iterable[Thing], total: int, thing: str, shown: bool) -> Iterator[Thing]:
+    """The things, and meanwhile a line that counts them and is gone at the end.
 
     In a notebook it is text, because a widget would be a dead one on the next day.
     """
     from IPython import get_ipython
+    from IPython.display import DisplayHandle
+    from tqdm import tqdm
 
     if not shown or getattr(get_ipython(), "kernel", None) is None:
-        from tqdm import tqdm
-
-        with tqdm(total=total, unit=thing, leave=False, disable=not shown) as bar:
-            yield bar.update
+        yield from tqdm(things, total=total, unit=thing, leave=False, disable=not shown)
         return
-    from IPython.display import DisplayHandle
-
-    line, done, said = DisplayHandle(), 0, time.monotonic()
-
-    def count() -> None:
-        nonlocal done, said
-        done += 1
+    line, said = DisplayHandle(), time.monotonic()
+    line.display({"text/plain": ""}, raw=True)
+    for done, one in enumerate(things, start=1):
+        yield one
         if time.monotonic() - said > 0.3:
             said = time.monotonic()
             line.update({"text/plain": f"{done} of {counted(total, thing)}"}, raw=True)
-
-    line.display({"text/plain": ""}, raw=True)
-    try:
-        yield count
-    finally:
-        line.update({"text/plain": ""}, raw=True)
+    line.update({"text/plain": ""}, raw=True)
 
 
 def p_text(p_value: float) -> str:

@@ -13,6 +13,8 @@ import pytest
 import coursekit as ck
 from coursekit import cli
 from coursekit.budget.handover import REFERENCE
+from tools.build_notebooks import find, read
+from tools.core_time import MOST, MOST_OF_ALL, core_minutes
 
 ROOT = Path(__file__).resolve().parent.parent
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -98,6 +100,14 @@ def test_minutes_are_those_of_the_notebooks() -> None:
         minutes = re.search(r"Core: about (\d+) minutes", path.read_text(encoding="utf-8"))
         assert minutes, path
         assert minutes.group(1) == said[path.stem]
+
+
+def test_minutes_are_as_computed_and_not_too_many() -> None:
+    computed = {path.stem: core_minutes(read(path)) for path in find([])}
+    said = dict(re.findall(r"^\| `(\w+)` \| (\d+) min \|", TEXT, re.MULTILINE))
+    assert said == {name: f"{minutes:.0f}" for name, minutes in computed.items()}
+    assert max(computed.values()) <= MOST
+    assert sum(computed.values()) <= MOST_OF_ALL
 
 
 def test_the_numbers_of_claims_are_those_of_the_table() -> None:

@@ -795,6 +795,22 @@ def test_face_in_camera_like_frames(noisy_faces):
         assert abs(u + width / 2 - MIDDLE.cx) < 4
 
 
+def test_causes_that_both_stand_out_are_not_called_hard_to_tell_apart():
+    """On walls from 0.3 to 2 m, although their estimates lean on each other; near by they are."""
+    z = np.array([0.3, 0.45, 0.6, 1.0, 1.5, 2.0])
+    read = z / (1 + 0.008 - 0.2 * z / FB)
+    far, close = (
+        stereo.fit_bias(z[:n], FX, BASELINE, read[:n], 2e-4 + 8e-4 * z[:n] ** 2, tape_m=1e-6)
+        for n in (6, 3)
+    )
+    assert abs(far.covariance[0, 1]) > 0.9 * far.sigma("baseline_error") * far.sigma(
+        "disparity_offset_px"
+    )
+    assert not covers(far.scale_error_interval, 0.0)
+    assert "hardly" not in str(far)
+    assert "hardly" in str(close)
+
+
 def test_width_does_not_follow_the_law(noisy_faces):
     """Claim D11: held at fixed pixels its std grows with Z, far below the depth's; found anew, the
     edges' jitter of some tenths of a pixel makes most of it."""

@@ -177,14 +177,12 @@ def detect_all(
     views: list[Detection] = []
     skipped: list[Skipped] = []
     try:
-        with counting(len(sources), "image", shown) as counts:
-            for name, source in sources:
-                try:
-                    views.append(detect(_read(source), board, name))
-                except BoardNotFound as reason:
-                    kind = "other_board" if isinstance(reason, OtherBoard) else ""
-                    skipped.append(Skipped(name, str(reason), kind))
-                counts()
+        for name, source in counting(sources, len(sources), "image", shown):
+            try:
+                views.append(detect(_read(source), board, name))
+            except BoardNotFound as reason:
+                kind = "other_board" if isinstance(reason, OtherBoard) else ""
+                skipped.append(Skipped(name, str(reason), kind))
     except KeyboardInterrupt:
         done = len(views) + len(skipped)
         print(f"Stopped after {done} of {len(sources)} images; they are kept.")

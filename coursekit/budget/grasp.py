@@ -11,7 +11,6 @@ from coursekit import checks
 from coursekit.budget.budget import ErrorBudget
 from coursekit.budget.view import AXES
 from coursekit.checks import want
-from coursekit.results import ErrorKind
 
 DRAWS = 20_000  # of a probability that is redrawn while dragging: a standard error of 0.4 % at most
 FEW_DRAWS = 10  # a gain of so many draws says nothing about which row is first
@@ -122,14 +121,12 @@ def success_probability(budget: ErrorBudget) -> Success:
 
 @dataclass(frozen=True)
 class Gain:
-    """What it gains to multiply one term's magnitude by a factor: differences, positive is better.
+    """What it gains to halve one term: differences, positive is better.
 
     worst_case_m, noise_m: along the closing axis, m. success: of the probability.
     """
 
     name: str
-    kind: ErrorKind
-    factor: float
     worst_case_m: float
     noise_m: float
     success: float
@@ -141,14 +138,12 @@ class Gain:
 
     def line(self, grasps: bool = True) -> str:
         """The gain in words; grasps: with what it gains in these."""
-        action = "halve" if self.factor == 0.5 else f"{self.factor:g} times"
         few = abs(self.success) < FEW_DRAWS / DRAWS
         share = "<0.1" if few else f"{100 * self.success:+.1f}"
         gained = f"{share:>5} % of grasps, " if grasps else ""
-        return f"{action} {self.name + ':':<21} {gained}{1e3 * self.room_m:.1f} mm of room"
+        return f"halve {self.name + ':':<21} {gained}{1e3 * self.room_m:.1f} mm of room"
 
-    def __str__(self) -> str:
-        return self.line()
+    __str__ = line
 
 
 class Ranking(tuple[Gain, ...]):
@@ -161,12 +156,12 @@ class Ranking(tuple[Gain, ...]):
         return "\n".join([order, *("  " + gain.line(not self.by_room) for gain in self)])
 
 
-def sensitivity(budget: ErrorBudget, factor: float = 0.5) -> Ranking:
+def sensitivity(budget: ErrorBudget) -> Ranking:
     """ "Halve this, gain that": every term by itself, the one to fix first in front.
 
-    factor: by which each magnitude is multiplied. The order is by grasps gained; where that is
-    within chance (all succeed, or none) by the worst case. The same draws serve every term, so
-    their differences are far quieter than the probabilities.
+    The order is by grasps gained; where that is within chance (all succeed, or none) by the room
+    along closing. The same draws serve every term, so their differences are far quieter than the
+    probabilities.
 
     >>> from coursekit.budget import lesson_budget
     >>> sensitivity(lesson_budget(stated=False))[0].name
@@ -177,10 +172,10 @@ def sensitivity(budget: ErrorBudget, factor: float = 0.5) -> Ranking:
     before, at = budget.as_draws(total).success(), budget.along("closing")
     gains = []
     for term, part in zip(budget.terms, parts, strict=True):
-        fewer = budget.as_draws(total + (factor - 1) * part)  # a part grows with its magnitude
-        along = budget.scaled(term.name, factor).along("closing")
+        fewer = budget.as_draws(total - part / 2).success()  # a part grows with its magnitude
+        along = budget.scaled(term.name, 0.5).along("closing")
         bias, noise = at.worst_case_m[1] - along.worst_case_m[1], at.noise_m - along.noise_m
-        gains.append(Gain(term.name, term.kind, factor, bias, noise, fewer.success() - before))
+        gains.append(Gain(term.name, bias, noise, fewer - before))
     chance = max(2 * math.sqrt(before * (1 - before) / DRAWS), FEW_DRAWS / DRAWS)
     alike = max(abs(gain.success) for gain in gains) <= chance
     ranked = Ranking(sorted(gains, key=lambda g: -(g.room_m if alike else g.success)))

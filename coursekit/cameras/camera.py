@@ -193,14 +193,11 @@ class Camera(Description, ABC):
     def _take(self, n: int, progress: bool) -> Iterator[Frame]:
         """Up to n frames, counted on a line; one printed line when a recording ends early."""
         count = 0
-        with (
-            contextlib.closing(self.stream()) as stream,
-            counting(n, "frame", progress and n >= 10) as counts,
-        ):
-            for frame in itertools.islice(stream, n):
+        with contextlib.closing(self.stream()) as stream:
+            wanted = itertools.islice(stream, n)
+            for frame in counting(wanted, n, "frame", progress and n >= 10):
                 yield frame
                 count += 1
-                counts()
         if count < n:
             print(f"The recording ends after {count} of the {n} frames asked for.")
 

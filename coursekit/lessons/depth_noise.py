@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from coursekit.arrays import Floats
+from coursekit.lessons import questions
 from coursekit.lessons.exercises import Exercise, Model, Step
 from coursekit.specifications import device  # noqa: F401  a wrong step in the TOML file uses it
 
@@ -79,6 +80,7 @@ def _depth_image() -> Floats:
 
 IMAGE = _depth_image()
 IMAGE.setflags(write=False)
+WINDOWS = questions.lesson_texts("depth_noise")["windows"]
 
 
 def _window(row: int, column: int, half: int) -> Bounds:
@@ -155,30 +157,8 @@ ROBUST_DEPTH = Exercise(
         "none": lambda: math.nan,
         "middle": lambda valid: float(np.median(valid)),
     },
-    cases=[
-        (IMAGE, 4, 1, 1, 1),
-        (IMAGE, 11, 8),
-        (IMAGE, 10, 3),
-        (IMAGE, 6, 3, 1),
-        (IMAGE, 5, 9, 1),
-        (IMAGE, 10.7, 7.6),
-        (IMAGE, 3.3, 5.8),
-        (IMAGE, 0, 6),
-        (IMAGE, 4, 0),
-        (IMAGE, -0.3, 0.4),
-        (IMAGE, 15, 8),
-        (IMAGE, 14.6, 11.2),
-        (IMAGE, 0, 0, 1),
-        (IMAGE, 13, 4, 1, 1),
-        (IMAGE, 13, 2, 1, 1),
-        (IMAGE, 13, 2, 1),
-        (IMAGE, 2, 6, 1, 6),
-        (IMAGE, 2, 6, 1, 7),
-        (IMAGE, 7, 6, 4, 20),
-        (IMAGE, -9, 6),
-        (IMAGE, 6, -9),
-        (7 * IMAGE, 10, 8),
-    ],
+    cases=[(IMAGE, *pixel) for pixel in WINDOWS["near"]]
+    + [(7 * IMAGE, *pixel) for pixel in WINDOWS["far"]],
     per_row=0,
     unit="m",
     tolerance=1e-6,

@@ -154,8 +154,4 @@ def _row_in_words(row: tuple[float, float, Any, str]) -> str:
     return f"{kind} {low:g} to {high:g} mm {way}"
 
 
-def _third_of(toward: Any, value: float) -> float:
-    return value if toward is None else abs(toward[0])
-
-
 ADD_UP.read_mistakes(globals())

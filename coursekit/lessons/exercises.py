@@ -3,12 +3,13 @@
 The right answer is written as a few named *steps*. A misconception replaces one step by what a
 learner who holds it would write, so a wrong function can be compared with each wrong model on the
 same cases, and with each pair of them. Only an exact match is named: the nearest wrong model
-misleads as soon as there are two mistakes. To add a misconception, write the wrong step in the
-lesson's module, and in its TOML file, under [mistakes], what the student will read:
-
-    PROJECT.add_mistakes(("read", "p1_p2_swapped", lambda k1, k2, p1, p2, k3: (k1, k2, p2, p1, k3)))
+misleads as soon as there are two mistakes. To add a misconception, write in the lesson's TOML file,
+under [mistakes], what the student will read, and under [wrong.<exercise>] the step and the wrong
+Python in its place:
 
     p1_p2_swapped = ["your p1 and p2 are swapped", "Which of the two multiplies r² + 2x²?"]
+
+    p1_p2_swapped = [["read", "lambda k1, k2, p1, p2, k3: (k1, k2, p2, p1, k3)"]]
 
 What nobody listed is left to a general device: it edits what goes into the right answer, into each
 of its steps and out of them (a sign, a factor, a column for another), and the source of each step
@@ -204,7 +205,7 @@ class Exercise:
             code = getattr(function, "__code__", None)
             if code is None or len(code.co_code) <= len(_nothing.__code__.co_code):
                 return self._say("not attempted", "not attempted yet: it returns None.")
-            return self._say("wrong", "it returns None: is there a `return`?", NO_RETURN)
+            return self._say("wrong", "it returns None: is there a `return`?", FOUND["no_return"])
         for run, args in zip(runs, self.cases, strict=True):
             if isinstance(run.error, NotImplementedError):
                 return self._say("not attempted", "not attempted yet.")
@@ -274,7 +275,7 @@ class Exercise:
             mistakes = (_device(relation, "your result", "", replace),)
         if mistakes:
             return self._one(mistakes[0], count, evidence)
-        return self._say("wrong", f"not right yet. {count}", evidence, BY_HAND)
+        return self._say("wrong", f"not right yet. {count}", evidence, FOUND["by_hand"])
 
     def _found(self, values: list[Floats], told: bool) -> tuple[Mistake, ...]:
         """The first mistakes that give these values; told: without the device's."""
@@ -298,8 +299,11 @@ class Exercise:
         square = expected[0].shape == (3, 3)
         holds = {
             "constant": all(np.array_equal(v, values[0], equal_nan=True) for v in values),
-            "rows_lost": self.per_row and all(self._agrees_but_for_rows(v, e) for v, e in both),
-            "mirrored": square and all(self._agrees(v, e) or self._mirrors(v) for v, e in both),
+            "rows_lost": all(self._right_or_nothing(v, e) for v, e in both)
+            and any((v != 0).any() and self._agrees(v, e) for v, e in both),
+            "mirrored": square
+            and all(self._agrees(v, e) or np.linalg.det(v) < 0 for v, e in both)
+            and all(self._agrees(v @ v.T, np.eye(3)) for v in values),
             "runs_away": not self.nan_answers
             and any(not (np.abs(v) <= 1e6 * (1 + np.abs(e).max())).all() for v, e in both),
             "signs": straight and abs(k - 1) < 1e-6 and len(set(np.sign(factors))) > 1,
@@ -308,17 +312,10 @@ class Exercise:
         }
         return next((kind for kind, true in holds.items() if true), None)
 
-    def _mirrors(self, matrix: Floats) -> bool:
-        return self._agrees(matrix @ matrix.T, np.eye(3)) and bool(np.linalg.det(matrix) < 0)
-
-    def _agrees_but_for_rows(self, value: Floats, want: Floats) -> bool:
-        """Whether of several rows some are right, and all others nothing: 0 or NaN."""
-        if not want.ndim or len(want) == 1:
-            return self._agrees(value, want)
-        right = [self._agrees(v, e) for v, e in zip(value, want, strict=True)]
-        return any(right) and all(
-            r or not np.nan_to_num(v).any() for r, v in zip(right, value, strict=True)
-        )
+    def _right_or_nothing(self, value: Floats, want: Floats) -> bool:
+        """Whether each row, or a result without rows, is right or nothing: 0 or NaN."""
+        rows = zip(value, want, strict=True) if want.ndim and self.per_row else [(value, want)]
+        return all(self._agrees(v, e) or not np.nan_to_num(v).any() for v, e in rows)
 
     def _seen_in(self, case: int, mistakes: tuple[Mistake, ...], want: Floats) -> Mistake:
         """The first of several mistakes that by itself shows in this case."""
@@ -347,7 +344,7 @@ class Exercise:
         return self._say("wrong", text, *lines, mistake.ask, named=mistake.name)
 
     def _several(self, first: Mistake, *lines: str) -> Verdict:
-        text = f"{MORE_THAN_ONE}{first.says}."
+        text = f"{FOUND['more']}{first.says}."
         return self._say("wrong", text, *lines, first.ask, named=f"several, first {first.name}")
 
     def _combinations(self) -> Iterator[tuple[Mistake, ...]]:
@@ -439,25 +436,8 @@ def _nothing() -> None:
     return None
 
 
-MORE_THAN_ONE = "more than one mistake. Look first at this: "
-NO_RETURN = (
-    "Printing or keeping a result does not give it back: `return` does. And the template's own "
-    "`return None` has to go."
-)
-BY_HAND = (
-    "No single mistake that this check knows gives these numbers. Work this case by hand, one "
-    "step at a time, and compare."
-)
-IN_PLACE = Mistake(
-    "in_place",
-    "your function changes the array it is given",
-    "Whoever calls it loses the original. Which line writes into an argument?",
-)
-TRANSPOSED = Mistake(
-    "transposed",
-    "your result is transposed: one column a point, and one row a point is wanted",
-    "Print the shape of what you return. Which axis counts the points?",
-)
+FOUND = questions.lesson_texts("exercises")
+IN_PLACE, TRANSPOSED = (Mistake(name, *texts) for name, texts in FOUND["formal"].items())
 
 
 @dataclass(frozen=True)
@@ -507,13 +487,12 @@ def _as_numbers(value: Any) -> Floats | None:
 
 Edit = Callable[[Any], Any]
 Way = tuple[str | int, ...]
-FOUND = questions.lesson_texts("exercises")
 EDITS: dict[str, Edit] = {
     kind: eval(f"lambda v: {formula}", {"np": np}) for kind, formula in FOUND["edits"].items()
 }
 ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh")
 NUMERIC = (int, float, np.generic, np.ndarray)
-MOST_SITES = 45  # a step with more of them is not tried with two edits
+MOST_SITES = 55  # of more of them in one step no two are tried together
 
 
 def _all_edits(exercise: Exercise) -> tuple[list[Mistake], list[Mistake]]:
@@ -547,7 +526,7 @@ def _all_edits(exercise: Exercise) -> tuple[list[Mistake], list[Mistake]]:
         for kind, where, edit in _edits_of(values, own, deep=False):
             found.append((kind, where, name, lambda *a, e=edit, f=step: f(*e(a))))
     pairs = [(kind, where, name, new) for name, (n, kind, where, new) in rewritten if n == 2]
-    return [_device(*edit) for edit in found], [_device(*edit, MORE_THAN_ONE) for edit in pairs]
+    return [_device(*edit) for edit in found], [_device(*edit, FOUND["more"]) for edit in pairs]
 
 
 def _device(kind: str, where: str, step: str, wrong: Step, before: str = "") -> Mistake:
@@ -585,6 +564,9 @@ def _edits_of(
     ]:
         for kind, where, edit in _edits_of(part, label, deep):
             yield kind, where, partial(_put, [(i, i) for i in indices], edit)
+    for turn in (1, 2) if len(arrays) == len(parts) == 3 and like else ():
+        new = [(parts[i][1], parts[i - turn][1]) for i in range(3)]
+        yield "exchanged", f"the parts of {whole}", partial(_put, new, lambda v: v)
     for (a, i, x), (b, j, y) in itertools.permutations(parts, 2):
         if isinstance(x, NUMERIC) and isinstance(y, NUMERIC) and np.shape(x) == np.shape(y):
             yield "copied", _listed((a, b)), partial(_put, [(i, j)], lambda v: v)
@@ -620,16 +602,17 @@ def _put(places: list[tuple[Any, Any]], edit: Edit, value: Any) -> Any:
 def _factors(
     args: tuple[Any, ...], names: list[str], result: Any
 ) -> Iterator[tuple[str, str, Step]]:
-    """Edits by which the result, or a part of it, is multiplied or divided by an input."""
-    for i, (name, given) in enumerate(zip(names, args, strict=False)):
+    """Edits by which the result, or parts of it, are multiplied or divided by an input."""
+    every = [n for _, n, _ in _parts(result, "")] or [...]
+    groups = [[n] for n in every] + [every, every[:-1]] * (len(every) > 2)
+    for (i, given), group in itertools.product(enumerate(args), groups):
         if isinstance(given, (float, np.ndarray)) and np.ndim(given) < 2:
-            for _, n, _ in _parts(result, "") or [("", ..., result)]:
-                for kind, by in (("factor_too_many", np.multiply), ("factor_missing", np.divide)):
-                    yield (
-                        kind,
-                        name,
-                        lambda a, v, i=i, by=by, n=n: _put([(n, n)], lambda x: by(x, a[i]), v),
-                    )
+            for kind, by in (("factor_too_many", np.multiply), ("factor_missing", np.divide)):
+
+                def edit(a: Any, v: Any, i: int = i, by: Any = by, group: Any = group) -> Any:
+                    return _put([(n, n) for n in group], lambda x: by(x, a[i]), v)
+
+                yield kind, names[i], edit
 
 
 @cache
@@ -657,7 +640,9 @@ def _rewritten(step: Step) -> list[tuple[int, str, str, Step]]:
             sites.append((1, kind, where, {id(node): new}))
             for like in ((), fields, beside, where):
                 groups.setdefault((kind, detail, like), (kind, where, {}))[2][id(node)] = new
-    pairs = itertools.combinations(sites if len(sites) <= MOST_SITES else [], 2)
+    pools: list[list[Any]] = [sites, [site for site in sites if site[1] == "name"], []]
+    pool = next(pool for pool in pools if len(pool) <= MOST_SITES)
+    pairs = itertools.combinations(pool, 2)
     several = [(1, *group) for group in groups.values() if len(group[2]) > 1]
     double = [(2, kind, where, a | b) for (_, kind, where, a), (*_, b) in pairs]
     edits = [
@@ -714,8 +699,11 @@ def _other_operators(node: Any) -> Iterator[tuple[str, Any, ast.AST]]:
             yield "divided", "turned", ast.BinOp(right, ast.Div(), left)
         if isinstance(left, ast.BinOp) and _rank(left.op) < _rank(op):  # (a + b) * c
             yield "bracket", 0, ast.BinOp(left.left, left.op, ast.BinOp(left.right, op, right))
+            yield "bracket", 1, ast.BinOp(ast.BinOp(left.left, op, right), left.op, left.right)
         if isinstance(right, ast.BinOp) and _rank(right.op) < _rank(op) + isinstance(op, ast.Div):
             yield "bracket", 0, ast.BinOp(ast.BinOp(left, op, right.left), right.op, right.right)
+        if isinstance(right, ast.BinOp) and _rank(right.op) > _rank(op):  # a * b**c
+            yield "bracket", 2, ast.BinOp(ast.BinOp(left, op, right.left), right.op, right.right)
 
 
 def _alternatives(node: Any, names: set[str]) -> Iterator[tuple[str, Any, ast.AST]]:
@@ -723,7 +711,7 @@ def _alternatives(node: Any, names: set[str]) -> Iterator[tuple[str, Any, ast.AS
     yield from _other_operators(node)
     match node:
         case ast.Constant(int() | float() as value) if not isinstance(value, bool):
-            for number in (value + 1, value - 1, -value):
+            for number in (value + 1, value - 1, -value, 2 * value, 1 / (value or 1)):
                 yield "number", (value, number), ast.Constant(number)
         case ast.Name(name, ast.Load()) if name in names:
             for other in sorted(names - {name}):

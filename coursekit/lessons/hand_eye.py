@@ -156,14 +156,6 @@ ROTATION_HALF = Exercise(
 )
 
 
-def _mirror_image(a: Floats, b: Floats) -> Floats:
-    U, _, Vt = np.linalg.svd(a.T @ b)
-    mirror = U @ Vt
-    if len(a) == 2:  # the third singular direction has no sign: take the one that mirrors
-        mirror = U @ np.diag([1.0, 1.0, -np.linalg.det(mirror)]) @ Vt
-    return mirror
-
-
 def _kabsch(product: Callable[[Floats, Floats, Floats], Floats]) -> Step:
     """Kabsch's method with another product of U, V^T and the matrix that makes it a rotation."""
 

@@ -70,15 +70,6 @@ REPROJECTION_RMS = Exercise(
 )
 
 
-def _everywhere(measure: Step) -> Step:
-    """The same measure of the errors in u, of those in v and of the distances."""
-
-    def whole(residuals: Floats, result: Floats) -> Any:
-        return measure(np.column_stack([residuals, np.linalg.norm(residuals, axis=1)]))
-
-    return whole
-
-
 REPROJECTION_RMS.read_mistakes(globals())
 
 
@@ -102,16 +93,11 @@ def _least_squares(seed: int, rows: int, columns: int, sigma: float) -> tuple[Fl
     return J, noise - J @ np.linalg.lstsq(J, noise, rcond=None)[0]
 
 
-def _freedom(J: Floats, residuals: Floats) -> int:
-    M, P = J.shape
-    return M - P
-
-
 FOCAL_SIGMA = Exercise(
     name="intrinsics.focal_sigma",
     build=_build_sigma,
     steps={
-        "freedom": _freedom,
+        "freedom": lambda J, residuals: J.shape[0] - J.shape[1],
         "noise": lambda residuals, freedom: residuals @ residuals / freedom,  # a variance
         "information": lambda J: J.T @ J,
         "first": lambda information: np.linalg.inv(information)[0, 0],

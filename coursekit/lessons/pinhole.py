@@ -130,11 +130,6 @@ PROJECT = Exercise(
 )
 
 
-def _pixels_by(numbers: Step) -> Step:
-    """`_to_pixels` with other numbers in the place of fx, fy, cx and cy."""
-    return lambda x, y, w, *lens: _to_pixels(x, y, w, *numbers(*lens))
-
-
 PROJECT.read_mistakes(globals())
 
 
@@ -221,11 +216,6 @@ DEPROJECT = Exercise(
     show=lambda row: _tuple(row, ".4f"),
     core=Core(of=lambda args: args[:3], which="without distortion", rest="`dist`"),
 )
-
-
-def _rays_by(numbers: Step) -> Step:
-    """`_to_normalised` with other numbers in the place of fx, fy, cx and cy."""
-    return lambda u, v, *lens: _to_normalised(u, v, *numbers(*lens))
 
 
 # The coefficients and the equation: what goes wrong in the first exercise does so in this one. But

@@ -237,11 +237,7 @@ def rendered_session(
     BoardNotFound where the board is not found in one, which the poses are chosen to avoid.
     """
     truth, q, dq = _poses(mount, seed, n, arm_errors, HandEyeMistakes())
-    images: list[Grey] = []
-    with counting(n, "image", n >= FOLDER_VIEWS) as counts:
-        for image in images_of(truth, seed):
-            images.append(image)
-            counts()
+    images = list(counting(images_of(truth, seed), n, "image", n >= FOLDER_VIEWS))
     board = truth.setup.board
     found = [detect(image, board, f"view_{i:02d}") for i, image in enumerate(images)]
     return _reported(truth, q, dq, Detections(found)), truth, images

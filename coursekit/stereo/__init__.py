@@ -45,6 +45,7 @@ from coursekit.stereo.windows import (
     WindowStats,
     averaging_curve,
     off_plane,
+    valid_mean,
     window_stats,
     without_mismatches,
 )

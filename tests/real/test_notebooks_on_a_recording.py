@@ -22,7 +22,7 @@ PATHS = build_notebooks.find([])
 HONEST = {  # what two frames of one scene cannot give, by cell
     "02_depth_noise": {
         "fit": "no law can be fitted",
-        "averaging": "nothing can be said about averaging",
+        "averaging-figure": "nothing can be said about averaging",
         "studio-capture": "needs a camera or a set",
     },
 }

@@ -13,11 +13,16 @@ from __future__ import annotations
 import importlib
 import inspect
 import math
+import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 Attempt = Callable[..., Any]
+BY_TEXT = tomllib.loads(Path(__file__).with_name("by_text.toml").read_text(encoding="utf-8"))
 
 
 @dataclass(frozen=True)
@@ -30,7 +35,8 @@ class WrongAnswer:
 
 
 def expected(said: str | None) -> tuple[str, str | None]:
-    return (said, None) if said in ("right", "core right", "raised") else ("wrong", said)
+    kinds = ("right", "core right", "raised", "not attempted")
+    return (said, None) if said in kinds else ("wrong", said or None)
 
 
 def wrong(said: str | None) -> Callable[[Attempt], Attempt]:
@@ -65,4 +71,10 @@ def changed(solution: Attempt, changes: dict[str, str | None]) -> None:
 def attempts(exercise: str) -> list[WrongAnswer]:
     """The wrong answers to the exercise `lesson.function`, and the solutions they come from."""
     module = importlib.import_module(f"wrong_answers.{exercise.replace('.', '_')}")
-    return [one for f in vars(module).values() for one in getattr(f, "wrong_answers", ())]
+    found = [one for f in vars(module).values() for one in getattr(f, "wrong_answers", ())]
+    for written in BY_TEXT.get(exercise, ()):
+        namespace = {"np": np}
+        exec(written["code"], namespace)
+        attempt = namespace[exercise.rpartition(".")[2]]
+        found.append(WrongAnswer(written["what"], attempt, expected(written["named"])))
+    return found

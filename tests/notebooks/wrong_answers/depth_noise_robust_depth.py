@@ -30,7 +30,7 @@ changed(
         "round(v), round(u) -> int(v), int(u)": "truncated",
         "round(v), round(u) -> np.array([v, u]).astype(int)": "truncated",
         "round(v), round(u) -> v, u": "raised",
-        "round(v), round(u) -> math.ceil(v), math.ceil(u)": None,
+        "round(v), round(u) -> math.ceil(v), math.ceil(u)": "rounded_up",
         # the window
         "row, column = -> half = 2\n    row, column =": "half_ignored",
         "row, column = -> half = half // 2\n    row, column =": "half_halved",

@@ -46,9 +46,9 @@ changed(
         "-> board_j @ undo(board_i), undo(gripper_j) @ gripper_i": "b_first",
         "undo(gripper_j) @ gripper_i, board_j @ undo(board_i) "
         "-> undo(gripper_i) @ gripper_j, undo(board_j) @ board_i": "several, first a_exchanged",
-        "undo(gripper_j) @ -> undo(gripper_j) * and board_j @ -> board_j *": None,
+        "undo(gripper_j) @ -> undo(gripper_j) * and board_j @ -> board_j *": "elementwise",
         "undo(gripper_j) @ gripper_i -> gripper_i - gripper_j "
-        "and board_j @ undo(board_i) -> board_j - board_i": None,
+        "and board_j @ undo(board_i) -> board_j - board_i": "subtracted",
         ", board_j @ undo(board_i)] -> ][0]": None,
     },
 )

@@ -52,7 +52,7 @@ changed(
         "X / Z, Y / Z -> fx * X / Z + cx, fy * Y / Z + cy and fx * x + cx, fy * y + cy -> x, y": (
             "distortion_in_pixels"
         ),
-        "+ k2 -> - k2": None,
+        "+ k2 -> - k2": "subtracted",
         # powers of the radius
         "1 + k1 -> k1": "one_missing",
         "= x**2 + y**2 -> = np.sqrt(x**2 + y**2)": "r_for_r2",
