@@ -7,8 +7,10 @@ It calls what a notebook would, by the same names: `ck` loads a room when it is 
 from __future__ import annotations
 
 import argparse
+import io
 import sys
 from collections.abc import Callable, Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +35,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"coursekit {doctor.edition()}")
         return 0
     options = _parser().parse_args(arguments)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal or a file may not know every sign
     try:
         return options.run(options) or 0
     except (ck.cameras.CameraError, OSError, ValueError) as error:
@@ -94,22 +99,38 @@ def _parser() -> argparse.ArgumentParser:
     the.add_argument("--folder", metavar="DIR", help="where to write, default: results/")
     the.add_argument("--overwrite", action="store_true", help="replace an existing bundle")
 
+    _add_grade(command)
+    _add_export(command)
+    _add_doctor(command)
+    return parser
+
+
+def _add_grade(command: Callable[..., Any]) -> None:
     more = (
-        "Grade every bundle (.zip) in a folder and below it. Stopped with Ctrl-C, the same command "
-        "goes on from there. Nothing that a student wrote is run or unpacked."
+        "Grade every bundle (.zip) in a folder and below it, or in the zip that Moodle or Canvas "
+        "makes. Stopped with Ctrl-C, the same command goes on from there. Nothing that a student "
+        "wrote is run."
     )
-    the = command("grade", _grade, "grade a folder of bundles", description=more)
-    the.add_argument("folder", metavar="FOLDER", help="what students handed in")
-    the.add_argument("--out", required=True, metavar="DIR", help="the report: a new folder")
+    lines = """the three commonest lines:
+  coursekit grade submissions.zip
+  coursekit grade submissions.zip --roster class.csv --late-after 2026-03-02T23:59
+  coursekit grade submissions.zip --overwrite       (after your own points, or more hand-ins)
+"""
+    raw = argparse.RawDescriptionHelpFormatter
+    shape = {"description": more, "epilog": lines, "formatter_class": raw}
+    the = command("grade", _grade, "grade a folder of bundles", **shape)
+    the.add_argument("folder", metavar="FOLDER", help="what students handed in, or a .zip of it")
+    the.add_argument("--out", metavar="DIR", help="the report: a new folder, default NAME_report")
+    roster = "a table (CSV) of the class: names, any ids, any more columns"
+    the.add_argument("--roster", metavar="FILE", help=roster)
+    late = "the last moment that is not late, of this computer's zone"
+    the.add_argument("--late-after", type=datetime.fromisoformat, metavar="MOMENT", help=late)
+    the.add_argument("--separator", choices=(",", ";"), default=",", help="of the tables' cells")
     the.add_argument("--workers", type=int, metavar="N", help="processes, default: one a core")
     timeout = "seconds a bundle, default: 10"
     the.add_argument("--timeout", type=float, default=10.0, metavar="S", help=timeout)
     finished = "replace a finished report; only what has changed is graded"
     the.add_argument("--overwrite", action="store_true", help=finished)
-
-    _add_export(command)
-    _add_doctor(command)
-    return parser
 
 
 def _add_doctor(command: Callable[..., Any]) -> None:
@@ -187,10 +208,11 @@ def _submit(options: argparse.Namespace) -> None:
 
 def _grade(options: argparse.Namespace) -> None:
     # No notebook needs it, so it has no short name.
-    from coursekit.submission.batch import grade_folder
+    from coursekit.submission.batch import Choices, grade_folder
 
-    where = options.folder, options.out
-    print(grade_folder(*where, options.workers, options.timeout, overwrite=options.overwrite))
+    how = options.folder, options.out, options.workers, options.timeout
+    choices = Choices(options.roster, options.late_after, options.separator)
+    print(grade_folder(*how, overwrite=options.overwrite, choices=choices))
 
 
 if __name__ == "__main__":

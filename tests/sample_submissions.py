@@ -7,6 +7,8 @@ claimed of its depths is computed here with NumPy where that is not the course's
 
 from __future__ import annotations
 
+import io
+import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
@@ -317,6 +319,11 @@ COPIES: dict[str, Callable[[Counts, Random], Counts]] = {
     "subset": lambda counts, r: counts[
         np.sort(r.permutation(len(counts))[: len(counts) * 6 // 10])
     ],
+    "mirrored": lambda counts, _: counts[:, :, ::-1],
+    "turned": lambda counts, _: np.rot90(counts, 1, (1, 2)),
+    "transposed": lambda counts, _: counts.transpose(0, 2, 1),
+    "rolled": lambda counts, _: np.roll(counts, (7, 3), (1, 2)),
+    "rescaled": lambda counts, _: np.rint(counts * 1.004),
     "constant_added": lambda counts, _: np.where(counts, counts + 3, 0),
 }
 
@@ -412,6 +419,67 @@ def _impossible_times(how: str, seed: int) -> Submission:
     near, middle, far = good.stacks
     middle = replace(middle, times_s=TIMES[how](middle.times_s, near.times_s))
     return replace(good, stacks=(near, middle, far))
+
+
+# --- a class ------------------------------------------------------------------------------------
+
+
+def class_names(n: int) -> list[str]:
+    """So many names, with accents, apostrophes and other scripts among them."""
+    first = ("Ada", "Zoë", "李", "Björn", "Mary Ann", "O'Neil")
+    return [f"{first[i % 6]} Student{chr(97 + i // 26)}{chr(97 + i % 26)}" for i in range(n)]
+
+
+def moodle(name: str, i: int, file: str) -> str:
+    return f"{name}_{1000 + i}_assignsubmission_file_/{file}"
+
+
+def canvas(name: str, i: int, file: str) -> str:
+    *first, last = name.replace("'", "").split()
+    late = "_LATE" * (i == 2)
+    return (
+        f"{(last + ''.join(first)).lower()}{late}_{1000 + i}_{70000 + i}_{file.replace('/', '_')}"
+    )
+
+
+def class_zip(whole: Submission, n: int, of: Callable[[str, int, str], str]) -> bytes:
+    """What an LMS makes of what n students handed in; `of` names the files as it does.
+
+    0 and 1 hand in nothing, 2 is late, 3 hands in twice, 4 half of a download, 5 a bundle without
+    an ending, 6 an unpacked one, 7 one zipped again, 8 an essay, 9 a bundle with the name of 10,
+    packed in 2099; 11, 12 and 13 type their names in other ways; 14's is no bundle.
+    """
+    names = class_names(n)
+
+    def data(name: str, made: str = MADE) -> bytes:
+        return bundle.bundle_bytes(replace(whole, student=name, made=made))
+
+    def parts(name: str) -> dict[str, bytes]:
+        with zipfile.ZipFile(io.BytesIO(data(name))) as packed:
+            return {member: packed.read(member) for member in packed.namelist()}
+
+    again = {f"studio_1/{part}": content for part, content in parts(names[7]).items()}
+    inside = {f"studio_1/{part}": content for part, content in parts(names[6]).items()}
+    odd: dict[int, dict[str, bytes]] = {
+        **{
+            0: {},
+            1: {},
+            3: {"a.zip": data(names[3]), "b.zip": data(names[3], "2026-03-02T11:00:00+00:00")},
+        },
+        **{4: {"studio.zip.crdownload": data(names[4])[:500]}, 5: {"studio": data(names[5])}},
+        **{6: inside, 7: {"s.zip": bundle.zip_bytes(again | {"__MACOSX/studio_1/._x": b"q"})}},
+        **{8: {"essay.pdf": b"%PDF"}, 9: {"s.zip": data(names[10], "2099-01-01T00:00:00+00:00")}},
+        **{11: {"s.zip": data(names[11].upper() + "\u200b")}, 13: {"s.zip": data("Bunny")}},
+        **{12: {"s.zip": data(", ".join(reversed(names[12].split(" ", 1))))}, 14: {"s.zip": b"no"}},
+    }
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as packed:
+        for i, name in enumerate(names):
+            for file, content in (odd[i] if i in odd else {"studio_1.zip": data(name)}).items():
+                day = 5 if i == 2 else 2
+                member = zipfile.ZipInfo(of(name, i, file), (2026, 3, day, 13, file == "b.zip", 0))
+                packed.writestr(member, content)
+    return buffer.getvalue()
 
 
 HOSTILE_TEXTS = (

@@ -11,24 +11,29 @@ import signal
 import subprocess
 import sys
 import time
+import zipfile
 from collections.abc import Iterable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hostile_bundles import ZOE, hostile
-from sample_submissions import honest
+from sample_submissions import canvas, class_names, class_zip, honest, moodle
 
 from coursekit import cli
 from coursekit.specifications import DATA
 from coursekit.submission import batch
 from coursekit.submission.batch import Bundle, Limits
-from coursekit.submission.format import bundle_bytes
+from coursekit.submission.format import Claims, bundle_bytes
+from coursekit.submission.recompute import grading_rules
 from coursekit.submission.report import ReportLine, grade_file, not_graded
 from coursekit.submission.rubric import grade
 
+NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
+USUAL = {"impossible_times", "not_distance_dependent"}  # of the small bundle
 SAMPLES = DATA / "sample_bundles"
 GRADED = ("ada_good", "ben_weak", "cleo_wrong", "dan_copied", "eve_formula")
 REFUSED = {
@@ -117,13 +122,14 @@ def test_what_students_wrote_stays_text(report):
 
 
 def test_the_report_holds_a_page_a_student_and_nothing_else(report):
-    made = ["grades.csv", "index.html", "paragraphs.html", "students"]
+    made = ["feedback.zip", "grades.csv", "index.html", "own_points.csv", "paragraphs.html"]
+    made += ["second_marker.html", "students"]
     assert sorted(path.name for path in report.iterdir()) == [".rows", *made]
     pages = sorted(path.name for path in (report / "students").iterdir())
     assert [page.rpartition("_")[0] for page in pages] == list(GRADED)
     index = (report / "index.html").read_text(encoding="utf-8")
     assert all(f'href="students/{page}"' in index for page in pages)
-    assert len(list((report / ".rows").glob("*.json"))) == 9
+    assert len(list((report / ".rows").glob("*.json"))) == 10  # and what the class had
 
 
 def test_the_same_bytes_come_out_however_many_processes_there_are(in_process, report, tmp_path):
@@ -348,16 +354,13 @@ def test_only_bundles_are_looked_at(in_process, tmp_path):
     (folder / "UPPER.ZIP").write_bytes((folder / "b.zip").read_bytes())
     (folder / "linked").symlink_to(quick(tmp_path / "elsewhere", ["secret"]))
     summary = graded(folder, folder / "report")
-    assert summary.left_out == ("essay.pdf",)
-    assert "left out: 1 file: essay.pdf" in str(summary)
+    assert summary.left_out == ("essay.pdf", "linked")
+    assert "left out: 2 files: essay.pdf, linked" in str(summary)
     names = [row["file"] for row in table(folder / "report")]
     assert names == ["A.zip", "UPPER.ZIP", "b.zip", "late/Ada_17/studio.zip"]
     again = graded(folder, folder / "report", overwrite=True)
     assert again.kept == 4  # the report in the folder is no bundle of it
-    assert graded(folder, folder / "second").left_out == ("essay.pdf",)  # nor an earlier run's
-    (folder / "report" / "thesis.tex").write_bytes(b"")
-    third = graded(folder, tmp_path / "third")
-    assert "report/thesis.tex" in third.left_out  # no report of ours any more
+    assert len(graded(folder, folder / "second").left_out) == 2  # nor an earlier run's
 
 
 def test_what_is_kept_of_a_bundle_may_go_and_the_report_says_so(in_process, tmp_path, monkeypatch):
@@ -394,19 +397,13 @@ def test_names_of_files_are_never_paths_or_code(in_process, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in", "out"]
 
 
-STRANGE = ["out", "in", "out/thesis.tex", "out/grades.csv ->", "out/mine/"]
-
-
-@pytest.mark.parametrize("mine", [*STRANGE, "out/students/photo.jpg", "out/.rows/x.py"])
-def test_a_folder_with_anything_else_in_it_is_not_touched(mine, tmp_path):
-    folder, path = quick(tmp_path / "in", ["a"]), tmp_path / mine.removesuffix(" ->")
+@pytest.mark.parametrize("mine", ["out", "in", "out/thesis.tex", "out/mine/"])
+def test_a_folder_that_is_no_report_is_not_touched(mine, tmp_path):
+    folder, path = quick(tmp_path / "in", ["a"]), tmp_path / mine
     if mine.startswith("out/"):
-        (tmp_path / "out" / "students").mkdir(parents=True)
-        (tmp_path / "out" / ".rows").mkdir()
+        (tmp_path / "out").mkdir()
     if mine.endswith("/"):
         path.mkdir()
-    elif mine.endswith("->"):
-        path.symlink_to(tmp_path / "elsewhere")
     elif mine != "in":
         path.write_text("mine", encoding="utf-8")
     before = sorted(tmp_path.rglob("*"))
@@ -434,6 +431,106 @@ def test_what_cannot_be_is_said_before_anything_is_made(change, message, tmp_pat
     with pytest.raises(ValueError, match=message):
         graded(**{"folder": "in", "out": "out"} | change)
     assert not (tmp_path / "out").exists()
+
+
+# --- a class ---
+
+LMS = {"Moodle": (moodle, "Identifier", "Participant {}"), "Canvas": (canvas, "ID", "{}")}
+
+
+@pytest.mark.parametrize("lms", LMS)
+def test_everybody_of_a_class_has_a_row_and_nobodys_grade_is_anothers(
+    lms, in_process, tmp_path, monkeypatch
+):
+    """And the table for the LMS, read as it is documented, says the same."""
+    monkeypatch.chdir(tmp_path)
+    n, (of, column, number) = 120 if NIGHTLY else 16, LMS[lms]
+    names = class_names(n)
+    Path("all.zip").write_bytes(class_zip(ZOE, n, of))
+    lines = [f"{number.format(1000 + i)};{name};{'AB'[i % 2]}" for i, name in enumerate(names)]
+    Path("class.csv").write_text("\n".join([f"{column};Student;Section", *lines]), "utf-8-sig")
+    choices = batch.Choices("class.csv", datetime(2026, 3, 4))
+    summary = batch.grade_folder("all.zip", progress=False, choices=choices)
+    assert summary.missing == tuple(names[:2])
+    out = Path("all_report")
+    rows = table(out)
+    status: dict[str, list[str]] = {}
+    for row in rows:
+        status.setdefault(row["student"], []).append(row["status"].removeprefix("not graded: "))
+    odd = {0: ["missing"], 1: ["missing"], 3: ["graded"] * 2, 14: ["not_a_zip"], 8: ["no_bundle"]}
+    odd |= {4: ["not_a_zip"]} | ({} if lms == "Moodle" else {6: ["no_bundle"]})
+    assert status == {name: odd.get(i, ["graded"]) for i, name in enumerate(names)}
+    assert {row["student"] for row in rows if row["late"] == "yes"} == {names[2]}
+    assert [row["counts"] for row in rows if row["student"] == names[3]] == ["no", "yes"]
+    assert all(row["Section"] == "AB"[names.index(row["student"]) % 2] for row in rows)
+    flags = {row["student"]: {*row["flags"].split()} - USUAL for row in rows}
+    assert {name: codes for name, codes in flags.items() if codes} == {
+        names[9]: {"another_student", "wrong_clock"},
+        names[13]: {"other_name"},
+    }
+    graded = {row["student"]: row["total"] for row in rows if row["counts"] == "yes"}
+    text = (out / f"{lms.lower()}.csv").read_text(encoding="utf-8-sig")
+    imported = {row[column]: row for row in csv.DictReader(io.StringIO(text))}
+    points = "Grade" if lms == "Moodle" else "Studio exercise 1"
+    for i, name in enumerate(names):
+        if name in graded or i < 2:
+            assert imported[number.format(1000 + i)][points] == graded.get(name, "")
+    with zipfile.ZipFile(out / "feedback.zip") as packed:
+        assert of(names[15], 15, "feedback.html" if lms == "Moodle" else "studio_1.html") in (
+            packed.namelist()
+        )
+
+
+def test_own_points_survive_a_regrade_which_says_what_changed(in_process, tmp_path, monkeypatch):
+    folder, out = quick(tmp_path / "in", ["a", "b"]), tmp_path / "out"
+    before = graded(folder, out)
+    own = out / "own_points.csv"
+    text = "who;student;paragraph;late;overrule;comment\na;a;2,5;-1;;well said\n"
+    own.write_text(text, encoding="utf-8-sig")
+    kept = own.read_bytes()
+    (out / "grades.csv").write_text("edited", encoding="utf-8")
+    for name in (".DS_Store", "Thumbs.db", "desktop.ini", "~$grades.xlsx", ".~lock.grades.csv#"):
+        (out / name).write_bytes(b"")
+    for name in ("grades.xlsx", "notes.txt", "students/.DS_Store", "students/a.png", ".rows/x"):
+        (out / name).write_bytes(b"mine")
+    foreign = {path for path in out.rglob("*") if path.is_file()}
+    summary = graded(folder, out, overwrite=True)
+    first = next(row for row in table(out) if row["student"] == "a")
+    machine = float(first["points"]) - float(first["paragraph"])
+    assert float(first["total"]) == pytest.approx(machine + 2.5 - 1)
+    assert summary.changes == (
+        ("a", f"{float(first['points']):g}", first["total"], "your own points changed"),
+    )
+    assert summary.kept == before.graded == 2
+    assert own.read_bytes() == kept
+    assert all(path.exists() for path in foreign)
+    assert [path.read_text() for path in out.glob("grades_edited_*.csv")] == ["edited"]
+    monkeypatch.setitem(grading_rules()["points"], "paragraph", 4)
+    monkeypatch.setattr(batch, "grader_version", lambda: "another")
+    (change,) = [c for c in graded(folder, out, overwrite=True).changes if c[0] == "b"]
+    assert "the rubric or the grader changed; paragraph " in change[3]
+    own.write_text(text.replace("2,5", "many"), encoding="utf-8")
+    with pytest.raises(ValueError, match=r"own_points\.csv: a: paragraph: got 'many', want points"):
+        graded(folder, out, overwrite=True)
+
+
+def test_without_an_lms_a_name_typed_twice_takes_nobodys_points(in_process, tmp_path):
+    folder, out = tmp_path / "in", tmp_path / "out"
+    good, weak = ZOE, replace(ZOE, made="2026-03-05T12:00:00+00:00", claims=Claims())
+    for place, one in (("zoe", good), ("mallory", weak)):
+        (folder / place).mkdir(parents=True)
+        (folder / place / "s.zip").write_bytes(bundle_bytes(one))
+    graded(folder, out)
+    rows = {row["file"]: row for row in table(out)}
+    assert [rows[f"{at}/s.zip"]["counts"] for at in ("zoe", "mallory")] == ["yes", "no"]
+    assert all("same_name" in row["flags"] for row in rows.values())
+
+
+def test_two_graders_do_not_write_one_report(in_process, tmp_path):
+    folder, out = quick(tmp_path / "in", ["a"]), tmp_path / "out"
+    graded(folder, out)
+    with batch._alone(out), pytest.raises(ValueError, match="another `coursekit grade`"):
+        graded(folder, out, overwrite=True)
 
 
 # --- the command ---

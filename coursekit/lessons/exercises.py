@@ -3,12 +3,13 @@
 The right answer is written as a few named *steps*. A misconception replaces one step by what a
 learner who holds it would write, so a wrong function can be compared with each wrong model on the
 same cases, and with each pair of them. Only an exact match is named: the nearest wrong model
-misleads as soon as there are two mistakes. To add a misconception, write the wrong step in the
-lesson's module, and in its TOML file, under [mistakes], what the student will read:
-
-    PROJECT.add_mistakes(("read", "p1_p2_swapped", lambda k1, k2, p1, p2, k3: (k1, k2, p2, p1, k3)))
+misleads as soon as there are two mistakes. To add a misconception, write in the lesson's TOML file,
+under [mistakes], what the student will read, and under [wrong.<exercise>] the step and the wrong
+Python in its place:
 
     p1_p2_swapped = ["your p1 and p2 are swapped", "Which of the two multiplies r² + 2x²?"]
+
+    p1_p2_swapped = [["read", "lambda k1, k2, p1, p2, k3: (k1, k2, p2, p1, k3)"]]
 
 What nobody listed is left to a general device: it edits what goes into the right answer, into each
 of its steps and out of them (a sign, a factor, a column for another), and the source of each step

@@ -14,24 +14,30 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import io
 import json
 import multiprocessing
 import os
+import re
 import signal
 import stat
 import sys
+import tempfile
 import threading
 import time
 import unicodedata
 import warnings
+import zipfile
+import zlib
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, TimeoutError, wait
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from datetime import datetime
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pebble import ProcessExpired, ProcessPool
 from tqdm.auto import tqdm
@@ -39,9 +45,9 @@ from tqdm.auto import tqdm
 from coursekit import results
 from coursekit.checks import positive, want
 from coursekit.submission import report
-from coursekit.submission.flags import as_json
-from coursekit.submission.format import NO_TEXT, slug
-from coursekit.submission.recompute import grading_rules
+from coursekit.submission.flags import Roster, as_json, class_table, place_of
+from coursekit.submission.format import DOCUMENTS, MANIFEST, NO_TEXT, TURNING_SIGNS, is_junk, slug
+from coursekit.submission.recompute import LABELS, grading_rules
 from coursekit.words import counted
 
 TIMEOUT_S = 10.0
@@ -53,7 +59,8 @@ HASHED_BYTES = 6 * 2**20  # of a file; larger ones are refused anyway
 
 FAILED = ("timeout", "died", "memory", "error", "lost")  # tried anew by the next run
 CSV, PAGE, PARAGRAPHS = "grades.csv", "index.html", "paragraphs.html"
-STUDENTS, ROWS = "students", ".rows"
+SECOND, OWN_POINTS, FEEDBACK = "second_marker.html", "own_points.csv", "feedback.zip"
+STUDENTS, ROWS, CLASS = "students", ".rows", "class.json"
 ONE_THREAD = {
     f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL", "NUMBA", "BLIS")
 } | {"VECLIB_MAXIMUM_THREADS": "1"}
@@ -93,7 +100,9 @@ class Bundle:
 class Summary:
     """How a batch went: numbers of bundles, and the folder of the report.
 
-    kept: of those, how many were graded by an earlier run. left_out: files that are no .zip.
+    kept: of those, how many were graded by an earlier run. left_out: files that are no bundle.
+    missing: who of the roster handed in nothing. changes: of a regrade, whose points changed, from
+    what, to what, and why.
     """
 
     out: Path
@@ -104,6 +113,8 @@ class Summary:
     kept: int
     left_out: tuple[str, ...]
     seconds: float
+    missing: tuple[str, ...] = ()
+    changes: tuple[tuple[str, ...], ...] = ()
 
     def __str__(self) -> str:
         n = self.graded + self.refused + self.failed
@@ -117,66 +128,114 @@ class Summary:
         if self.kept:
             lines.append(f"{self.kept} of them had been graded before and have not changed.")
         if self.left_out:
-            shown = ", ".join(self.left_out[:5]) + (", ..." if len(self.left_out) > 5 else "")
-            lines.append(f"No bundles, so left out: {counted(len(self.left_out), 'file')}: {shown}")
+            some = f"{counted(len(self.left_out), 'file')}: {_some(self.left_out)}"
+            lines.append(f"No bundles, so left out: {some}")
+        if self.missing:
+            lines.append(f"Missing: {counted(len(self.missing), 'student')}: {_some(self.missing)}")
+        if self.changes:
+            names = [f"{name} ({was} to {now})" for name, was, now, _ in self.changes]
+            lines.append(f"Changed: {counted(len(names), 'student')}: {_some(names)}")
         lines.append(f"Open {self.out / PAGE}; {CSV} beside it goes into a spreadsheet.")
         return "\n".join(lines)
+
+
+def _some(names: Sequence[str]) -> str:
+    """The first five of them."""
+    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
 
 
 # ---- a batch ------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class Choices:
+    """What an instructor chooses for a report.
+
+    roster: a table of the class. late_after: the latest moment that is not late. separator: of the
+    cells of the tables.
+    """
+
+    roster: str | os.PathLike[str] | None = None
+    late_after: datetime | None = None
+    separator: Literal[",", ";"] = ","
+
+
 def grade_folder(
     folder: str | os.PathLike[str],
-    out: str | os.PathLike[str],
+    out: str | os.PathLike[str] | None = None,
     workers: int | None = None,
     timeout_s: float = TIMEOUT_S,
     memory_bytes: int = MEMORY_BYTES,
     progress: bool = True,
     overwrite: bool = False,
+    choices: Choices = Choices(),
 ) -> Summary:
     """Grade every bundle (.zip) in a folder and those below it, and write a report of them.
 
-    out: a folder for the report: new, empty, or one that holds a report. workers: processes,
-    default one a core. timeout_s: for a bundle. memory_bytes: for a process, above its resting
-    size. overwrite: replace a finished report; what was graded and has not changed is not graded
-    again, unless the grader has changed. An unfinished one is gone on with in any case.
+    folder: or the zip that an LMS makes of all that was handed in. out: a folder for the report:
+    new, empty, or one that holds a report; default NAME_report, here. workers: processes,
+    default one a core. timeout_s: for a bundle. memory_bytes: for a process, above
+    its resting size. overwrite: replace a finished report; what was graded and has not changed is
+    not graded again, unless the grader has changed. An unfinished one is gone on with in any case.
     Raises ValueError for a folder that will not do, before any work, Stopped on Ctrl-C, and
     ChildProcessError when no process can be started.
     """
     grading_rules()  # a typing error in rubric.toml is said before anything starts
-    started = time.monotonic()
-    folder, out = Path(folder), Path(out)
+    folder = Path(folder)
+    out = Path(f"{folder.resolve().stem}_report") if out is None else Path(out)
     if workers is None:
         free = getattr(os, "sched_getaffinity", None)  # what this process may use
         workers = len(free(0)) if free else os.cpu_count() or 1
     for name, value in (("workers", workers), ("timeout_s", timeout_s), ("memory", memory_bytes)):
         positive(name, value)
+    roster = Roster(class_table(Path(choices.roster)) if choices.roster else ())
+    _own_points(out / OWN_POINTS)
     _check_out(out, overwrite)
-    paths, left_out = find_bundles(folder, out)
-    bundles = list(_bundles(folder, paths))
+    limits = Limits(workers, timeout_s, memory_bytes)
+    if not folder.is_file():
+        return _grade(folder, out, limits, progress, roster, choices)
+    with tempfile.TemporaryDirectory() as scratch:
+        _unpack(folder, Path(scratch))
+        return _grade(Path(scratch), out, limits, progress, roster, choices, dated=True)
+
+
+def _grade(
+    folder: Path,
+    out: Path,
+    limits: Limits,
+    progress: bool,
+    roster: Roster,
+    choices: Choices,
+    dated: bool = False,
+) -> Summary:
+    """See `grade_folder`. dated: the files' dates are when they were handed in."""
+    started = time.monotonic()
+    if not folder.is_dir():
+        raise ValueError(f"{folder}: there is no such folder; want the one with the bundles in it")
+    want(out.resolve() != folder.resolve(), "out", str(out), "another folder than that of bundles")
+    bundles, left_out, others = find_bundles(folder, out)
     unfinished = [bundle for bundle in bundles if not _is_done(out, bundle)]
     kept = finished = len(bundles) - len(unfinished)
     for part in (out / STUDENTS, out / ROWS):
         part.mkdir(parents=True, exist_ok=True)
-    limits = Limits(workers, timeout_s, memory_bytes)
-    try:
-        with (
-            tqdm(total=len(bundles), initial=kept, unit="bundle", disable=not progress) as bar,
-            _noted_interrupts() as interrupted,
-            contextlib.closing(work_through(unfinished, report.grade_file, limits)) as outcomes,
-        ):
-            for bundle, outcome in outcomes:
-                _store(out, bundle, outcome)  # and not here: a class of any size fits
-                finished += 1
-                bar.update()
-                if interrupted:
-                    raise KeyboardInterrupt
-    except KeyboardInterrupt:
-        many = counted(len(bundles), "bundle")
-        says = f"stopped after {finished} of {many}, which are kept. The same command goes on"
-        raise Stopped(f"{says} from there.") from None
-    done = _finish(out, bundles)
+    with _alone(out):
+        try:
+            with (
+                tqdm(total=len(bundles), initial=kept, unit="bundle", disable=not progress) as bar,
+                _noted_interrupts() as interrupted,
+                contextlib.closing(work_through(unfinished, report.grade_file, limits)) as outcomes,
+            ):
+                for bundle, outcome in outcomes:
+                    _store(out, bundle, outcome, dated)  # and not here: a class of any size fits
+                    finished += 1
+                    bar.update()
+                    if interrupted:
+                        raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            many = counted(len(bundles), "bundle")
+            says = f"stopped after {finished} of {many}, which are kept. The same command goes on"
+            raise Stopped(f"{says} from there.") from None
+        done, changes = _finish(out, bundles, others, roster, choices)
     counts = Counter(_kind(line) for line in done)
     return Summary(
         out,
@@ -187,6 +246,8 @@ def grade_folder(
         kept,
         left_out,
         time.monotonic() - started,
+        tuple(line.name for line in done if line.reason == "missing"),
+        tuple(changes),
     )
 
 
@@ -211,51 +272,123 @@ def _noted_interrupts() -> Iterator[list[int]]:
             signal.signal(signal.SIGINT, before)
 
 
-def find_bundles(folder: Path, out: Path) -> tuple[list[Path], tuple[str, ...]]:
-    """The .zip files in a folder and below in the order of their names, and what else is there.
+def _walk(folder: Path, out: Path) -> Iterator[tuple[Path, str]]:
+    """What lies in a folder and below it in the order of names, with why it is not read, or "".
 
-    Links are not followed, hidden files and reports of ours are not looked at.
+    A folder with a manifest is one thing, an unpacked bundle. Links are not followed; reports of
+    ours, and what a system leaves, are passed over.
+    """
+    ahead = [folder]
+    while ahead:
+        at = ahead.pop()
+        try:
+            entries = sorted(os.scandir(at), key=lambda entry: entry.name)
+        except OSError as error:
+            yield at, f"cannot be read ({error.strerror})"
+            continue
+        if {MANIFEST, *DOCUMENTS} <= {entry.name for entry in entries}:
+            yield at, ""
+            continue
+        below = []
+        for entry in entries:
+            path = Path(entry.path)
+            if entry.is_dir(follow_symlinks=False):
+                if not is_junk(entry.name) and path != out and not (path / ROWS).is_dir():
+                    below.append(path)
+            elif not is_junk(entry.name):
+                yield path, ""
+        ahead += reversed(below)
+
+
+def find_bundles(folder: Path, out: Path) -> tuple[list[Bundle], tuple[str, ...], list[Graded]]:
+    """The bundles in a folder and below it; the other files; and lines for what cannot be read.
+
+    A bundle is a .zip, whatever a browser adds to that, one without an ending, or an unpacked one.
+    Whoever has a folder of their own, and no bundle in it, has a line, too.
     Raises ValueError for no folder, or one without a bundle.
     """
-    if not folder.is_dir():
-        raise ValueError(f"{folder}: there is no such folder; want the one with the bundles in it")
-    want(out.resolve() != folder.resolve(), "out", str(out), "another folder than that of bundles")
-    found: list[Path] = []
-    others: list[Path] = []
-    for parent, folders, names in os.walk(folder):
-        at = Path(parent)
-        folders[:] = [name for name in folders if not name.startswith((".", "__MACOSX"))]
-        folders[:] = [name for name in folders if (at / name).resolve() != out.resolve()]
-        folders[:] = [name for name in folders if not _is_report(at / name)]
-        for name in names:
-            if not name.startswith("."):
-                (found if name.lower().endswith(".zip") else others).append(at / name)
+    found: list[Bundle] = []
+    others: list[str] = []
+    lines: list[Graded] = []
+    seen: Counter[str] = Counter()
+    for path, why in _walk(folder, out.resolve()):
+        raw = path.relative_to(folder).as_posix()
+        name = printable(raw if raw != "." else folder.name)
+        seen[name] += 1
+        name = name if seen[name] == 1 else f"{name} ({seen[name]})"
+        if why:
+            lines.append((report.not_graded(name, "unreadable", f"The folder {why}."), ""))
+        elif (
+            (path.is_dir() and not path.is_symlink())
+            or ".zip" in path.name.lower()
+            or _holds_a_bundle(path)
+        ):
+            found.append(Bundle(path, name, _key(path, raw)))
+        else:
+            others.append(name)
     if not found:
         there = f", only {counted(len(others), 'other file')}" if others else " or below it"
         raise ValueError(
             f"{folder}: there is no bundle (.zip) in it{there}; "
             "want the folder with what students handed in"
         )
-    return (
-        sorted(found, key=lambda path: path.relative_to(folder).as_posix()),
-        tuple(sorted(printable(path.relative_to(folder).as_posix()) for path in others)),
-    )
+    handed = {_whose(bundle.name) for bundle in found}
+    alone: dict[str, list[str]] = {}
+    for name in others:
+        if _whose(name) not in handed | {""}:
+            alone.setdefault(_whose(name), []).append(name)
+    for names in alone.values():
+        says = f"There is no bundle, only {', '.join(names[:5])}. Ask for the .zip."
+        lines.append((report.not_graded(names[0], "no_bundle", says), ""))
+    return found, tuple(others), lines
 
 
-def _bundles(folder: Path, paths: Iterable[Path]) -> Iterator[Bundle]:
-    """The files with a name each that can be written anywhere and is there once."""
-    seen: Counter[str] = Counter()
-    for path in paths:
-        raw = path.relative_to(folder).as_posix()
-        name = printable(raw)
-        seen[name] += 1
-        yield Bundle(path, name if seen[name] == 1 else f"{name} ({seen[name]})", _key(path, raw))
+def _whose(name: str) -> str:
+    """What tells whose a file is without a look inside: the LMS's number, or the first folder."""
+    at = place_of(name)
+    return f"{at.lms} {at.id}" if at.lms else name.partition("/")[0] * ("/" in name)
+
+
+def _holds_a_bundle(path: Path) -> bool:
+    """Whether a file without the ending .zip is a zip with a manifest in it."""
+    try:
+        if path.is_symlink() or not path.is_file():
+            return False
+        with path.open("rb") as file:
+            return file.read(4) == b"PK\3\4" and MANIFEST.encode() in file.read(HASHED_BYTES)
+    except OSError:
+        return False
+
+
+def _unpack(archive: Path, into: Path) -> None:
+    """The files of an LMS's zip, with its dates; no path leads out, and no more than a bundle's
+    size is unpacked of any. Raises ValueError for what is no zip.
+    """
+    try:
+        with zipfile.ZipFile(archive) as packed:
+            for member in packed.infolist():
+                plain = re.sub(r'[<>:"|?*\\\x00-\x1f]', "_", member.filename)
+                parts = [part[:150] for part in plain.split("/") if part.strip(". ")]
+                target = into.joinpath(*parts)
+                if member.is_dir() or is_junk(member.filename):
+                    continue
+                target.parent.mkdir(parents=True, exist_ok=True)
+                with packed.open(member) as file:
+                    target.write_bytes(file.read(HASHED_BYTES))
+                with contextlib.suppress(ValueError, OverflowError, OSError):
+                    then = datetime(*member.date_time).timestamp()
+                    os.utime(target, (then, then))
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, OSError) as error:
+        says = f"{archive.name}: cannot be unpacked ({error}); download it again"
+        raise ValueError(says) from None
 
 
 def _key(path: Path, name: str) -> str:
     """What a line is kept under: the file's name and content, and the version of the grader."""
     hashed = hashlib.sha256(f"{grader_version()}\0{name}\0".encode(errors="surrogateescape"))
     with contextlib.suppress(OSError):  # its line will say so
+        for part in sorted(path.iterdir()) if path.is_dir() and not path.is_symlink() else ():
+            hashed.update(f"{part.name}\0{_key(part, part.name)}".encode(errors="replace"))
         about = path.lstat()
         hashed.update(f"{about.st_mode}\0{about.st_size}\0".encode())
         if stat.S_ISREG(about.st_mode) and about.st_size <= HASHED_BYTES:
@@ -277,7 +410,8 @@ def grader_version() -> str:
 def printable(text: str) -> str:
     """A file's name as text that can be written anywhere: no control characters, no surrogates."""
     clean = text.encode("utf-8", "replace").decode()
-    return "".join("?" if unicodedata.category(c) in NO_TEXT else c for c in clean)
+    bad = {c for c in clean if c in TURNING_SIGNS or unicodedata.category(c) in NO_TEXT}
+    return "".join("?" if c in bad else c for c in clean)
 
 
 # ---- the pool -----------------------------------------------------------------------------------
@@ -452,16 +586,16 @@ def limit_memory(more_bytes: int) -> None:
 
 
 def _check_out(out: Path, overwrite: bool) -> None:
-    """ValueError unless the folder can take a report without harm to anything else."""
+    """ValueError unless the folder is empty, or a report: then whatever else is in it stays."""
     if out.is_symlink() or (out.exists() and not out.is_dir()):
         raise ValueError(f"out: {out} is no folder; want a new or empty one")
     if not out.exists():
         return
-    for entry in sorted(out.iterdir()):
-        if not _is_ours(entry):
-            raise ValueError(
-                f"out: {out} holds {entry.name}, which no report does; want a new or empty folder"
-            )
+    others = [entry.name for entry in out.iterdir() if not is_junk(entry.name)]
+    if others and not (out / ROWS).is_dir():
+        raise ValueError(
+            f"out: {out} holds {min(others)}, and is no report; want a new or empty folder"
+        )
     if (out / CSV).exists() and not overwrite:
         raise ValueError(
             f"out: {out} holds a finished report already: choose another folder, or overwrite it "
@@ -469,28 +603,23 @@ def _check_out(out: Path, overwrite: bool) -> None:
         )
 
 
-def _is_ours(entry: Path) -> bool:
-    """Whether a report writes such a file or folder, with nothing else in it."""
-    if entry.is_symlink():
-        return False
-    if entry.is_dir():
-        ending = {STUDENTS: ".html", ROWS: ".json"}.get(entry.name)
-        return ending is not None and all(
-            child.name.endswith((ending, ".part")) and child.is_file() and not child.is_symlink()
-            for child in entry.iterdir()
-        )
-    starts = tuple(f".{name}." for name in (CSV, PAGE, PARAGRAPHS))
-    unfinished = entry.name.endswith(".part") and entry.name.startswith(starts)
-    return entry.name in (CSV, PAGE, PARAGRAPHS) or unfinished
+@contextlib.contextmanager
+def _alone(out: Path) -> Iterator[None]:
+    """One grader at a time in a report. The system frees the lock when its holder ends."""
+    with (out / ROWS / "lock").open("a+b") as file:
+        try:
+            if sys.platform == "win32":
+                import msvcrt
 
+                file.seek(0)
+                msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+            else:
+                import fcntl
 
-def _is_report(folder: Path) -> bool:
-    """Whether a folder is a report of an earlier run, with nothing else in it."""
-    try:
-        begun = (folder / ROWS).is_dir() or ((folder / CSV).exists() and (folder / PAGE).exists())
-        return begun and all(_is_ours(entry) for entry in folder.iterdir())
-    except OSError:
-        return False
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise ValueError(f"out: another `coursekit grade` is writing to {out}") from None
+        yield
 
 
 def _load(out: Path, bundle: Bundle) -> report.ReportLine | None:
@@ -511,34 +640,130 @@ def _is_done(out: Path, bundle: Bundle) -> bool:
     return not line.page or (out / line.page).exists()
 
 
-def _store(out: Path, bundle: Bundle, outcome: Graded) -> None:
+def _store(out: Path, bundle: Bundle, outcome: Graded, dated: bool = False) -> None:
     """Keep a finished bundle: its page first, so that a line never lacks it."""
     line, page = outcome
+    line = replace(line, handed_in=_dated(bundle.path) if dated else "")
     if page:
         results.write_bytes(out / bundle.page, page.encode())
     results.write_bytes(out / ROWS / f"{bundle.key}.json", as_json(line).encode())
 
 
-def _finish(out: Path, bundles: list[Bundle]) -> list[report.ReportLine]:
-    """Write what takes the whole class; returns the lines with what they share."""
+def _finish(
+    out: Path, bundles: list[Bundle], others: Sequence[Graded], roster: Roster, how: Choices
+) -> tuple[list[report.ReportLine], list[tuple[str, ...]]]:
+    """Write what takes the whole class; returns the lines with what they share, and changes."""
     gone = "What was kept of it is gone. Run the same command again."
-    lines = report.across(
-        [_load(out, bundle) or report.not_graded(bundle.name, "lost", gone) for bundle in bundles]
-    )
-    pages = {bundle.page for bundle in bundles}
-    results.write_bytes(out / PARAGRAPHS, report.paragraphs_page(lines).encode())
-    results.write_bytes(out / PAGE, report.class_page(lines).encode())
-    results.write_bytes(
-        out / CSV, report.grades_csv(lines).encode("utf-8-sig")
-    )  # so spreadsheets see ë
-    for path in (out / STUDENTS).iterdir():
-        if f"{STUDENTS}/{path.name}" not in pages:
+    each = [_load(out, b) or report.not_graded(b.name, "lost", gone) for b in bundles]
+    each += [line for line, _ in others]
+    own = _own_points(out / OWN_POINTS)
+    lines = report.across(each, roster, how.late_after, own)
+    state = {line.who: [line.name or line.student, *_state(line)] for line in lines if line.counts}
+    changes = list(_changes(_json(out / ROWS / CLASS), state))
+    table = report.grades_csv(lines, how.separator)
+    texts = {
+        PARAGRAPHS: report.paragraphs_page(lines),
+        SECOND: report.paragraphs_page(lines, named=False),
+        PAGE: report.class_page(lines, changes),
+        CSV: table,
+        **report.exports(lines, how.separator),
+        f"{ROWS}/{CLASS}": json.dumps({"csv": _digest(table), "state": state}),
+    }
+    before = _json(out / ROWS / CLASS).get("csv")
+    with contextlib.suppress(OSError):
+        edited = (out / CSV).read_bytes()
+        if before and _digest(edited.decode("utf-8-sig", "replace")) != before:
+            results.write_bytes(out / f"grades_edited_{_digest(str(edited))[:6]}.csv", edited)
+    if not (out / OWN_POINTS).exists():
+        texts[OWN_POINTS] = report.own_table(lines, how.separator)
+    for name, text in texts.items():
+        code = "utf-8-sig" if name.endswith(".csv") else "utf-8"  # so spreadsheets see ë
+        results.write_bytes(out / name, text.encode(code))
+    _write_feedback(out, lines)
+    pages, keys = {bundle.page for bundle in bundles}, {bundle.key for bundle in bundles}
+    for path in (out / STUDENTS).glob("*.html"):
+        if re.search(r"_[0-9a-f]{12}$", path.stem) and f"{STUDENTS}/{path.name}" not in pages:
             path.unlink()  # of a bundle that is no more, or an older grader
-    return lines
+    for path in (out / ROWS).glob("*.json"):
+        if re.fullmatch(r"[0-9a-f]{64}", path.stem) and path.stem not in keys:
+            path.unlink()
+    return lines, changes
+
+
+def _write_feedback(out: Path, lines: Sequence[report.ReportLine]) -> None:
+    """The pages of those bundles that count in a zip that Moodle or Canvas gives back."""
+    buffer, seen = io.BytesIO(), set[str]()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as packed:
+        for line in lines:
+            name = place_of(line.file).feedback
+            if line.counts and line.page and name not in seen:
+                seen.add(name)
+                page = (out / line.page).read_bytes()
+                packed.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), page)
+    results.write_bytes(out / FEEDBACK, buffer.getvalue())
+
+
+def _own_points(path: Path) -> dict[str, dict[str, str]]:
+    """The instructor's own points, by person; none if there is no such file. Raises ValueError."""
+    found = {}
+    for row in class_table(path) if path.exists() else ():
+        for column in ("paragraph", "late", "overrule"):
+            try:
+                report.number_of(row.get(column, ""))
+            except ValueError:
+                raise ValueError(
+                    f"{path.name}: {row.get('student')}: {column}: got {row[column]!r}, want points"
+                ) from None
+        found[row.get("who", "").removeprefix("'")] = row
+    return found
+
+
+def _state(line: report.ReportLine) -> list[Any]:
+    """What a regrade compares: points in all, by topic, and what was graded."""
+    topics: dict[str, float] = {}
+    for item in line.items:
+        topics[item.topic] = round(topics.get(item.topic, 0.0) + item.points, 2)
+    return [line.total, topics, line.file, line.made]
+
+
+def _changes(before: dict[str, Any], state: dict[str, Any]) -> Iterator[tuple[str, ...]]:
+    """Whose points changed since the last report: name, from, to, why."""
+    for who, (name, total, topics, *bundle) in state.items():
+        was = before.get("state", {}).get(who)
+        if was is None or was[1] == total:
+            continue
+        why = [
+            f"{LABELS[topic]} {was[2].get(topic, 0):g} to {points:g}"
+            for topic, points in topics.items()
+            if was[2].get(topic, 0) != points
+        ]
+        reason = "the rubric or the grader changed" if why else "your own points changed"
+        if list(bundle) != was[3:]:
+            reason = "another bundle counts"
+        points = ("-" if value is None else f"{value:g}" for value in (was[1], total))
+        yield name, *points, "; ".join([reason, *why])
+
+
+def _json(path: Path) -> dict[str, Any]:
+    """An object that is kept; empty if it is not there, or damaged."""
+    with contextlib.suppress(OSError, ValueError):
+        found = json.loads(path.read_bytes())
+        return found if isinstance(found, dict) else {}
+    return {}
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _dated(path: Path) -> str:
+    """When a file was handed in, by its date."""
+    path = path / MANIFEST if path.is_dir() else path
+    return datetime.fromtimestamp(path.stat().st_mtime).isoformat(timespec="seconds")
 
 
 def _kind(line: report.ReportLine) -> str:
-    """What the summary counts a line as: graded, refused or failed."""
-    if line.points is not None:
-        return "graded"
+    """What the summary counts a line as: graded, refused, failed or missing."""
+    if line.points is not None or line.reason == "missing":
+        return "graded" if line.reason != "missing" else "missing"
     return "failed" if line.reason in FAILED else "refused"

@@ -6,32 +6,51 @@ A flag takes no points. It says what was seen, and what else could explain it.
 from __future__ import annotations
 
 import base64
+import contextlib
+import csv
 import hashlib
+import io
 import json
 import math
 import re
 import unicodedata
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from coursekit import specifications
-from coursekit.arrays import Bools, Floats, NDArray
+from coursekit.arrays import Floats, NDArray
+from coursekit.checks import want
 from coursekit.submission.format import CameraFacts, Stack, Submission
 from coursekit.submission.recompute import SEEN, Recomputed, grading_rules
 
-TILES = 6  # a side of the grid on which the noise of a frame is remembered
-PATTERN_LIKENESS = 0.8  # correlation of two time means on that grid
-FRAME_LIKENESS = 0.85  # of two frames' noise
+LARGEST_WAVE = 6  # so many of them across a window; finer ones hold what was added
+N_WAVES = (
+    27  # numbers in a spectrum: pairs of 0 to 6 waves down and across, in any order, but (0, 0)
+)
+FRAME_LIKENESS = (
+    0.8  # of two frames' spectra; strangers' 8th best of 12 reaches 0.74 in a small window
+)
+COMPARED, MOST_FRAMES = 150_000, 40_000  # pairs of stacks in all, and frames for each, at most
 FRAMES_ASKED = 12  # frames of a stack that are looked for in others
-FRAMES_FOUND = 8  # of these, for the stacks to be the same measurement
-CLIPPED_AT = 4.0  # times what is typical: a few changed values must not hide a copy
+FRAMES_FOUND = 9  # of these, for the stacks to be the same measurement
 PERFECT_CLOCK_S = 1e-8  # no real clock keeps step so well
 WORDS_IN_A_ROW = 3  # words in a row, by which paragraphs are compared
+MOODLE = re.compile(
+    r"(?:^|/)(?P<at>(?P<name>[^/]+?)_(?P<id>\d+)_assignsubmission_(?:file|onlinetext)_?)"
+)
+CANVAS = re.compile(r"(?:^|/)(?P<name>[^/_]+)(?P<late>_LATE)?_(?P<id>\d{2,})_\d{2,}_[^/]+$")
+NAME_COLUMNS = ("name", "full name", "student", "student name")  # columns of a roster
+FIRST_AND_LAST = ("first name", "last name", "surname")
+IDS = (
+    *("id", "identifier", "student id", "id number", "number", "sis user id", "sis login id"),
+    *("login", "username", "email", "email address", "e-mail"),
+)
 SHARED_RUNS = 0.7  # part of the runs of the shorter of two paragraphs that the other one has too
 
 
@@ -209,7 +228,7 @@ def _one_stack_twice(prints: Sequence[StackPrint]) -> Iterator[Flag]:
     """Whether one distance was made out of another."""
     for i, one in enumerate(prints):
         for two in prints[:i]:
-            alike = max(_shared(one, two)[0], _shared(two, one)[0])
+            alike = max(_shared(one, [two])[0][0], _shared(two, [one])[0][0])
             if one.digest == two.digest or alike >= FRAMES_FOUND:
                 yield _flag("one_stack_twice", one=two.distance_m, two=one.distance_m)
 
@@ -219,16 +238,16 @@ def _one_stack_twice(prints: Sequence[StackPrint]) -> Iterator[Flag]:
 
 @dataclass(frozen=True, eq=False)
 class StackPrint:
-    """What is remembered of a stack.
+    """What is remembered of a stack: spectra of its noise, which do not change when all frames are
+    mirrored, turned or rolled, or a constant is added.
 
-    digest: of its bytes. pattern (36,): the mean over time on a grid of TILES^2, without its plane.
-    frames (N, 36): of each frame what is not in the mean, without what all tiles share. Each is
-    scaled to a largest value of 127; a constant, a scale and the order of frames do not matter.
+    digest: of its bytes. level (27,): the mean spectrum. frames (N, 27): of each frame what
+    is not in that, scaled to a largest value of 127. The order of frames does not matter.
     """
 
     distance_m: float
     digest: str
-    pattern: NDArray[np.int8]
+    level: tuple[float, ...]
     frames: NDArray[np.int8]
 
 
@@ -249,10 +268,10 @@ class Fingerprint:
         """The fingerprint whose JSON `as_json` made."""
 
         def rows(text: str) -> NDArray[np.int8]:
-            return np.frombuffer(base64.b64decode(text), np.int8).reshape(-1, TILES**2)
+            return np.frombuffer(base64.b64decode(text), np.int8).reshape(-1, N_WAVES)
 
         stacks = tuple(
-            StackPrint(s["distance_m"], s["digest"], rows(s["pattern"])[0], rows(s["frames"]))
+            StackPrint(s["distance_m"], s["digest"], tuple(s["level"]), rows(s["frames"]))
             for s in data["stacks"]
         )
         return cls(**{**data, "stacks": stacks})
@@ -288,171 +307,284 @@ def fingerprint(submission: Submission) -> Fingerprint:
 
 
 def _stack_print(stack: Stack) -> StackPrint:
-    """What is remembered of a stack; see `StackPrint`.
+    """What is remembered of a stack; see `StackPrint`. A window that is too small has no frames.
 
-    Values far from the typical deviation are clipped twice, so that a few changed ones neither
-    move the mean nor stand out. A window of fewer pixels than the grid has blank prints.
+    Values far from a frame's median are clipped, so that a few changed ones do not stand out.
     """
-    counts = stack.counts
-    n, height, width = counts.shape
-    digest = hashlib.blake2b(
-        repr(counts.shape).encode() + np.ascontiguousarray(counts).tobytes(), digest_size=16
-    ).hexdigest()
-    blank = np.zeros(TILES**2, np.int8)
-    if min(height, width) < TILES:
-        return StackPrint(stack.distance_m, digest, blank, np.zeros((0, TILES**2), np.int8))
+    counts = np.ascontiguousarray(stack.counts)
+    _, height, width = counts.shape
+    digest = hashlib.blake2b(repr(counts.shape).encode() + counts.tobytes(), digest_size=16)
+    if min(height, width) <= 2 * LARGEST_WAVE:
+        return StackPrint(stack.distance_m, digest.hexdigest(), (), np.zeros((0, N_WAVES), np.int8))
     valid = counts > 0
-    seen = valid.sum(axis=0)
-    mean = counts.sum(axis=0) / np.maximum(seen, 1)
-    deviation = (counts - mean.astype(np.float32)) * valid
-    few = np.abs(deviation[:: max(1, n // 16)])
-    scale = max(float(np.sqrt(np.square(few).mean())), 1e-9)
-    scale = max(float(np.sqrt(np.square(np.minimum(few, 3 * scale)).mean())), 0.25)
-    clipped = np.clip(deviation, -CLIPPED_AT * scale, CLIPPED_AT * scale)
-    mean = mean + clipped.sum(axis=0) / np.maximum(seen, 1)  # a wild value no longer moves it
-    deviation = np.clip(
-        (counts - mean.astype(np.float32)) * valid, -CLIPPED_AT * scale, CLIPPED_AT * scale
-    )
-    tiles = _tiles(deviation)
-    tiles -= tiles.mean(axis=1, keepdims=True)
-    return StackPrint(stack.distance_m, digest, _bytes(_pattern(mean, seen > 0)), _bytes(tiles))
-
-
-def _pattern(mean: Floats, known: Bools) -> Floats:
-    """A mean image (h, w) without its plane, on the grid (36,); a hole counts as on the plane."""
-    if known.sum() < 12:
-        return np.zeros(TILES**2)
-    rows, columns = np.indices(mean.shape) - 0.5 * np.array(mean.shape)[:, None, None]
-    design = np.stack([np.ones(mean.shape), columns, rows], axis=-1)
-    residual = np.zeros(mean.shape)
-    use = known
-    for _ in range(2):
-        plane = np.linalg.lstsq(design[use], mean[use], rcond=None)[0]
-        residual = np.where(known, mean - design @ plane, 0.0)
-        size = np.abs(residual)
-        use = known & (size <= max(5 * float(np.median(size[known])), 0.5))
-        if use.sum() < 12:
-            break
-    limit = 5 * max(float(np.median(np.abs(residual[known]))), 0.1)
-    return np.asarray(_tiles(np.clip(residual, -limit, limit)[None])[0], np.float64)
-
-
-def _tiles(images: NDArray[Any]) -> NDArray[Any]:
-    """Images (N, h, w) averaged over TILES x TILES parts: (N, 36)."""
-    n, height, width = images.shape
-    down, across = (_averaging(size).astype(images.dtype) for size in (height, width))
-    return np.asarray(down.T @ images @ across).reshape(n, TILES**2)
-
-
-@lru_cache(maxsize=128)
-def _averaging(size: int) -> Floats:
-    """(size, TILES): column t averages part t of `size` samples."""
-    part = np.arange(size) * TILES // size
-    member = (part[:, None] == np.arange(TILES)).astype(np.float64)
-    return member / member.sum(axis=0)
+    mean = counts.sum(axis=0) / np.maximum(valid.sum(axis=0), 1)
+    off = (counts - mean.astype(np.float32)) * valid
+    most = np.maximum(6 * np.median(np.abs(off), axis=(1, 2), keepdims=True), 3)
+    off = np.clip(off, -most, most)
+    waves = np.arange(-LARGEST_WAVE, LARGEST_WAVE + 1)
+    power = np.abs(np.fft.fft2(off - off.mean(axis=(1, 2), keepdims=True))) ** 2
+    power = power[:, waves[:, None] % height, waves % width]
+    power = power + power[:, ::-1]
+    power = power + power.transpose(0, 2, 1)
+    down, across = np.triu_indices(LARGEST_WAVE + 1)
+    spectra = power[:, LARGEST_WAVE + down[1:], LARGEST_WAVE + across[1:]] ** 0.25
+    level = spectra.mean(axis=0)
+    rounded = tuple(round(float(value), 3) for value in level)
+    return StackPrint(stack.distance_m, digest.hexdigest(), rounded, _bytes(spectra - level))
 
 
 def _bytes(values: NDArray[Any]) -> NDArray[np.int8]:
-    """Rows (..., 36) scaled so that the largest value of each is 127; rows of zeros stay."""
+    """Rows scaled so that the largest value of each is 127; rows of zeros stay."""
     largest = np.abs(values).max(axis=-1, keepdims=True)
     return np.rint(127 * values / np.where(largest > 1e-6, largest, np.inf)).astype(np.int8)
 
 
 def _unit(values: NDArray[np.int8]) -> NDArray[np.float32]:
-    """Rows (..., 36) of length 1; rows of zeros stay."""
+    """Rows of length 1; rows of zeros stay."""
     rows = values.astype(np.float32)
     length = np.sqrt(np.square(rows).sum(axis=-1, keepdims=True))
     return np.asarray(rows / np.where(length > 0, length, 1.0), np.float32)
 
 
-def _queries(frames: NDArray[np.int8]) -> NDArray[np.int8]:
-    """Up to FRAMES_ASKED frames, evenly spread."""
-    n = len(frames)
-    return frames[np.linspace(0, n - 1, min(n, FRAMES_ASKED)).round().astype(int)]
-
-
-def _shared(one: StackPrint, two: StackPrint) -> tuple[int, bool]:
-    """How many of some frames of `one` are in `two`, and whether they are exactly the same."""
-    ask = _queries(one.frames)
-    if len(ask) < FRAMES_FOUND or len(two.frames) < FRAMES_FOUND:
-        return 0, False
-    likeness = _unit(ask) @ _unit(two.frames).T
-    hits = np.flatnonzero(likeness.max(axis=1) >= FRAME_LIKENESS)
-    same = len(hits) and (two.frames[likeness[hits].argmax(axis=1)] == ask[hits]).all()
-    return len(hits), bool(same)
+def _shared(one: StackPrint, others: Sequence[StackPrint]) -> list[tuple[int, bool]]:
+    """How many of some frames of `one` are in each of the others, and whether exactly."""
+    n = len(one.frames)
+    if n < FRAMES_FOUND or not others:
+        return [(0, False)] * len(others)
+    ask = one.frames[np.linspace(0, n - 1, min(n, FRAMES_ASKED)).round().astype(int)]
+    every = np.concatenate([other.frames for other in others])
+    ends = np.cumsum([len(other.frames) for other in others])
+    likeness = _unit(ask) @ _unit(every).T
+    found = []
+    for end, other in zip(ends, others, strict=True):
+        part = likeness[:, end - len(other.frames) : end]
+        hits = np.flatnonzero(part.max(axis=1, initial=0) >= FRAME_LIKENESS)
+        same = len(hits) and (other.frames[part[hits].argmax(axis=1)] == ask[hits]).all()
+        found.append((len(hits), bool(same)))
+    return found
 
 
 def copies(prints: Mapping[str, Fingerprint]) -> list[Copy]:
-    """Bundles whose raw data are identical or nearly so, by the keys of `prints`.
+    """Bundles whose raw data are identical or nearly so, by their keys: one `Copy` a group.
 
-    Found whatever the order and number of the frames, with a few values changed, a constant added,
-    or noise of +-1 count. Identical ones make one `Copy` together, nearly identical ones one a
-    pair; of several identical bundles the first is compared further, for all of them.
+    Found whatever the order and number of the frames, mirrored, turned, transposed or rolled, with
+    a constant or a little noise added, rescaled, a few values changed. In a large class a stack is
+    compared with those of the nearest level, so that the work is bounded.
     """
-    groups: dict[tuple[str, ...], list[str]] = {}
-    for key, prints_of_one in prints.items():
-        digests = tuple(sorted(stack.digest for stack in prints_of_one.stacks))
-        groups.setdefault(digests or (key,), []).append(key)
-    found = []
-    for keys in groups.values():
-        if len(keys) > 1:
-            many = f"{len(keys)} bundles have" if len(keys) > 2 else "Two bundles have"
-            says = f"{many} the same raw depths, byte for byte"
-            found.append(_copy(keys, "identical", says, _innocent(keys, prints, True)))
-    return found + _nearly({keys[0]: tuple(keys) for keys in groups.values()}, prints)
-
-
-def _copy(keys: Sequence[str], code: str, says: str, innocent: str) -> Copy:
-    """innocent: why they may well be the same, or nothing."""
-    return Copy(tuple(keys), code, f"{says}{': ' * bool(innocent)}{innocent}.", bool(innocent))
-
-
-def _innocent(keys: Sequence[str], prints: Mapping[str, Fingerprint], exact: bool) -> str:
-    """Why they may well be the same; empty where nothing says so."""
-    some = [prints[key] for key in keys]
-    if len({person(p.student) for p in some}) == 1:
-        return "they are of one student"
-    if exact and {p.source for p in some} == {"simulated"} and len({p.camera for p in some}) == 1:
-        return f"{some[0].camera} gives everybody the same"
-    return ""
-
-
-def _nearly(groups: Mapping[str, tuple[str, ...]], prints: Mapping[str, Fingerprint]) -> list[Copy]:
-    """Pairs of bundles with frames in common; groups: those that are identical, by the first."""
-    stacks = [(key, stack) for key in groups for stack in prints[key].stacks if len(stack.frames)]
-    if len(stacks) < 2:
-        return []
-    patterns = _unit(np.array([stack.pattern for _, stack in stacks]))
-    found: dict[tuple[str, str], dict[float, tuple[int, bool]]] = {}
-    rank = {key: i for i, key in enumerate(groups)}
+    stacks = [(k, s) for k, p in prints.items() for s in p.stacks if len(s.frames) >= FRAMES_FOUND]
+    levels = np.array([stack.level for _, stack in stacks]).reshape(len(stacks), N_WAVES)
+    pairs: dict[tuple[str, str], dict[float, tuple[int, bool]]] = {}
+    first: dict[tuple[str, ...], str] = {}
+    for key, fingerprint_of in prints.items():
+        digests = tuple(sorted(stack.digest for stack in fingerprint_of.stacks))
+        if digests and first.setdefault(digests, key) != key:
+            pairs[first[digests], key] = {s.distance_m: (12, True) for s in fingerprint_of.stacks}
+    alone = {*first.values()}
     for i, (key, stack) in enumerate(stacks):
-        for j in np.flatnonzero(patterns @ patterns[i] > PATTERN_LIKENESS):
-            other, its_stack = stacks[j]
-            number, exact = (0, False) if other == key else _shared(stack, its_stack)
-            if number >= FRAMES_FOUND:
-                pair = (key, other) if rank[key] < rank[other] else (other, key)
-                part = found.setdefault(pair, {})
-                before = part.get(stack.distance_m, (0, False))
-                now = (number, exact or stack.digest == its_stack.digest)
-                part[stack.distance_m] = max(before, now)
-    copies_found = []
-    for (one, two), part in found.items():
-        keys, exact = groups[one] + groups[two], all(same for _, same in part.values())
-        where = " and ".join(f"{z:.2f} m" for z in sorted(part))
-        share = sum(number for number, _ in part.values()) / (FRAMES_ASKED * len(part))
+        if key not in alone:
+            continue
+        order = np.argsort(np.abs(levels - levels[i]).sum(axis=1))
+        near = [stacks[j] for j in order if stacks[j][0] != key and stacks[j][0] in alone]
+        near = near[: max(24, COMPARED // len(stacks))]
+        frames = np.cumsum([len(its.frames) for _, its in near])
+        near = near[: 1 + int(np.searchsorted(frames, MOST_FRAMES))]
+        for (other, _), found in zip(near, _shared(stack, [s for _, s in near]), strict=True):
+            if found[0] >= FRAMES_FOUND:
+                part = pairs.setdefault((min(key, other), max(key, other)), {})
+                part[stack.distance_m] = max(found, part.get(stack.distance_m, found))
+    return [_copy(keys, pairs, prints) for keys in _groups(list(prints), list(pairs))]
+
+
+def _groups(keys: Sequence[Any], pairs: Sequence[tuple[Any, Any]]) -> list[list[Any]]:
+    """The keys that pairs connect, in groups of two or more."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    number = {key: i for i, key in enumerate(keys)}
+    one, two = np.array([(number[a], number[b]) for a, b in pairs], int).reshape(-1, 2).T
+    graph = coo_array((np.ones(len(one)), (one, two)), shape=(len(keys), len(keys)))
+    groups: dict[int, list[Any]] = {}
+    for key, label in zip(keys, connected_components(graph, directed=False)[1], strict=True):
+        groups.setdefault(int(label), []).append(key)
+    return [group for group in groups.values() if len(group) > 1]
+
+
+def _copy(
+    keys: Sequence[str],
+    pairs: Mapping[tuple[str, str], Mapping[float, tuple[int, bool]]],
+    prints: Mapping[str, Fingerprint],
+) -> Copy:
+    """What is said of a group: how much the same they are, and why that may be by right."""
+    some = [prints[key] for key in keys]
+    parts = [found for pair, part in pairs.items() if pair[0] in keys for found in part.items()]
+    digests = {tuple(sorted(stack.digest for stack in one.stacks)) for one in some}
+    exact = all(same for _, (_, same) in parts)
+    many = f"{len(keys)} bundles have" if len(keys) > 2 else "Two bundles have"
+    if len(digests) == 1:
+        code, says = "identical", f"{many} the same raw depths, byte for byte"
+    else:
+        where = " and ".join(f"{z:.2f} m" for z in sorted({z for z, _ in parts}))
+        share = sum(n for _, (n, _) in parts) / (FRAMES_ASKED * len(parts))
         kind = "the same" if exact else "nearly the same"
-        says = f"The frames at {where} are {kind} ({min(share, 1):.0%} of those looked for were"
-        innocent = _innocent(keys, prints, exact)
-        copies_found.append(_copy(keys, "nearly_identical", f"{says} found)", innocent))
-    return copies_found
+        says = f"{many} {kind} frames at {where} ({min(share, 1):.0%} of those looked for)"
+        code = "nearly_identical"
+    innocent = ""
+    if len({person(one.student) for one in some}) == 1:
+        innocent = ": they are of one student"
+    elif (
+        exact
+        and {one.source for one in some} == {"simulated"}
+        and len({one.camera for one in some}) == 1
+    ):
+        innocent = f": {some[0].camera} gives everybody the same"
+    return Copy(tuple(keys), code, f"{says}{innocent}.", bool(innocent))
 
 
-# --- who shares words -----------------------------------------------------------------------
+# --- who is who -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Place:
+    """What the name of a file says that Moodle or Canvas made; all but `feedback` empty elsewhere.
+
+    feedback: the name of a student's page in a zip that the same LMS takes back.
+    """
+
+    feedback: str
+    lms: str = ""
+    name: str = ""
+    id: str = ""
+    late: bool = False
+
+
+def place_of(file: str) -> Place:
+    """Whose a file is by its name.
+
+    >>> place_of("Ada Lovelace_17_assignsubmission_file_/studio_1.zip")
+    Place(feedback='Ada Lovelace_17_assignsubmission_file_/feedback.html', lms='Moodle', \
+name='Ada Lovelace', id='17', late=False)
+    >>> place_of("lovelaceada_LATE_1234_56789_studio_1.zip").feedback
+    'lovelaceada_LATE_1234_56789_studio_1.html'
+    """
+    if found := MOODLE.search(file):
+        within = "/" * file[found.end() :].startswith("/")
+        return Place(f"{found['at']}{within}feedback.html", "Moodle", found["name"], found["id"])
+    stem = file.rpartition("/")[2].rpartition(".")[0] or file.rpartition("/")[2]
+    if found := CANVAS.search(file):
+        return Place(f"{stem}.html", "Canvas", found["name"], found["id"], bool(found["late"]))
+    return Place(f"{stem}.html")
+
+
+def words_of(name: str) -> list[str]:
+    """The words of a name; case, accents and signs without a width do not matter."""
+    plain = unicodedata.normalize("NFKD", unicodedata.normalize("NFKD", name).casefold())
+    kept = "".join(sign for sign in plain if unicodedata.category(sign) not in ("Mn", "Cf"))
+    return re.findall(r"[^\W_]+", kept)
+
+
+def spellings(name: str) -> set[str]:
+    """A name as one word, beginning with any of its words: "Lovelace, Ada" is "Ada Lovelace"."""
+    words = words_of(name)
+    return {"".join(words[i:] + words[:i]) for i in range(len(words))}
 
 
 def person(name: str) -> str:
-    """A student's name for telling whether two are one: case and spaces do not matter."""
-    return " ".join(unicodedata.normalize("NFKC", name).casefold().split())
+    """A name for telling whether two are one."""
+    return min(spellings(name), default="")
+
+
+@dataclass(frozen=True)
+class Person:
+    """Somebody of the class. key: one a person; row: what the roster says, by column."""
+
+    key: str
+    name: str
+    row: Mapping[str, str] = field(default_factory=dict)
+
+
+class Roster:
+    """A class: the rows of a table, and whoever an LMS names besides."""
+
+    def __init__(self, rows: Sequence[Mapping[str, str]] = ()) -> None:
+        self.people: dict[str, Person] = {}
+        self._known: dict[str, set[str]] = {}
+        for row in rows:
+            cells = {column.strip().casefold(): value for column, value in row.items()}
+            name = next((cells[c] for c in NAME_COLUMNS if cells.get(c)), "")
+            name = name or " ".join(filter(None, (cells.get(c) for c in FIRST_AND_LAST)))
+            ids = {column: cells[column] for column in IDS if cells.get(column)}
+            if person(name) in ("", "pointspossible") and not ids:
+                continue  # an empty line, or the second one of Canvas
+            key = next(iter(ids.values()), person(name))
+            want(key not in self.people, "roster", key, "every student once")
+            clues = [*(f"#{column} {value}" for column, value in ids.items()), *ids.values()]
+            self._add(Person(key, name or key, row), clues)
+
+    def _add(self, one: Person, clues: Iterable[str]) -> None:
+        self.people[one.key] = one
+        for clue in {*spellings(one.name), *map(str.casefold, clues)}:
+            self._known.setdefault(clue, set()).add(one.key)
+
+    def find(self, *clues: str) -> Person | None:
+        """Who it is by the first of these names or ids that is one person's."""
+        for clue in clues:
+            hits: set[str] = set(self._known.get(clue.casefold(), ()))
+            hits = hits.union(*(self._known.get(spelling, ()) for spelling in spellings(clue)))
+            if len(hits) == 1:
+                return self.people[hits.pop()]
+        return None
+
+    def of_place(self, at: Place) -> Person:
+        """Who hands in from a place of an LMS: of the roster, or new."""
+        key = f"{at.lms} {at.id}"
+        clue = f"#identifier participant {at.id}" if at.lms == "Moodle" else f"#id {at.id}"
+        known = self.people.get(key) or self.find(clue, at.name)
+        if known is None or (known.key != key and not known.row):  # another of the same name
+            known = Person(key, at.name)
+            self._add(known, [key])
+        return known
+
+    def of_file(self, file: str, typed: str) -> Person:
+        """Who handed in a file: by the LMS's name of it, by a folder's, then by what was typed."""
+        at, folders = place_of(file), file.split("/")[:-1]
+        if at.lms:
+            return self.of_place(at)
+        stem = at.feedback.removesuffix(".html").removeprefix("studio_1_").replace("_", " ")
+        found = self.find(*folders, *([typed] if typed else [stem]))
+        return found or Person(person(typed) or f"file {file}", typed)
+
+    def other_name(self, one: Person, typed: str) -> Iterator[Flag]:
+        """What to say where the name in a bundle is not that of who handed it in."""
+        if not typed or spellings(typed) & spellings(one.name) or typed.strip() in one.row.values():
+            return
+        other = self.find(typed)
+        if other is not None and other.key != one.key:
+            yield _flag("another_student", typed=typed, name=one.name)
+        else:
+            alike = bool({*words_of(typed)} & {*words_of(one.name)})
+            yield replace(_flag("other_name", typed=typed, name=one.name), note=alike)
+
+
+def class_table(path: Path) -> list[dict[str, str]]:
+    """The rows of a table as a spreadsheet writes it: `,`, `;` or tabs; UTF-8, UTF-16 or Windows'.
+
+    Raises ValueError for a file that is none.
+    """
+    data = path.read_bytes()
+    codes = ["utf-16"] if data[:2] in (b"\xff\xfe", b"\xfe\xff") else ["utf-8-sig", "cp1252"]
+    for code in codes:
+        with contextlib.suppress(UnicodeDecodeError):
+            text = data.decode(code)
+            sign = max(",;\t", key=text.partition("\n")[0].count)
+            try:
+                rows = list(csv.DictReader(io.StringIO(text, newline=""), delimiter=sign))
+            except csv.Error as error:
+                raise ValueError(f"{path.name}: is no table ({error})") from None
+            return [{k: (v or "").strip() for k, v in row.items() if k} for row in rows]
+    raise ValueError(f"{path.name}: is no table of text; save it as CSV, UTF-8")
+
+
+# --- who shares words -----------------------------------------------------------------------
 
 
 def same_words(said: Mapping[str, tuple[str, str]]) -> list[Copy]:
@@ -482,7 +614,6 @@ def same_words(said: Mapping[str, tuple[str, str]]) -> list[Copy]:
 def _alike(texts: Sequence[tuple[str, ...]], least: int) -> list[list[tuple[str, ...]]]:
     """The texts in groups of those that share their runs of words; least: runs, for a part."""
     from scipy.sparse import coo_array, csr_array
-    from scipy.sparse.csgraph import connected_components
 
     if not texts:
         return []
@@ -505,8 +636,6 @@ def _alike(texts: Sequence[tuple[str, ...]], least: int) -> list[list[tuple[str,
         near = shared.data >= SHARED_RUNS * np.minimum(size[one], size[two])
         pairs.append(np.stack([one[near], two[near]]))
     one, two = np.concatenate(pairs, axis=1)
-    graph = coo_array((np.ones(len(one)), (one, two)), shape=(len(texts), len(texts)))
-    groups: dict[int, list[tuple[str, ...]]] = {}
-    for text, label in zip(texts, connected_components(graph, directed=False)[1], strict=True):
-        groups.setdefault(int(label), []).append(text)
-    return list(groups.values())
+    groups = _groups(range(len(texts)), list(zip(one.tolist(), two.tolist(), strict=True)))
+    single = {*range(len(texts))} - {i for group in groups for i in group}
+    return [[texts[i] for i in group] for group in [*groups, *([i] for i in single)]]

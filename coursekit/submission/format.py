@@ -13,8 +13,8 @@ import hashlib
 import io
 import json
 import math
+import os
 import re
-import struct
 import unicodedata
 import warnings
 import zipfile
@@ -57,10 +57,11 @@ SCHEMA = json.loads(Path(__file__).with_name("bundle.schema.json").read_text(enc
 
 HAND_IN = "hand in the file that `coursekit submit` wrote, as it is"
 COPY_AGAIN = "copy or download it again"
-AS_IT_WAS = "hand in the .zip that `coursekit submit` wrote, never unpacked and never zipped again"
+AS_IT_WAS = "hand in the .zip that `coursekit submit` wrote, and nothing else"
 
 FIRST_DATE = (1980, 1, 1, 0, 0, 0)  # that a zip can say
-HARMLESS_FLAGS = 0x0806  # how hard deflate tried; that the name is UTF-8 (it is ASCII)
+SECRET_FLAGS = 0x2041  # of a zip's member: it is encrypted, or its header is
+JUNK = ("Thumbs.db", "desktop.ini", "Icon\r")  # that a system leaves in a folder
 TURNING_SIGNS = "\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"  # text runs backwards
 NO_TEXT = ("Cc", "Cs", "Zl", "Zp")  # control characters, halves of others, line ends of Unicode
 
@@ -292,7 +293,8 @@ def slug(text: str) -> str:
 
 
 def read_bundle(source: bytes | Path) -> Submission:
-    """The submission in a bundle: the file's bytes, or its path. Raises Refused, nothing else.
+    """The submission in a bundle: the file's bytes, its path, or the folder it was unpacked into.
+    Raises Refused, nothing else.
 
     First the zip is looked at, then the manifest with the sizes and hashes of all members, then
     each JSON member by the schema, then the arrays, and last how all of it fits together.
@@ -301,7 +303,10 @@ def read_bundle(source: bytes | Path) -> Submission:
     Traceback (most recent call last):
     coursekit.submission.format.Refused: The file is no zip, or cut off; copy or download it again.
     """
-    members = _unzipped(_bytes_of(source) if isinstance(source, Path) else source)
+    if isinstance(source, Path) and os.path.isfile(source / MANIFEST):
+        members = _unpacked(source)
+    else:
+        members = _unzipped(_bytes_of(source) if isinstance(source, Path) else source)
     manifest = _manifest(members)
     facts, claims, conclusion, outcomes = (_document(members, name) for name in DOCUMENTS)
     stacks = facts.pop("stacks")
@@ -329,7 +334,7 @@ def read_bundle(source: bytes | Path) -> Submission:
 def _bytes_of(path: Path) -> bytes:
     """The bytes of a file, one more than allowed at most: then it is too large."""
     try:
-        if not path.is_file():  # opening a pipe would wait for ever
+        if path.is_symlink() or not path.is_file():  # opening a pipe would wait for ever
             raise Refused("not_a_file", f"{shown(path.name)} is not there, or no plain file")
         with path.open("rb") as file:
             return file.read(MAX_FILE + 1)
@@ -338,11 +343,11 @@ def _bytes_of(path: Path) -> bytes:
         raise Refused("unreadable", wrong) from error
 
 
-def _unzipped(data: bytes) -> dict[str, bytes]:
-    """The members of a plain zip: one directly behind the other, their directory, its end record.
+def _unzipped(data: bytes, inner: bool = False) -> dict[str, bytes]:
+    """The members of a zip by their names in it, of one folder, whoever zipped it.
 
-    So nothing can hide before, between or behind them, in extra fields or in comments, and a member
-    has one size, one name and one meaning.
+    What macOS and Windows add is passed over; the manifest's hashes say whether the rest is whole.
+    inner: it came out of one. A zip that holds nothing but a bundle is opened once more.
     """
     if len(data) > MAX_FILE:
         raise Refused("too_large", f"The file has {len(data)} bytes, {MAX_FILE} are allowed")
@@ -350,41 +355,49 @@ def _unzipped(data: bytes) -> dict[str, bytes]:
         archive = zipfile.ZipFile(io.BytesIO(data))
     except Exception:  # a stranger's bytes: the parser may trip over anything
         raise Refused("not_a_zip", "The file is no zip, or cut off", COPY_AGAIN) from None
-    members = archive.infolist()
-    for member in members:
-        _check_member(member)
-    if len(members) > MAX_MEMBERS or sum(member.file_size for member in members) > MAX_TOTAL:
+    every = [m for m in archive.infolist() if not is_junk(m.orig_filename)]
+    members = {m.orig_filename: m for m in every if not m.orig_filename.endswith("/")}
+    if len(members) == 1 and next(iter(members)).lower().endswith(".zip") and not inner:
+        (bundle,) = members.values()
+        if bundle.file_size <= min(MAX_FILE, MAX_RATIO * bundle.compress_size):
+            return _unzipped(_content(archive, bundle), inner=True)
+    if len(members) > MAX_MEMBERS or sum(m.file_size for m in every) > MAX_TOTAL:
         wrong = f"Unpacked, it has more than {MAX_TOTAL} bytes, or more than {MAX_MEMBERS} members"
         raise Refused("too_large", wrong)
-    position, plain = 0, len({member.orig_filename for member in members}) == len(members)
-    for member in sorted(members, key=lambda member: member.header_offset):
-        sizes = struct.pack("<3L", member.CRC, member.compress_size, member.file_size)
-        plain &= member.header_offset == position and data[position + 14 : position + 26] == sizes
-        position += 30 + len(member.orig_filename) + member.compress_size
-    directory, n = sum(46 + len(member.orig_filename) for member in members), len(members)
-    end = struct.pack("<4s4H2LH", b"PK\5\6", 0, 0, n, n, directory, position, 0)
-    if not plain or len(data) != position + directory + len(end) or not data.endswith(end):
-        wrong = "The zip is not plain: it was zipped again, or something was put into it"
-        raise Refused("not_plain", wrong, AS_IT_WAS)
-    return {member.filename: _content(archive, member) for member in members}
+    if len({m.orig_filename for m in every}) < len(every):
+        raise Refused("not_plain", "The zip has two members of one name", AS_IT_WAS)
+    parts = {name: name.rpartition("/") for name in members}
+    folder = next((at for at, _, name in parts.values() if name == MANIFEST), "")
+    found = {}
+    for name, (at, _, last) in parts.items():
+        _check_member(members[name], last if at == folder else name)
+        found[last] = _content(archive, members[name])
+    return found
 
 
-def _check_member(member: zipfile.ZipInfo) -> None:
+def is_junk(name: str) -> bool:
+    """Whether a system or a spreadsheet leaves such a file or folder anywhere; name: its path."""
+    parts = name.split("/")
+    return "__MACOSX" in parts or parts[-1].startswith((".", "~$")) or parts[-1] in JUNK
+
+
+def _unpacked(folder: Path) -> dict[str, bytes]:
+    """The members of a bundle that somebody unpacked into a folder."""
+    names = [path.name for path in folder.iterdir() if path.name in (MANIFEST, *DOCUMENTS)]
+    names += [f"{kind}_{i}.npy" for i in range(MAX_MEMBERS) for kind in ("depth", "times")]
+    return {name: _bytes_of(folder / name) for name in names if (folder / name).exists()}
+
+
+def _check_member(member: zipfile.ZipInfo, name: str) -> None:
     """A member has a name of the format and is a plain file within the caps, as it is declared."""
-    name = member.orig_filename  # `filename` ends at a NUL
     most = next((most for pattern, most in ALLOWED_BYTES.items() if pattern.fullmatch(name)), None)
     if most is None:
-        wrong = f"The zip has a member {shown(name)}, as when a bundle is unpacked and zipped again"
+        wrong = f"The zip has a member {shown(name)}, which no bundle has"
         raise Refused("unknown_member", wrong, AS_IT_WAS)
-    kind = member.external_attr >> 28  # as Unix writes it: 8 is a plain file
-    if (
-        member.flag_bits & ~HARMLESS_FLAGS
-        or member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-        or member.volume
-        or kind not in (0, 8)
-        or member.external_attr & 0x10
-    ):
-        wrong = f"{name} is no plain file: it is encrypted, or a link, or was zipped again"
+    link = member.external_attr >> 28 not in (0, 8)  # as Unix writes it: 8 is a plain file
+    known = member.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+    if member.flag_bits & SECRET_FLAGS or not known or link:
+        wrong = f"{name} is no plain file: it is encrypted, packed in another way, or a link"
         raise Refused("not_plain", wrong, AS_IT_WAS)
     packed = member.compress_size
     if member.file_size > min(most, MAX_RATIO * packed) or packed > MAX_FILE:

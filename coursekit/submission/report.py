@@ -9,12 +9,14 @@ plotting library would take longer than grading.
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import math
+import re
 import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from datetime import datetime
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,16 +28,39 @@ from markupsafe import Markup
 
 from coursekit.arrays import Interval
 from coursekit.stereo import rounded_variance
-from coursekit.submission.flags import Copy, Fingerprint, Flag, copies, person, same_words
+from coursekit.submission.flags import (
+    Copy,
+    Fingerprint,
+    Flag,
+    Person,
+    Roster,
+    copies,
+    place_of,
+    same_words,
+    words_of,
+)
 from coursekit.submission.format import Plot, Refused, Submission, TableRow, read_bundle
-from coursekit.submission.recompute import LABELS, MISTAKES, Recomputed
+from coursekit.submission.recompute import LABELS, MISTAKES, REPEAT, SEEN, Recomputed
 from coursekit.submission.rubric import Grade, Item, grade
 from coursekit.words import counted
 
 HEADER = (
-    *("file", "student", "status", "counts", "points", "of", "percent"),
-    *LABELS,
-    *("lost", "flags", "says"),
+    *("file", "student", "who", "name in it", "status", "counts", "late", "made", "handed in"),
+    *("points", "of", "percent", *LABELS, "total", "comment", "lost", "flags", "says"),
+    *("page", "code"),
+)
+MOODLE_COLUMNS = (
+    *("Identifier", "Full name", "Email address", "Grade", "Maximum Grade"),
+    *("Last modified (grade)", "Feedback comments"),
+)
+CANVAS_COLUMNS = ("Student", "ID", "SIS User ID", "SIS Login ID", "Section", "Studio exercise 1")
+OWN_COLUMNS = (
+    "who",
+    "student",
+    "paragraph",
+    "late",
+    "overrule",
+    "comment",
 )
 FORMULA = tuple("=+-@\t\r\n＝＋－＠")  # what makes a spreadsheet calculate a cell
 HERE = Path(__file__).parent
@@ -64,8 +89,10 @@ def _page(**values: Any) -> str:
 class ReportLine:
     """One bundle in the class: graded, or not and why.
 
-    file: the bundle's name. made, paragraph: as handed in. page: the link to its page. reason,
-    says: of a bundle that was not graded. counts: False where the student has a newer one.
+    file: the bundle's name. student: the name in it. made, paragraph: as handed in. page: the link
+    to its page. reason, says: of a bundle that was not graded. handed_in: when, as the LMS says.
+    Of `across`: counts, False where another one of the student does; late;
+    who, name, row: the person and what the roster says; own: the instructor's points and comment.
     `as_json` and `from_dict` take it through JSON.
     """
 
@@ -82,6 +109,29 @@ class ReportLine:
     says: str = ""
     counts: bool = True
     fingerprint: Fingerprint | None = None
+    handed_in: str = ""
+    late: bool = False
+    who: str = ""
+    name: str = ""
+    row: Mapping[str, str] = field(default_factory=dict)
+    own: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def total(self) -> float | None:
+        """The points with the instructor's own: for the paragraph, for late days, in all."""
+        if self.own.get("overrule"):
+            return number_of(self.own["overrule"])
+        if self.points is None:
+            return None
+        machine = sum(item.points for item in self.items if item.topic == "paragraph")
+        own = self.own.get("paragraph")
+        paragraph = number_of(own) if own else machine
+        return round(self.points - machine + paragraph + number_of(self.own.get("late", "")), 2)
+
+    @property
+    def code(self) -> str:
+        """What stands for the name on the pages of a second marker."""
+        return hashlib.sha256(f"{self.who}\0{self.file}".encode()).hexdigest()[:6]
 
     @property
     def percent(self) -> float | None:
@@ -102,6 +152,11 @@ class ReportLine:
         items = tuple(Item(**item) for item in data["items"])
         flags = tuple(Flag(**flag) for flag in data["flags"])
         return cls(**{**data, "items": items, "flags": flags, "fingerprint": prints})
+
+
+def number_of(text: str) -> float:
+    """Points as somebody writes them, "2.5" or "2,5"; nothing is 0. Raises ValueError."""
+    return float(text.replace(",", ".").strip() or 0.0)
 
 
 def graded(file: str, grade: Grade, submission: Submission, page: str = "") -> ReportLine:
@@ -148,40 +203,107 @@ def out_of_memory(name: str) -> ReportLine:
     return not_graded(name, "memory", says)
 
 
-def across(lines: Sequence[ReportLine]) -> list[ReportLine]:
-    """The lines with what only the class shows: shared data and words, and whose newest counts.
+def across(
+    lines: Sequence[ReportLine],
+    roster: Roster | None = None,
+    late_after: datetime | None = None,
+    own: Mapping[str, Mapping[str, str]] | None = None,
+) -> list[ReportLine]:
+    """The lines with what only the class shows: who each is of and which of theirs counts, shared
+    data and words, and a line for each of the roster who handed in nothing.
 
-    Without fingerprints, which are of no more use. Of a student's bundles that were made at the
-    same moment the first counts.
+    own: the instructor's points, by person. Without fingerprints, which are of no more use.
     """
+    roster, own = roster or Roster(), own or {}
+    for line in lines:  # first, so that a typed name can be known as somebody else's
+        if (at := place_of(line.file)).lms:
+            roster.of_place(at)
+    who = {line.file: roster.of_file(line.file, line.student) for line in lines}
     done = [line for line in lines if line.points is not None]
-    prints = {line.file: line.fingerprint for line in done if line.fingerprint is not None}
-    said = {line.file: (line.student, line.paragraph) for line in done}
+    prints = {
+        line.file: replace(line.fingerprint, student=who[line.file].key)
+        for line in done
+        if line.fingerprint is not None
+    }
+    said = {line.file: (who[line.file].key, line.paragraph) for line in done}
     about: dict[str, list[Flag]] = {}
     for copy in [*copies(prints), *same_words(said)]:
         for key in copy.keys:
             about.setdefault(key, []).append(_copy_flag(copy))
-    newest: dict[str, ReportLine] = {}
-    for line in sorted(done, key=_moment, reverse=True):
-        newest.setdefault(person(line.student), line)
+    theirs: dict[str, list[ReportLine]] = {}
+    for line in done:
+        theirs.setdefault(who[line.file].key, []).append(line)
+    chosen = {key: _that_counts(some) for key, some in theirs.items()}
     found = []
     for line in lines:
-        flags = [*line.flags, *about.get(line.file, ())]
-        last = line if line.points is None else newest[person(line.student)]
+        one, at = who[line.file], place_of(line.file)
+        last, more = chosen[one.key] if line.points is not None else (line, ())
+        late = at.late or (late_after is not None and _moment(line) > late_after.timestamp())
+        flags = [*line.flags, *about.get(line.file, ()), *more, *_clock(line)]
+        flags += roster.other_name(one, line.student)
         if last is not line:
             says = (
                 f"An earlier bundle of {last.student}, {_points(line.points)} points; "
                 f"{last.file} counts, {_points(last.points)} points."
             )
             flags.append(Flag("earlier_bundle", says, note=True))
-        counts = last is line
-        found.append(replace(line, flags=tuple(flags), counts=counts, fingerprint=None))
+        own_line = _of(line, one, own)
+        found.append(
+            replace(own_line, flags=tuple(flags), counts=last is line, late=late, fingerprint=None)
+        )
+    there = {line.who for line in found}
+    for one in roster.people.values():
+        if one.key not in there:
+            nothing = not_graded("", "missing", "Nothing was handed in.")
+            found.append(_of(nothing, one, own))
     return found
 
 
+def _of(line: ReportLine, one: Person, own: Mapping[str, Mapping[str, str]]) -> ReportLine:
+    """The line with whose it is."""
+    return replace(line, who=one.key, name=one.name, row=one.row, own=own.get(one.key, {}))
+
+
+def _that_counts(some: Sequence[ReportLine]) -> tuple[ReportLine, tuple[Flag, ...]]:
+    """Which of a student's bundles counts, and what to say about it.
+
+    The newest, or the first of those; but if no LMS says that they are of one student, never one
+    that takes points away from another.
+    """
+    newest = max(some, key=_moment)
+    if len(some) == 1 or place_of(newest.file).lms:
+        return newest, ()
+    best = max(some, key=lambda line: line.points or 0.0)
+    if (newest.points or 0.0) >= (best.points or 0.0):
+        best = newest
+    folders = {line.file.rpartition("/")[0] for line in some}
+    if best is newest and len(folders) == 1:
+        return best, ()
+    each = ", ".join(
+        f"{line.file} ({_points(line.points)} points, packed {line.made})" for line in some[:6]
+    )
+    says = SEEN["same_name"].format(typed=best.student, bundles=each)
+    return best, (Flag("same_name", says),)
+
+
+def _clock(line: ReportLine) -> Iterator[Flag]:
+    """Whether a bundle was packed later than it can have been."""
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    for what, moment in (("was handed in", line.handed_in), ("was graded", now)):
+        if line.made and moment and _seconds(line.made) > _seconds(moment) + 86_400:
+            says = SEEN["wrong_clock"].format(made=line.made, after=f"it {what} ({moment})")
+            yield Flag("wrong_clock", says)
+            return
+
+
+def _seconds(moment: str) -> float:
+    """s since 1970; a moment without a zone is of here."""
+    return datetime.fromisoformat(moment).timestamp()
+
+
 def _moment(line: ReportLine) -> float:
-    """When a bundle was made, s since 1970."""
-    return datetime.fromisoformat(line.made).timestamp() if line.made else 0.0
+    """When a bundle was handed in, or else made, s since 1970; 0 for one that does not say."""
+    return _seconds(line.handed_in or line.made) if line.handed_in or line.made else 0.0
 
 
 def _copy_flag(copy: Copy) -> Flag:
@@ -392,15 +514,15 @@ def _histogram(percents: Sequence[float]) -> dict[str, Any]:
     }
 
 
-def class_page(lines: Sequence[ReportLine]) -> str:
+def class_page(lines: Sequence[ReportLine], changes: Sequence[tuple[str, ...]] = ()) -> str:
     """Distribution, misconceptions, flags, refused bundles, and a link to every student's page.
 
-    lines: after `across`. A student counts once, with the newest bundle.
+    lines: after `across`. A student counts once. changes: since the last report, of a regrade.
     """
     done = [line for line in lines if line.points is not None]
     counts = [line for line in done if line.counts]
     percents = [line.percent or 0.0 for line in counts]
-    named = sorted(counts, key=lambda line: (person(line.student), line.file))
+    named = sorted(counts, key=lambda line: (words_of(line.name or line.student), line.file))
     ask_first = "No points were taken for these. Ask first: there may be an innocent reason."
     return _page(
         what="class",
@@ -415,14 +537,21 @@ def class_page(lines: Sequence[ReportLine]) -> str:
             ("To look at", ask_first, _by_flag(done, False)),
             ("Notes", "Expected, and no reason to ask.", _by_flag(done, True)),
         ],
-        refused=[(line.file, line.reason, line.says) for line in lines if line.points is None],
+        refused=[
+            (line.file or line.name, line.reason, line.says)
+            for line in lines
+            if line.points is None and line.reason != "missing"
+        ],
+        missing=[line.name for line in lines if line.reason == "missing"],
+        late=[line for line in counts if line.late],
+        changes=changes,
         named=named,
         ranked=sorted(named, key=lambda line: line.percent or 0.0),
     )
 
 
-def _topics(lines: Sequence[ReportLine]) -> Iterator[tuple[str, str, Any]]:
-    """Label, per cent right and (mistake, students) of what was asked."""
+def _topics(lines: Sequence[ReportLine]) -> Iterator[tuple[str, str, str, Any]]:
+    """Label, where the lesson says it, per cent right and (mistake, students) of what was asked."""
     for topic, label in LABELS.items():
         items = [item for line in lines for item in line.items if item.topic == topic]
         who: dict[str, list[ReportLine]] = {}
@@ -432,7 +561,8 @@ def _topics(lines: Sequence[ReportLine]) -> Iterator[tuple[str, str, Any]]:
                     who.setdefault(said, []).append(line)
         if items:
             right = sum(item.verdict == "right" for item in items) / len(items)
-            yield label, f"{right:.0%}", sorted(who.items(), key=lambda pair: -len(pair[1]))
+            groups = sorted(who.items(), key=lambda pair: -len(pair[1]))
+            yield label, REPEAT.get(topic, ""), f"{right:.0%}", groups
 
 
 def _by_flag(lines: Sequence[ReportLine], note: bool) -> list[Any]:
@@ -445,13 +575,20 @@ def _by_flag(lines: Sequence[ReportLine], note: bool) -> list[Any]:
     return list(who.items())
 
 
-def paragraphs_page(lines: Sequence[ReportLine]) -> str:
-    """The closing paragraphs of the class, by name, to read in one go; lines: after `across`."""
+def paragraphs_page(lines: Sequence[ReportLine], named: bool = True) -> str:
+    """The closing paragraphs of the class, by name, to read in one go; lines: after `across`.
+
+    named: else by code and without links, for a second marker.
+    """
     some = [line for line in lines if line.points is not None and line.counts]
-    some.sort(key=lambda line: (person(line.student), line.file))
+    some.sort(key=lambda line: (words_of(line.name or line.student), line.file))
+    if not named:
+        some = sorted(
+            (replace(line, name=line.code, page="") for line in some), key=lambda line: line.name
+        )
     said = [(line, _about(line)) for line in some if line.paragraph.strip()]
     silent = [line for line in some if not line.paragraph.strip()]
-    return _page(what="paragraphs", said=said, silent=silent)
+    return _page(what="paragraphs", said=said, silent=silent, named=named)
 
 
 def _about(line: ReportLine) -> str:
@@ -470,15 +607,15 @@ def _said(item: Item) -> str:
     return {"wrong": "wrong, no known reason", "missing": "left out"}.get(item.verdict, "")
 
 
-def grades_csv(lines: Sequence[ReportLine]) -> str:
-    """One row a bundle: points in all and by topic, what cost some, flags, why it was not graded.
+def grades_csv(lines: Sequence[ReportLine], separator: str = ",") -> str:
+    """One row a bundle, and one for each of the roster without any: points in all and by topic,
+    what cost some, flags, why it was not graded, the page, and the roster's own columns.
 
-    Of several bundles of one student one counts, as its column says; lines: after `across`.
-    Text that a spreadsheet would calculate gets an apostrophe before it.
+    Of several bundles of one student one counts, as its column says; lines: after `across`. `total`
+    holds the instructor's own points. Text that a spreadsheet would calculate gets an apostrophe.
     """
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(HEADER)
+    more = [c for c in dict.fromkeys(c for line in lines for c in line.row) if c not in HEADER]
+    rows = []
     for line in lines:
         done = line.points is not None
         topics = (
@@ -487,14 +624,69 @@ def grades_csv(lines: Sequence[ReportLine]) -> str:
         )
         lost = "; ".join(_lost(item) for item in line.items if item.points < item.of)
         codes = " ".join(sorted({flag.code for flag in line.flags if not flag.note}))
-        cells = (
-            *(line.file, line.student, "graded" if done else f"not graded: {line.reason}"),
-            *("yes" if done and line.counts else "no", _points(line.points), _points(line.of)),
-            f"{line.percent:.1f}" if done else "",
-            *(_points(value) if done else "" for value in topics),
-            *(lost, codes, line.says),
+        rows.append(
+            (
+                *(line.file, line.name or line.student, line.who, line.student),
+                "graded" if done else f"not graded: {line.reason}",
+                *("yes" if done and line.counts else "no", "yes" if line.late else "no"),
+                *(line.made, line.handed_in, _points(line.points), _points(line.of)),
+                f"{line.percent:.1f}" if done else "",
+                *(_points(value) if done else "" for value in topics),
+                *(_points(line.total), line.own.get("comment", ""), lost, codes, line.says),
+                *(line.page, line.code, *(line.row.get(column, "") for column in more)),
+            )
         )
-        writer.writerow(map(_cell, cells))
+    return _csv([(*HEADER, *more), *rows], separator)
+
+
+def exports(lines: Sequence[ReportLine], separator: str = ",") -> dict[str, str]:
+    """Tables that Moodle and Canvas import, by the file's name; lines: after `across`.
+
+    Moodle's is its offline grading worksheet, found by `Identifier`; Canvas' its gradebook, found
+    by `ID`, with the row of the points possible.
+    """
+    tables: dict[str, str] = {}
+    moodle, canvas = [], []
+    for line in lines:
+        at, row = place_of(line.file), {k.casefold(): v for k, v in line.row.items()}
+        if not (line.counts and (line.points is not None or line.reason == "missing")):
+            continue
+        name, grade_of = line.name or line.student, _points(line.total)
+        identifier = f"Participant {at.id}" if at.lms == "Moodle" else row.get("identifier", "")
+        if identifier:
+            email = row.get("email address", row.get("email", ""))
+            moodle.append((identifier, name, email, grade_of, "100", "", _feedback(line)))
+        number = at.id if at.lms == "Canvas" else row.get("id", "")
+        if number and not identifier:
+            sis = (row.get(column, "") for column in CANVAS_COLUMNS[2:5])
+            canvas.append((name, number, *sis, grade_of))
+    if moodle:
+        tables["moodle.csv"] = _csv([MOODLE_COLUMNS, *moodle], separator)
+    if canvas:
+        possible = ("    Points Possible", "", "", "", "", "100")
+        tables["canvas.csv"] = _csv([CANVAS_COLUMNS, possible, *canvas], separator)
+    return tables
+
+
+def own_table(lines: Sequence[ReportLine], separator: str = ",") -> str:
+    """A table for the instructor's own points, with a row for everybody."""
+    names = {line.who: line.name or line.student for line in lines if line.name}
+    return _csv(
+        [OWN_COLUMNS, *((who, name, "", "", "", "") for who, name in names.items())], separator
+    )
+
+
+def _feedback(line: ReportLine) -> str:
+    """What a student reads beside the points: the instructor's words, and what cost some."""
+    lost = [_lost(item) for item in line.items if item.points < item.of]
+    return " ".join(filter(None, (line.own.get("comment", ""), "; ".join(lost), line.says)))
+
+
+def _csv(rows: Iterable[Iterable[str]], separator: str) -> str:
+    """A table with every cell quoted."""
+    out = io.StringIO()
+    writer = csv.writer(out, delimiter=separator, quoting=csv.QUOTE_ALL, lineterminator="\n")
+    writer.writerows(map(_cell, row) for row in rows)
     return out.getvalue()
 
 
@@ -504,8 +696,9 @@ def _lost(item: Item) -> str:
 
 
 def _cell(text: str) -> str:
-    """Text that no spreadsheet takes for a formula; one line."""
+    """Text that no spreadsheet takes for a formula, whatever separates its cells; one line."""
     text = " ".join(text.split()) if any(c in text for c in "\r\n\t") else text
+    text = re.sub(rf"([;,|]\s*)([{re.escape(''.join(FORMULA))}])", r"\1'\2", text)
     return f"'{text}" if text.lstrip().startswith(FORMULA) else text
 
 

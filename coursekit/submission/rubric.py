@@ -26,7 +26,6 @@ from coursekit.submission.recompute import (
     WHY,
     AtDistance,
     Recomputed,
-    WithError,
     grading_rules,
     recompute,
 )
@@ -417,48 +416,27 @@ def _other_units(found: float, tolerance: float, step_mm: float) -> Iterator[_Mi
 
 
 def _plot(asked: _Question, submission: Submission, found: Recomputed) -> Item:
-    """The student's figure, in millimetres; metres throughout cost once."""
+    """The student's figure: measured stds as in the raw depths, and a prediction; all in mm."""
     plot = submission.plot
     measured = {m.distance_m: m.std for m in found.at if m.std is not None}
     if plot is None or not plot.distances_m:
         return asked.missing("measured std of depth against the predicted one, at each distance")
-    there = [_nearest(list(measured), z) for z in plot.distances_m]
-    pairs = zip(plot.measured_mm, there, strict=True)
-    shown = [1e3 * mm / (measured[z].value or math.nan) for mm, z in pairs if z is not None]
-    if not shown or not all(0.5 < times < 2 for times in shown):
-        return _points(asked, submission, plot, measured)
-    plot = replace(plot, measured_mm=tuple(1e3 * mm for mm in plot.measured_mm))
-    if plot.predicted_mm and max(plot.predicted_mm) < max(plot.measured_mm) / 50:
-        plot = replace(plot, predicted_mm=tuple(1e3 * mm for mm in plot.predicted_mm))
-    item = _points(asked, submission, plot, measured)
-    says, part = f"{item.says[:-1]}; but all in metres: 1 m is 1000 mm.", item.points / asked.of
-    return asked.item("partial", says, "metres", part * grading_rules()["credit"]["metres"])
-
-
-def _points(
-    asked: _Question, submission: Submission, plot: Plot, measured: dict[float, WithError]
-) -> Item:
-    """Measured stds as in the raw depths or the table, and a prediction; all in mm."""
     wanted = len(grading_rules()["exercise"]["distances_m"])
-    absent, wrong, of_table, right = [], [], [], 0
+    absent, wrong, right = [], [], 0
     for z, std in measured.items():
-        where, near = f"{z:.2f} m", _nearest(plot.distances_m, z)
+        where, near, tolerance = f"{z:.2f} m", _nearest(plot.distances_m, z), 0.0
         if near is None:
             absent.append(where)
             continue
-        got = plot.measured_mm[plot.distances_m.index(near)]
-        row, tolerance = _row(submission, z), _tolerance("std", std.se)
-        claim = None if row is None else row.depth_std_mm
-        if abs(got - std.value) <= tolerance:
+        got, tolerance = plot.measured_mm[plot.distances_m.index(near)], _tolerance("std", std.se)
+        kept = _row(submission, z)  # the std of one's own table, which is judged there
+        own = None if kept is None else kept.depth_std_mm
+        if min(abs(got - std.value), abs(got - (own or math.inf))) <= tolerance:
             right += 1
-        elif claim is not None and abs(got - claim) <= _half_digit("std"):
-            right += 1  # wrong, but that is counted in the table
-            of_table.append(where)
         else:
-            wrong.append(
-                f"at {where} it shows a measured {_shown('std', got)}, your raw depths say "
-                f"{_shown('std', std.value)} ({_accepted('std', tolerance)})"
-            )
+            said = [_shown("std", value) for value in (got, std.value)]
+            says = f"at {where} it shows a measured {said[0]}, your raw depths say {said[1]}"
+            wrong.append(f"{says} ({_accepted('std', tolerance)})")
     there = [_nearest(list(measured), z) for z in plot.distances_m]
     for z, near in zip(plot.distances_m, there, strict=True):
         if near is None:
@@ -477,8 +455,6 @@ def _points(
             says += " and without your prediction"
         return asked.item("partial", f"{says}.", "no_prediction", part)
     shows = "measured std as in your raw depths"
-    if of_table:
-        shows = f"measured std as in your table, which is judged there ({', '.join(of_table)})"
     return _prediction(asked, plot, shows, [measured[z].value for z in there if z is not None])
 
 
