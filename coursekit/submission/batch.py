@@ -520,9 +520,9 @@ def _pool(limits: Limits) -> Iterator[ProcessPool]:
         context=_context(),
     )
     try:
-        with _no_interrupts():  # what it starts inherits this
-            pool.active  # noqa: B018 - a property that starts it
         try:
+            with _no_interrupts():  # what it starts inherits this
+                pool.active  # noqa: B018 - a property that starts it
             pool.schedule(_ready).result(PATIENCE_S)
         except (BrokenProcessPool, OSError, RuntimeError) as error:  # TimeoutError is an OSError
             raise ChildProcessError(CANNOT_START) from error
