@@ -12,7 +12,7 @@ import numpy as np
 from coursekit.arrays import Floats
 from coursekit.lessons import questions
 from coursekit.lessons.exercises import Exercise, Model, Step
-from coursekit.specifications import device  # noqa: F401  a wrong step in the TOML file uses it
+from coursekit.specifications import device
 
 Bounds = tuple[int, int, int, int]  # first row, the one after the last; the same for columns
 
@@ -58,7 +58,43 @@ DEPTH_NOISE = Exercise(
 )
 
 
-DEPTH_NOISE.read_mistakes(globals())
+DEPTH_NOISE.add_mistakes(
+    ("power", "linear_in_Z", lambda Z: Z),
+    ("power", "linear_in_Z", lambda Z: 2 * Z),
+    ("power", "cubed", lambda Z: Z**3),
+    ("constant", "millimetres", lambda fx, baseline: fx * baseline * 1000),
+    ("constant", "millimetres", lambda fx, baseline: fx * baseline / 1000),
+    ("constant", "baseline_forgotten", lambda fx, baseline: fx),
+    ("constant", "fx_forgotten", lambda fx, baseline: baseline),
+    ("constant", "constant_forgotten", lambda fx, baseline: 1.0),
+    ("constant", "other_baseline", lambda fx, baseline: fx * device("D435").unit.baseline_m),
+    ("constant", "other_baseline", lambda fx, baseline: fx * 0.05),
+    ("divide", "multiplied", lambda power, constant: power * constant),
+    ("constant", "baseline_behind_the_fraction", lambda fx, baseline: fx / baseline),
+    ("constant", "focal_length_behind_the_fraction", lambda fx, baseline: baseline / fx),
+    ("divide", "upside_down", lambda power, constant: constant / power),
+    ("noise", "noise_divided", lambda slope, sigma_d, Z: slope / sigma_d),
+    ("noise", "noise_forgotten", lambda slope, sigma_d, Z: slope),
+    ("noise", "root_of_two", lambda slope, sigma_d, Z: math.sqrt(2) * slope * sigma_d),
+    # fx B / (d - sigma_d) - Z; Z - fx B / (d + sigma_d); half of the two together; and the same
+    # with half of sigma_d to each side.
+    ("noise", "difference", lambda slope, sigma_d, Z: slope * sigma_d / (1 - slope * sigma_d / Z)),
+    ("noise", "difference", lambda slope, sigma_d, Z: slope * sigma_d / (1 + slope * sigma_d / Z)),
+    (
+        "noise",
+        "difference",
+        lambda slope, sigma_d, Z: slope * sigma_d / (1 - (slope * sigma_d / Z) ** 2),
+    ),
+    (
+        "noise",
+        "difference",
+        lambda slope, sigma_d, Z: slope * sigma_d / (1 - (slope * sigma_d / Z / 2) ** 2),
+    ),
+    ("result", "variance", lambda sigma: sigma**2),
+    ("result", "root", np.sqrt),
+    ("result", "negative", lambda sigma: -sigma),
+    ("", "disparity", lambda law: lambda Z, fx, baseline, sigma_d: fx * baseline / Z),
+)
 
 
 # --- robust_depth ---
@@ -168,7 +204,83 @@ ROBUST_DEPTH = Exercise(
 )
 
 
-ROBUST_DEPTH.read_mistakes(globals())
+ROBUST_DEPTH.add_mistakes(
+    ("read", "u_v_swapped", lambda u, v: (v, u)),
+    ("round", "truncated", int),
+    ("round", "rounded_up", math.ceil),
+    (
+        "window",
+        "first_too_early",
+        lambda v, u, half: (v - half - 1, v + half + 1, u - half - 1, u + half + 1),
+    ),
+    ("window", "last_missing", lambda v, u, half: (v - half, v + half, u - half, u + half)),
+    ("window", "half_ignored", lambda row, column, half: _window(row, column, 2)),
+    ("window", "half_halved", lambda row, column, half: _window(row, column, half // 2)),
+    (
+        "shortcut",
+        "pixel_alone",
+        lambda image, row, column: (
+            image[row, column]
+            if 0 <= row < len(image) and 0 <= column < image.shape[1]
+            else math.nan
+        ),
+    ),
+    (
+        "shortcut",
+        "pixel_alone",
+        lambda image, row, column: (
+            image[row, column]
+            if 0 <= row < len(image)
+            and 0 <= column < image.shape[1]
+            and 0 < image[row, column] < math.inf
+            else None
+        ),
+    ),
+    (
+        "shortcut",
+        "pixel_alone",
+        lambda image, row, column: (
+            image[row, column]
+            if -len(image) <= row < len(image)
+            and -image.shape[1] <= column < image.shape[1]
+            and image[row, column] > 0
+            else None
+        ),
+    ),
+    ("cut", "negative_index", _cut(_as_they_come)),
+    ("cut", "negative_index", _cut(_as_they_come, _inside)),
+    ("cut", "negative_index", _cut(_inside, _as_they_come)),
+    ("cut", "negative_index", _cut(lambda a, b, size: np.arange(a, min(b, size)))),
+    ("cut", "negative_end", _cut(lambda a, b, size: slice(max(a, 0), b))),
+    (
+        "cut",
+        "moved_inside",
+        _cut(lambda a, b, size: np.arange(b - a) + min(max(a, 0), size - b + a)),
+    ),
+    ("cut", "border_repeated", _cut(lambda a, b, size: np.clip(range(a, b), 0, size - 1))),
+    ("cut", "border_lost", _cut(lambda a, b, size: _inside(a, min(b, size - 1), size))),
+    ("cut", "border_lost", _cut(lambda a, b, size: slice(max(a, 0), min(b, size - 1)))),
+    ("cut", "modulo", _cut(lambda a, b, size: np.arange(a, b) % size)),
+    (
+        "cut",
+        "height_width_swapped",
+        lambda image, top, bottom, left, right: _cut(_inside)(
+            image, top, min(bottom, image.shape[1]), left, min(right, image.shape[0])
+        ),
+    ),
+    ("cut", "border_refused", _cut(lambda a, b, size: slice(a, b if a >= 0 and b <= size else a))),
+    ("zeros", "zeros_counted", lambda pixels: pixels),
+    ("finite", "nan_counted", lambda pixels: pixels),
+    ("finite", "infinity_counted", lambda pixels: pixels[~np.isnan(pixels)]),
+    ("enough", "min_valid_ignored", lambda valid, pixels, min_valid: True),
+    ("enough", "min_valid_fixed", lambda valid, pixels, min_valid: len(valid) >= 5),
+    ("enough", "one_too_strict", lambda valid, pixels, min_valid: len(valid) > min_valid),
+    ("enough", "all_pixels_counted", lambda valid, pixels, min_valid: pixels.size >= min_valid),
+    ("none", "zero_returned", lambda: 0.0),
+    ("middle", "mean", lambda valid: float(np.mean(valid))),
+    ("middle", "one_of_the_middle_two", lambda valid: float(np.sort(valid)[len(valid) // 2])),
+    ("middle", "one_of_the_middle_two", lambda valid: float(np.sort(valid)[(len(valid) - 1) // 2])),
+)
 
 
 # --- table_row ---
@@ -266,7 +378,50 @@ TABLE_ROW = Exercise(
     ][1:],
 )
 # Tried two at a time are only these steps': with eight ways to be right, all would take too long.
-TABLE_ROW.read_mistakes(globals(), ("bias", "unit", "report", "invalid"))
+TABLE_ROW.add_mistakes(
+    ("bias", "bias_sign", lambda level, distance: distance - level),
+    ("bias", "bias_is_depth", lambda level, distance: level),
+    ("report", "variance_reported", lambda std, frames: std**2),
+    ("unit", "row_in_metres", lambda both, step: (both[0] / 1000.0, both[1] / 1000.0)),
+    ("unit", "row_in_metres", lambda both, step: (both[0] / 1000.0, both[1])),
+    ("unit", "row_in_metres", lambda both, step: (both[0], both[1] / 1000.0)),
+    ("invalid", "invalid_percent", lambda counts: 100 * np.mean(counts == 0)),
+    ("invalid", "ever_invalid", lambda counts: (counts == 0).any(axis=0).mean()),
+    ("invalid", "ever_invalid", lambda counts: (counts == 0).any(axis=(1, 2)).mean()),
+    ("bias", "bias_size", lambda level, distance: abs(level - distance)),
+    ("bias", "bias_percent", lambda level, distance: 100 * (level / distance - 1)),
+    ("bias", "bias_against_metres", lambda level, distance: level - distance / 1000.0),
+    ("report", "error_of_the_mean", lambda std, frames: std / math.sqrt(frames)),
+    ("unit", "row_in_counts", lambda both, step: (both[0] / step, both[1] / step)),
+    ("unit", "row_in_counts", lambda both, step: (both[0], both[1] / step)),
+    ("unit", "row_order", lambda both, step: both[::-1]),
+    ("invalid", "valid_part", lambda counts: np.mean(counts > 0)),
+    ("invalid", "invalid_number", lambda counts: np.sum(counts == 0)),
+)
+TABLE_ROW.add_mistakes(
+    ("depth", "zeros_counted", lambda counts, step: step * counts),
+    ("level", "zeros_counted", lambda z: np.nan_to_num(z).mean()),
+    ("std", "zeros_counted", lambda z: _pooled(np.nan_to_num(z))),
+    ("std", "stds_averaged", lambda z: np.nanmean(np.sqrt(_variances(z)))),
+    ("std", "stds_averaged", lambda z: np.nanmean(np.sqrt(_variances(z, 0)))),
+    ("std", "stds_averaged", lambda z: np.nanmedian(np.sqrt(_variances(z)))),
+    ("std", "divided_by_n", lambda z: np.sqrt(np.nanmean(_variances(z, 0)))),
+    ("std", "over_space", lambda z: np.sqrt(np.nanmean(np.nanvar(z, axis=(1, 2), ddof=1)))),
+    ("std", "over_space", lambda z: np.nanmean(np.nanstd(z, axis=(1, 2)))),
+    ("std", "over_space", lambda z: np.nanstd(np.nanmean(z, axis=0))),
+    ("std", "over_space", lambda z: np.nanstd(np.nanmean(z, axis=0), ddof=1)),
+    ("std", "over_everything", np.nanstd),
+    ("std", "over_everything", lambda z: np.nanstd(z, ddof=1)),
+    ("keep", "mixed_treatment", lambda z: (_left_out(z), z)),
+    ("keep", "mixed_treatment", lambda z: (z, _left_out(z))),
+    ("keep", "steady_only", lambda z: (_steady(z),) * 2),
+    ("level", "nan_spreads", np.mean),
+    ("std", "nan_spreads", lambda z: np.sqrt(np.mean(np.var(z, axis=0, ddof=1)))),
+    ("level", "bias_of_the_median", np.nanmedian),
+    ("std", "of_the_windows_mean", lambda z: np.nanstd(np.nanmean(z, axis=(1, 2)), ddof=1)),
+    ("std", "of_the_windows_mean", lambda z: np.nanstd(np.nanmean(z, axis=(1, 2)))),
+    alone=True,
+)
 
 
 # --- standard_errors ---
@@ -309,4 +464,14 @@ STANDARD_ERRORS = Exercise(
     show=TABLE_ROW.show,
     nan_answers=True,
 )
-STANDARD_ERRORS.read_mistakes(globals())
+STANDARD_ERRORS.add_mistakes(
+    ("patches", "pattern_forgotten", lambda pixels: math.inf),
+    ("patches", "pixels_independent", lambda pixels: pixels),
+    ("squares", "pixels_independent", lambda pixels, n: 2 * (n - 1) * pixels),
+    ("patches", "patch_not_squared", lambda pixels: pixels / 12),
+    ("frames", "frames_forgotten", lambda n: math.inf),
+    ("sum", "errors_added", lambda stays, moves: stays + moves),
+    ("squares", "patch_of_the_mean", lambda pixels, n: 2 * (n - 1) * pixels / 12**2),
+    ("squares", "two_forgotten", lambda pixels, n: (n - 1) * pixels / 8**2),
+    ("squares", "one_pixel_only", lambda pixels, n: 2 * (n - 1)),
+)

@@ -3,13 +3,12 @@
 The right answer is written as a few named *steps*. A misconception replaces one step by what a
 learner who holds it would write, so a wrong function can be compared with each wrong model on the
 same cases, and with each pair of them. Only an exact match is named: the nearest wrong model
-misleads as soon as there are two mistakes. To add a misconception, write in the lesson's TOML file,
-under [mistakes], what the student will read, and under [wrong.<exercise>] the step and the wrong
-Python in its place:
+misleads as soon as there are two mistakes. To add a misconception, write the wrong step in the
+lesson's module, and in its TOML file, under [mistakes], what the student will read:
+
+    PROJECT.add_mistakes(("read", "p1_p2_swapped", lambda k1, k2, p1, p2, k3: (k1, k2, p2, p1, k3)))
 
     p1_p2_swapped = ["your p1 and p2 are swapped", "Which of the two multiplies r² + 2x²?"]
-
-    p1_p2_swapped = [["read", "lambda k1, k2, p1, p2, k3: (k1, k2, p2, p1, k3)"]]
 
 What nobody listed is left to a general device: it edits what goes into the right answer, into each
 of its steps and out of them (a sign, a factor, a column for another), and the source of each step
@@ -24,7 +23,7 @@ import inspect
 import itertools
 import traceback
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
@@ -122,17 +121,6 @@ class Exercise:
         for step, name, instead in wrong:
             says, ask = (" ".join(text.split()) for text in texts[name])
             self.mistakes.append(Mistake(name, says, ask, step, instead, alone or not step))
-
-    def read_mistakes(self, names: dict[str, Any], in_pairs: Sequence[str] = ()) -> None:
-        """Add the wrong steps that stand in the TOML file; names: what their Python may use.
-
-        in_pairs: the steps whose mistakes are also tried two at a time; all, where none is named.
-        """
-        for name, ways in self._written("wrong")[self.function].items():
-            for step, code in ways:
-                alone = bool(in_pairs) and step not in in_pairs
-                wrong = eval(" ".join(code.split()), names)
-                self.add_mistakes((step, name, wrong), alone=alone)
 
     def _written(self, table: str) -> dict[str, Any]:
         return dict(questions.lesson_texts(self.name.partition(".")[0])[table])

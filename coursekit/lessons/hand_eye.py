@@ -84,7 +84,49 @@ MOTION_PAIR = Exercise(
 )
 
 
-MOTION_PAIR.read_mistakes(globals())
+MOTION_PAIR.add_mistakes(
+    ("read", "gripper_twice", lambda gi, gj, bi, bj: (gi, gj, gi, gj)),
+    ("read", "board_twice", lambda gi, gj, bi, bj: (bi, bj, bi, bj)),
+    ("inverse", "transposed_pose", lambda T: T.T),
+    ("inverse", "translation_not_turned", lambda T: make_transform(T[:3, :3].T, -T[:3, 3])),
+    ("inverse", "not_inverted", lambda T: T),
+    ("A", "motion_in_base", lambda first, second, inverse: second @ inverse(first)),
+    ("A pair", "a_exchanged", lambda i, j: (j, i)),
+    ("B pair", "b_exchanged", lambda i, j: (j, i)),
+    ("B", "motion_in_board", lambda first, second, inverse: inverse(second) @ first),
+    ("order", "both_exchanged", lambda A, B: np.stack([np.linalg.inv(A), np.linalg.inv(B)])),
+    ("order", "b_first", lambda A, B: np.stack([B, A])),
+    ("A", "elementwise", lambda gripper_i, gripper_j, inverse: inverse(gripper_j) * gripper_i),
+    ("A", "elementwise", lambda gripper_i, gripper_j, inverse: gripper_j * gripper_i),
+    ("B", "elementwise", lambda board_i, board_j, inverse: board_j * inverse(board_i)),
+    ("B", "elementwise", lambda board_i, board_j, inverse: board_j * board_i),
+    ("A", "subtracted", lambda gripper_i, gripper_j, inverse: gripper_j - gripper_i),
+    ("A", "subtracted", lambda gripper_i, gripper_j, inverse: gripper_i - gripper_j),
+    ("B", "subtracted", lambda board_i, board_j, inverse: board_j - board_i),
+    ("B", "subtracted", lambda board_i, board_j, inverse: board_i - board_j),
+    (
+        "A",
+        "places_subtracted",
+        lambda i, j, inverse: make_transform(j[:3, :3].T @ i[:3, :3], i[:3, 3] - j[:3, 3]),
+    ),
+    (
+        "A",
+        "places_subtracted",
+        lambda i, j, inverse: make_transform(j[:3, :3].T @ i[:3, :3], j[:3, 3] - i[:3, 3]),
+    ),
+    (
+        "B",
+        "places_subtracted",
+        lambda i, j, inverse: make_transform(j[:3, :3] @ i[:3, :3].T, i[:3, 3] - j[:3, 3]),
+    ),
+    (
+        "B",
+        "places_subtracted",
+        lambda i, j, inverse: make_transform(j[:3, :3] @ i[:3, :3].T, j[:3, 3] - i[:3, 3]),
+    ),
+    ("A", "other_order", lambda gripper_i, gripper_j, inverse: gripper_i @ inverse(gripper_j)),
+    ("B", "other_order", lambda board_i, board_j, inverse: inverse(board_i) @ board_j),
+)
 
 
 # --- rotation_half ---
@@ -168,4 +210,32 @@ def _kabsch(product: Callable[[Floats, Floats, Floats], Floats]) -> Step:
     return turn
 
 
-ROTATION_HALF.read_mistakes(globals())
+ROTATION_HALF.add_mistakes(
+    ("result", "inverse_of_x", lambda R: R.T),
+    ("turn", "not_a_rotation", lambda a, b: np.linalg.lstsq(b, a, rcond=None)[0].T),
+    ("used", "first_motion_only", lambda a, b: (a[:1], b[:1])),
+    ("result", "negative", lambda R: -R),
+    ("result", "not_scaled", lambda R: R / np.sqrt(3)),
+    ("result", "not_scaled_and_negative", lambda R: -R / np.sqrt(3)),
+    ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: U @ D @ Vt.T)),
+    ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: Vt @ D @ U.T)),
+    ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: U @ Vt.T)),
+    ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: Vt @ U.T)),
+    (
+        "axes",
+        "axis_without_sign",
+        lambda *motions: [
+            np.array([np.real(V[:, np.argmin(abs(w - 1))]) for w, V in map(np.linalg.eig, R)])
+            for R in motions
+        ],
+    ),
+    ("", "same_frame", lambda _: lambda A, B: A[0] @ B[0].T),
+    ("", "same_frame", lambda _: lambda A, B: (A @ np.swapaxes(B, 1, 2)).mean(axis=0)),
+    (
+        "",
+        "same_frame",
+        lambda _: (
+            lambda A, B: Rotation.from_matrix((A @ np.swapaxes(B, 1, 2)).mean(axis=0)).as_matrix()
+        ),
+    ),
+)

@@ -70,7 +70,59 @@ REPROJECTION_RMS = Exercise(
 )
 
 
-REPROJECTION_RMS.read_mistakes(globals())
+REPROJECTION_RMS.add_mistakes(
+    # The first ten are in the numbers of the two axes, whether or not the 2-D number is made of
+    # them.
+    ("axis", "mean_removed", lambda e: np.std(e, axis=0)),
+    ("shown", "mean_removed", lambda e, axes: np.std(e, axis=0)),
+    (
+        "whole",
+        "mean_removed",
+        lambda e, result: np.std(np.c_[e, np.linalg.norm(e, axis=1)], axis=0),
+    ),
+    ("axis", "divided_by_n_minus_1", lambda e: np.sqrt(np.sum(e**2, axis=0) / (len(e) - 1))),
+    ("shown", "divided_by_n_minus_1", lambda e, axes: np.sqrt(np.sum(e**2, axis=0) / (len(e) - 1))),
+    ("axis", "mean_absolute", lambda e: np.mean(np.abs(e), axis=0)),
+    ("shown", "mean_absolute", lambda e, axes: np.mean(np.abs(e), axis=0)),
+    ("axis", "signed_mean", lambda e: np.mean(e, axis=0)),
+    ("shown", "signed_mean", lambda e, axes: np.mean(e, axis=0)),
+    ("axis", "no_root", lambda e: np.mean(e**2, axis=0)),
+    ("shown", "no_root", lambda e, axes: np.mean(e**2, axis=0)),
+    ("axis", "summed", lambda e: np.sqrt(np.sum(e**2, axis=0))),
+    ("shown", "summed", lambda e, axes: np.sqrt(np.sum(e**2, axis=0))),
+    ("axis", "axis_over_2n", lambda e: np.sqrt(np.sum(e**2, axis=0) / (2 * len(e)))),
+    ("shown", "axis_over_2n", lambda e, axes: np.sqrt(np.sum(e**2, axis=0) / (2 * len(e)))),
+    ("axis", "largest", lambda e: np.max(np.abs(e), axis=0)),
+    ("shown", "largest", lambda e, axes: np.max(np.abs(e), axis=0)),
+    (
+        "whole",
+        "largest",
+        lambda e, result: np.max(np.abs(np.c_[e, np.linalg.norm(e, axis=1)]), axis=0),
+    ),
+    ("axis", "median_absolute", lambda e: np.median(np.abs(e), axis=0)),
+    ("shown", "median_absolute", lambda e, axes: np.median(np.abs(e), axis=0)),
+    (
+        "whole",
+        "median_absolute",
+        lambda e, result: np.median(np.abs(np.c_[e, np.linalg.norm(e, axis=1)]), axis=0),
+    ),
+    ("axis", "wrong_axis", lambda e: np.sqrt(np.mean(e**2, axis=1))[:2]),
+    ("shown", "wrong_axis", lambda e, axes: np.sqrt(np.mean(e**2, axis=1))[:2]),
+    ("both", "both_over_2n", lambda residuals, axes: float(np.sqrt(np.mean(axes**2)))),
+    ("both", "mean_distance", lambda e, axes: float(np.mean(np.linalg.norm(e, axis=1)))),
+    ("both", "added", lambda residuals, axes: float(np.sum(axes))),
+    ("both", "mean_of_axes", lambda residuals, axes: float(np.mean(axes))),
+    ("both", "both_without_root", lambda residuals, axes: float(np.sum(axes**2))),
+    ("both", "norm_of_everything", lambda residuals, axes: float(np.linalg.norm(residuals))),
+    ("whole", "squares_everywhere", lambda residuals, result: result**2),
+    (
+        "whole",
+        "mean_distances_everywhere",
+        lambda e, result: np.mean(np.abs(np.c_[e, np.linalg.norm(e, axis=1)]), axis=0),
+    ),
+    ("order", "v_before_u", lambda axes, both: np.array([axes[1], axes[0], both])),
+    ("order", "both_first", lambda axes, both: np.array([both, *axes])),
+)
 
 
 # --- focal_sigma ---
@@ -125,4 +177,25 @@ FOCAL_SIGMA = Exercise(
 )
 
 
-FOCAL_SIGMA.read_mistakes(globals())
+FOCAL_SIGMA.add_mistakes(
+    ("first", "all_variances", lambda information: np.trace(np.linalg.inv(information))),
+    ("freedom", "nothing_fitted", lambda J, residuals: J.shape[0]),
+    ("freedom", "one_parameter", lambda J, residuals: J.shape[0] - 1),
+    ("freedom", "corners_counted", lambda J, residuals: J.shape[0] / 2 - J.shape[1]),
+    ("noise", "no_noise", lambda residuals, freedom: 1.0),
+    ("noise", "noise_not_squared", lambda e, freedom: math.sqrt(e @ e / freedom)),
+    ("noise", "noise_not_squared", lambda e, freedom: np.sum(np.abs(e)) / freedom),
+    ("noise", "noise_summed", lambda e, freedom: e @ e),
+    ("noise", "spread_of_residuals", lambda residuals, freedom: np.var(residuals)),
+    ("noise", "spread_of_residuals", lambda residuals, freedom: np.var(residuals, ddof=1)),
+    ("noise", "two_dimensional_rms", lambda residuals, freedom: 2 * np.mean(residuals**2)),
+    ("first", "others_known", lambda information: 1.0 / information[0, 0]),
+    ("first", "not_inverted", lambda information: information[0, 0]),
+    ("first", "last_parameter", lambda information: np.linalg.inv(information)[-1, -1]),
+    ("first", "second_parameter", lambda information: np.linalg.inv(information)[1, 1]),
+    ("first", "whole_row", lambda information: abs(np.sum(np.linalg.inv(information)[0]))),
+    ("information", "rows_for_columns", lambda J: np.linalg.pinv(np.linalg.pinv(J @ J.T)[:1, :1])),
+    ("scale", "divided_by_noise", lambda noise, first: first / noise),
+    ("root", "variance", lambda value: value),
+    ("root", "ninety_five", lambda value: 1.96 * math.sqrt(value)),
+)

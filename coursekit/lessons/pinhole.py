@@ -130,7 +130,122 @@ PROJECT = Exercise(
 )
 
 
-PROJECT.read_mistakes(globals())
+def _tangential_after_radial(
+    x: Floats, y: Floats, k1: float, k2: float, p1: float, p2: float, k3: float
+) -> Any:
+    """The tangential terms of the point that is bent already, as librealsense has them."""
+    r2 = x**2 + y**2
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    a, b = x * radial, y * radial
+    return a + 2 * p1 * a * b + p2 * (r2 + 2 * a**2), b + p1 * (r2 + 2 * b**2) + 2 * p2 * a * b
+
+
+PROJECT.add_mistakes(
+    ("normalise", "no_division", lambda X, Y, Z: (X, Y, 1.0)),
+    ("normalise", "no_division", lambda X, Y, Z: (X, Y, Z)),
+    (
+        "normalise",
+        "divided_by_range",
+        lambda X, Y, Z: (*(np.stack([X, Y]) / np.linalg.norm([X, Y, Z], axis=0)), 1.0),
+    ),
+    ("normalise", "centre_divided", lambda X, Y, Z: (X / Z, Y / Z, 1.0 / Z)),
+    ("normalise", "upside_down", lambda X, Y, Z: (Z / X, Z / Y, 1.0)),
+    ("normalise", "y_up", lambda X, Y, Z: (X / Z, -Y / Z, 1.0)),
+    ("to_pixels", "y_up", lambda x, y, w, fx, fy, cx, cy: _to_pixels(x, y, w, fx, -fy, cx, cy)),
+    (
+        "to_pixels",
+        "fx_fy_swapped",
+        lambda x, y, w, fx, fy, cx, cy: _to_pixels(x, y, w, fy, fx, cx, cy),
+    ),
+    (
+        "to_pixels",
+        "fx_for_both",
+        lambda x, y, w, fx, fy, cx, cy: _to_pixels(x, y, w, fx, fx, cx, cy),
+    ),
+    (
+        "to_pixels",
+        "centre_before_scale",
+        lambda x, y, w, fx, fy, cx, cy: (fx * (x + cx * w), fy * (y + cy * w)),
+    ),
+    (
+        "to_pixels",
+        "K_transposed",
+        lambda x, y, w, fx, fy, cx, cy: (
+            fx * x / (cx * x + cy * y + w),
+            fy * y / (cx * x + cy * y + w),
+        ),
+    ),
+    (
+        "to_pixels",
+        "cx_cy_swapped",
+        lambda x, y, w, fx, fy, cx, cy: _to_pixels(x, y, w, fx, fy, cy, cx),
+    ),
+    (
+        "to_pixels",
+        "principal_point_forgotten",
+        lambda x, y, w, fx, fy, cx, cy: _to_pixels(x, y, w, fx, fy, 0.0, 0.0),
+    ),
+    (
+        "to_pixels",
+        "principal_point_subtracted",
+        lambda x, y, w, fx, fy, cx, cy: _to_pixels(x, y, w, fx, fy, -cx, -cy),
+    ),
+    ("read", "p1_p2_swapped", lambda k1, k2, p1, p2, k3: (k1, k2, p2, p1, k3)),
+    ("read", "k3_before_p1", lambda k1, k2, p1, p2, k3: (k1, k2, p2, k3, p1)),
+    ("read", "r6_missing", lambda k1, k2, p1, p2, k3: (k1, k2, p1, p2, 0.0)),
+    ("read", "tangential_missing", lambda k1, k2, p1, p2, k3: (k1, k2, 0.0, 0.0, k3)),
+    ("bend", "factor_2_missing", _bent(cross=1)),
+    ("bend", "factor_2_missing", _bent(square=1)),
+    ("bend", "factor_2_missing", _bent(cross=1, square=1)),
+    (
+        "bend",
+        "x_overwritten",
+        lambda x, y, *dist: (
+            _bend(x, y, *dist)[0],
+            _bend(x, y, *dist)[1] + 2 * dist[3] * (_bend(x, y, *dist)[0] - x) * y,
+        ),
+    ),
+    (
+        "bend",
+        "tangential_after_radial",
+        _tangential_after_radial,
+    ),
+    ("bend", "one_missing", _bent(one=0)),
+    ("bend", "r_for_r2", _bent((0.5, 1, 1.5))),
+    ("bend", "r_for_r2", _bent((0.5, 1, 1.5), tangential=0.5)),
+    ("bend", "r2_for_r", _bent((2, 4, 6))),
+    ("bend", "r2_for_r", _bent((2, 4, 6), tangential=2)),
+    ("bend", "r2_for_r", _bent((1, 4, 6))),
+    (
+        "image",
+        "bent_before_division",
+        lambda points, normalise, bend, to_pixels: to_pixels(
+            *(np.stack(bend(*points[:2])) / points[2]), 1.0
+        ),
+    ),
+    (
+        "image",
+        "distortion_in_pixels",
+        lambda points, normalise, bend, to_pixels: bend(*to_pixels(*normalise(*points))),
+    ),
+    (
+        "image",
+        "distortion_in_pixels",
+        lambda points, normalise, bend, to_pixels: np.add(
+            np.reshape(to_pixels(0.0, 0.0, 1.0), (2, 1)),
+            bend(
+                *np.subtract(
+                    to_pixels(*normalise(*points)), np.reshape(to_pixels(0.0, 0.0, 1.0), (2, 1))
+                )
+            ),
+        ),
+    ),
+    ("columns", "output_swapped", lambda u, v: np.stack([v, u], axis=1)),
+    ("columns", "rounded", lambda u, v: np.rint(np.stack([u, v], axis=1))),
+    ("columns", "rounded", lambda u, v: np.trunc(np.stack([u, v], axis=1))),
+    ("columns", "half_pixel", lambda u, v: np.stack([u, v], axis=1) + 0.5),
+    ("columns", "half_pixel", lambda u, v: np.stack([u, v], axis=1) - 0.5),
+)
 
 
 # --- deproject ---
@@ -256,7 +371,58 @@ def _overwritten(rounds: int) -> Step:
     return unbend
 
 
-DEPROJECT.read_mistakes(globals())
+DEPROJECT.add_mistakes(
+    ("rays", "inverse_missing", lambda u, v, *lens: (*_to_pixels(u, v, 1.0, *lens), 1.0)),
+    (
+        "rays",
+        "inverse_transposed",
+        lambda u, v, fx, fy, cx, cy: (u / fx, v / fy, 1 - cx / fx * u - cy / fy * v),
+    ),
+    (
+        "rays",
+        "inverse_transposed",
+        lambda u, v, fx, fy, cx, cy: (
+            *(np.stack([u / fx, v / fy]) / (1 - cx / fx * u - cy / fy * v)),
+            1.0,
+        ),
+    ),
+    (
+        "rays",
+        "principal_point_forgotten",
+        lambda u, v, fx, fy, cx, cy: _to_normalised(u, v, fx, fy, 0.0, 0.0),
+    ),
+    (
+        "rays",
+        "principal_point_added",
+        lambda u, v, fx, fy, cx, cy: _to_normalised(u, v, fx, fy, -cx, -cy),
+    ),
+    ("rays", "brackets_missing", lambda u, v, fx, fy, cx, cy: (u - cx / fx, v - cy / fy, 1.0)),
+    (
+        "rays",
+        "times_focal_length",
+        lambda u, v, fx, fy, cx, cy: _to_normalised(u, v, 1 / fx, 1 / fy, cx, cy),
+    ),
+    ("rays", "fx_fy_swapped", lambda u, v, fx, fy, cx, cy: _to_normalised(u, v, fy, fx, cx, cy)),
+    ("rays", "fx_for_both", lambda u, v, fx, fy, cx, cy: _to_normalised(u, v, fx, fx, cx, cy)),
+    ("rays", "cx_cy_swapped", lambda u, v, fx, fy, cx, cy: _to_normalised(u, v, fx, fy, cy, cx)),
+    ("rays", "input_swapped", lambda u, v, *lens: _to_normalised(v, u, *lens)),
+    ("rays", "y_up", lambda u, v, fx, fy, cx, cy: _to_normalised(u, v, fx, -fy, cx, cy)),
+    ("rays", "half_pixel", lambda u, v, *lens: _to_normalised(u + 0.5, v + 0.5, *lens)),
+    ("rays", "half_pixel", lambda u, v, *lens: _to_normalised(u - 0.5, v - 0.5, *lens)),
+    (
+        "scale",
+        "depth_along_ray",
+        lambda x, y, w, depth: _scale(x, y, w, depth / np.hypot(w, np.hypot(x, y))),
+    ),
+    ("scale", "millimetres", lambda x, y, w, depth: _scale(x, y, w, 1000 * depth)),
+    ("scale", "millimetres", lambda x, y, w, depth: _scale(x, y, w, depth / 1000)),
+    ("scale", "not_scaled", lambda x, y, w, depth: (x, y, w * depth)),
+    ("scale", "divided_by_depth", lambda x, y, w, depth: (x / depth, y / depth, w * depth)),
+    ("scale", "depth_forgotten", lambda x, y, w, depth: (x, y, w * np.ones_like(depth))),
+    ("unbend", "distorted_again", lambda x, y, bend, *dist: bend(x, y)),
+    ("unbend", "one_step", _iterate(1)),
+    ("unbend", "one_step", _divide(1)),
+)
 
 # With more rounds than these, all cases agree. Of each long family a few are tried in pairs, too.
 for _name, _family, _every, _in_pairs in (
