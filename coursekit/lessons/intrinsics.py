@@ -64,10 +64,14 @@ REPROJECTION_RMS = Exercise(
     ],
     per_row=0,
     unit="px",
-    tolerance=1e-7,
+    tolerance=5e-5,
     describe=_describe_rms,
     show=lambda row: "(" + ", ".join(f"{v:.4f}" for v in np.ravel(row)) + ")",
 )
+
+
+def _with_hypot(axes: Floats) -> Floats:
+    return np.array([*axes[:2], np.hypot(*axes[:2])])
 
 
 REPROJECTION_RMS.add_mistakes(
@@ -86,6 +90,15 @@ REPROJECTION_RMS.add_mistakes(
     ("shown", "mean_absolute", lambda e, axes: np.mean(np.abs(e), axis=0)),
     ("axis", "signed_mean", lambda e: np.mean(e, axis=0)),
     ("shown", "signed_mean", lambda e, axes: np.mean(e, axis=0)),
+    ("axis", "mean_before_square", lambda e: np.abs(np.mean(e, axis=0))),
+    ("axis", "first_only", lambda e: np.abs(e[0]) / math.sqrt(len(e))),
+    ("axis", "first_only", lambda e: np.abs(e[0])),
+    (
+        "",
+        "rms_of_positions",
+        lambda f: lambda seen, predicted: _with_hypot(f(seen, 0 * seen) - f(predicted, 0 * seen)),
+    ),
+    ("axis", "first_column_twice", lambda e: np.sqrt(np.mean(e**2, axis=0))[[0, 0]]),
     ("axis", "no_root", lambda e: np.mean(e**2, axis=0)),
     ("shown", "no_root", lambda e, axes: np.mean(e**2, axis=0)),
     ("axis", "summed", lambda e: np.sqrt(np.sum(e**2, axis=0))),
@@ -168,7 +181,7 @@ FOCAL_SIGMA = Exercise(
     ],
     per_row=0,
     unit="px",
-    tolerance=1e-9,
+    tolerance=1e-6,
     describe=lambda args: (
         f"J is {args[0].shape[0]}x{args[0].shape[1]}"
         + (f" with rows {args[0].tolist()}, residuals {args[1].tolist()}" * (len(args[0]) < 7))
@@ -188,6 +201,10 @@ FOCAL_SIGMA.add_mistakes(
     ("noise", "noise_summed", lambda e, freedom: e @ e),
     ("noise", "spread_of_residuals", lambda residuals, freedom: np.var(residuals)),
     ("noise", "spread_of_residuals", lambda residuals, freedom: np.var(residuals, ddof=1)),
+    ("noise", "mean_taken_off", lambda e, freedom: len(e) * np.var(e) / freedom),
+    ("noise", "divided_twice", lambda e, freedom: np.mean(e**2) / freedom),
+    ("noise", "square_of_the_sum", lambda e, freedom: np.sum(e) ** 2 / freedom),
+    ("scale", "root_of_the_noise_alone", lambda noise, first: noise * first**2),
     ("noise", "two_dimensional_rms", lambda residuals, freedom: 2 * np.mean(residuals**2)),
     ("first", "others_known", lambda information: 1.0 / information[0, 0]),
     ("first", "not_inverted", lambda information: information[0, 0]),
