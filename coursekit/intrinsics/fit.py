@@ -370,7 +370,8 @@ def rms_under(lens: Intrinsics, detections: Sequence[Detection], points: Floats)
 
     points (N, 3): the board's corners, m. A K that is wrong shows where the corners can tell.
 
-    >>> lens, board = Intrinsics(640, 480, 600, 600, 320, 240), Board("checkerboard", (10, 7), 0.025)
+    >>> lens = Intrinsics(640, 480, 600, 600, 320, 240)
+    >>> board = Board("checkerboard", (10, 7), 0.025)
     >>> turn = Rotation.from_euler("x", 30, degrees=True).as_matrix()
     >>> seen = project(board.points @ turn.T + [-0.1, -0.1, 0.5], lens.K)
     >>> views = [Detection(np.arange(54), seen, lens.size)]

@@ -521,7 +521,8 @@ def valid_median(stack: Floats) -> Floats:
 def off_plane(images: Floats) -> float:
     """RMS over the pixels of images (N, h, w), each about its own plane, see `about_plane`.
 
-    >>> print(f"{off_plane(np.array([[[0.5, 0.5, 0.5], [0.5, 0.509, 0.5], [0.5, 0.5, 0.5]]])):.4f} m")
+    >>> image = np.array([[0.5, 0.5, 0.5], [0.5, 0.509, 0.5], [0.5, 0.5, 0.5]])
+    >>> print(f"{off_plane(image[None]):.4f} m")
     0.0028 m
     """
     off = np.array([about_plane(image)[0] for image in images])
