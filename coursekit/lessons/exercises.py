@@ -81,7 +81,8 @@ class Exercise:
     otherwise (a result that is one number, say) the whole case. Results agree within `tolerance`
     (in `unit`) or a millionth of their size, as float32 does, and NaN with NaN. Where
     `nan_answers`, NaN is an answer like any other; otherwise a wrong model that comes to NaN or
-    infinity has overflowed. ways: other right answers, what each does and the steps that do it; `way` is what the model does. An
+    infinity has overflowed. ways: other right answers, what each does and the steps that do it;
+    `way` is what the model does. An
     attempt that leaves out what is beyond the `core` is judged by the core cases alone: by an
     exercise that has only those, and is `part_of` this one.
     """
