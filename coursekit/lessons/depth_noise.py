@@ -319,6 +319,7 @@ def _pooled_by_samples(z: Floats) -> Any:
     return np.sqrt(np.nansum(dof * _variances(z)) / dof.sum())
 
 
+_BY_PIXELS = (", every pixel alike in the bias", lambda z: np.nanmean(np.nanmean(z, axis=0)))
 _BY_SAMPLES = (", pixels weighted by their samples in the std", _pooled_by_samples)
 
 
@@ -389,34 +390,24 @@ TABLE_ROW = Exercise(
     ways=[  # how the means and variances of pixels with holes are weighted is free
         (f"mismatches {way}{mean}{mix}", {"keep": keep, "level": level, "std": std})
         for way, keep in (("kept", lambda z: (z, z)), ("left out", lambda z: (_left_out(z),) * 2))
-        for mean, level in (
-            ("", np.nanmean),
-            (
-                ", every pixel counted alike in the bias",
-                lambda z: np.nanmean(np.nanmean(z, axis=0)),
-            ),
-        )
+        for mean, level in (("", np.nanmean), _BY_PIXELS)
         for mix, std in (("", _pooled), _BY_SAMPLES)
     ][1:],
 )
 
 
 def _mismatches_invalid(row: Model) -> Model:
-    return lambda counts, scale, distance: np.array(
-        [
-            *row(counts, scale, distance)[:2],
-            np.isnan(_left_out(np.where(counts, counts, np.nan))).mean(),
-        ]
-    )
+    def part(c: Floats) -> Any:
+        return np.isnan(_left_out(np.where(c, c, np.nan))).mean()
+
+    return lambda c, *at: np.r_[row(c, *at)[:2], part(c)]
 
 
 def _wraps_round(row: Model) -> Model:
-    return lambda counts, scale, distance: np.array(
-        [
-            1e3 * scale * np.mean(counts[counts > 0] - np.uint16(distance / scale)),
-            *row(counts, scale, distance)[1:],
-        ]
-    )
+    def bias(c: Any, scale: float, distance: float) -> Any:
+        return 1e3 * scale * np.mean(c[c > 0] - np.uint16(distance / scale))
+
+    return lambda *args: np.r_[bias(*args), row(*args)[1:]]
 
 
 # Tried two at a time are only these steps': with eight ways to be right, all would take too long.

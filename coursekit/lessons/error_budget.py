@@ -47,10 +47,6 @@ SENSITIVITIES = Exercise(
 )
 
 
-def _floored(dX_du: float, dX_dZ: float, depth_error: float) -> Floats:
-    return np.array([dX_du, dX_dZ, dX_dZ * depth_error])
-
-
 SENSITIVITIES.add_mistakes(
     (
         "leak",
@@ -67,7 +63,8 @@ SENSITIVITIES.add_mistakes(
     ("depth", "sine", lambda u, Z, fx, cx: (u - cx) / math.hypot(u - cx, fx)),
     ("leak", "leak_is_the_error", lambda dX_du, dX_dZ, depth_error, Z: depth_error),
     ("", "at_the_wrong_depth", lambda f: lambda u, Z, fx, cx, off: f(u, Z + off, fx, cx, off)),
-    ("", "floored", lambda f: lambda u, Z, fx, cx, off: _floored(Z // fx, (u - cx) // fx, off)),
+    ("pixel", "floored", lambda u, Z, fx, cx: Z // fx),
+    ("depth", "floored", lambda u, Z, fx, cx: (u - cx) // fx),
     ("depth", "u_with_Z", lambda u, Z, fx, cx: (cx - u) / Z),
     ("leak", "wrong_price", lambda dX_du, dX_dZ, depth_error, Z: dX_du * depth_error),
     ("leak", "sign_lost", lambda dX_du, dX_dZ, depth_error, Z: abs(dX_dZ * depth_error)),

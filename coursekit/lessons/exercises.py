@@ -266,10 +266,10 @@ class Exercise:
         evidence = self._evidence(first, values[first], expected[first])
         if formal:
             return self._several(formal[0], count, evidence)
-        told = relation in FOUND["told"]
-        mistakes = self._found(values, told, known)
+        mistakes = self._found(values, relation in FOUND["told"])
         if len({m.name for m in mistakes}) > 1:
-            return self._several(self._seen_in(first, mistakes, expected[first]), count, evidence)
+            seen = self._seen_in(first, mistakes, expected[first])
+            return self._several(_in_words(seen, known), count, evidence)
         if self.core and not mistakes:  # what is wrong there may hide behind the rest
             of_core = [i for i, args in enumerate(self.cases) if self.is_core(args)]
             ours, wanted = ([of[i] for i in of_core] for of in (values, expected))
@@ -279,17 +279,14 @@ class Exercise:
         if relation and not mistakes:
             mistakes = (_device(relation, "your result", "", replace),)
         if mistakes:
-            return self._one(mistakes[0], count, evidence)
+            return self._one(_in_words(mistakes[0], known), count, evidence)
         return self._say("wrong", f"not right yet. {count}", evidence, FOUND["by_hand"])
 
-    def _found(self, values: list[Floats], told: bool, known: set[str]) -> tuple[Mistake, ...]:
+    def _found(self, values: list[Floats], told: bool) -> tuple[Mistake, ...]:
         """The first mistakes that give these values; told: without the device's."""
         for mistakes in self._combinations():
-            if mistakes[-1].device:
-                if told:
-                    break
-                if not _speaks_of(mistakes[-1].says, known):
-                    continue
+            if told and mistakes[-1].device:
+                break
             if self._explains(mistakes, values):
                 return mistakes
         return ()
@@ -314,7 +311,7 @@ class Exercise:
         holds = {
             "digits": all(np.allclose(v, e, 1e-5, 10 * self.tolerance, True) for v, e in both),
             "rows_lost": all(self._right_or_nothing(v, e) for v, e in both)
-            and any((v != 0).any() and self._agrees(v, e) for v, e in both),
+            and any(np.nan_to_num(v).any() and self._agrees(v, e) for v, e in both),
             "mirrored": any(mirrors) and sum(map(max, right, mirrors)) >= len(both) - 1,
             "sign_of_all": square
             and all(
@@ -496,10 +493,12 @@ def _names_in(code: Any) -> set[str]:
     return {*code.co_varnames, *code.co_cellvars, *code.co_names}.union(*inside)
 
 
-def _speaks_of(text: str, known: set[str]) -> bool:
-    """Whether a text of the device names something, and nothing that the learner has not seen."""
-    names = set(re.findall(r"`(\w+)`", text))
-    return len(names) <= MOST_NAMES and known.issuperset(names) and "the input" not in text
+def _in_words(mistake: Mistake, known: set[str]) -> Mistake:
+    """The device's words without names that the learner has not seen, and without many."""
+    names = set(re.findall(r"`(\w+)`", mistake.says))
+    if not mistake.device or (len(names) <= MOST_NAMES and known.issuperset(names)):
+        return mistake
+    return replace(mistake, says=NAMES.sub(FOUND["unseen"], mistake.says))
 
 
 def _shape(array: Floats) -> str:
@@ -523,6 +522,7 @@ EDITS: dict[str, Edit] = {
 }
 ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh")
 NUMERIC = (int, float, np.generic, np.ndarray)
+NAMES = re.compile(r"(what is made of )?`\w+`((, | and )`\w+`)*")
 MOST_NAMES = 3  # of more of them no learner finds the place
 MOST_SITES = 55  # of more of them in one step no two are tried together
 
@@ -574,7 +574,7 @@ def _listed(names: Iterable[str]) -> str:
 def _argument_names(step: Step, count: int) -> list[str]:
     code = getattr(step, "__code__", None)
     names = [f"`{name}`" for name in code.co_varnames] if code else []
-    return (names + ["the input"] * count)[:count]
+    return (names + ["an intermediate result"] * count)[:count]
 
 
 def _edits_of(

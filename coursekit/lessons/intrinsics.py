@@ -70,57 +70,39 @@ REPROJECTION_RMS = Exercise(
 )
 
 
-def _with_hypot(axes: Floats) -> Floats:
-    return np.array([*axes[:2], np.hypot(*axes[:2])])
-
-
+for _step in ("axis", "shown"):  # whether or not the 2-D number is made of them
+    REPROJECTION_RMS.add_mistakes(
+        (_step, "mean_removed", lambda e, *_: np.std(e, axis=0)),
+        (_step, "divided_by_n_minus_1", lambda e, *_: np.sqrt(np.sum(e**2, axis=0) / (len(e) - 1))),
+        (_step, "mean_absolute", lambda e, *_: np.mean(np.abs(e), axis=0)),
+        (_step, "signed_mean", lambda e, *_: np.mean(e, axis=0)),
+        (_step, "mean_before_square", lambda e, *_: np.abs(np.mean(e, axis=0))),
+        (_step, "first_only", lambda e, *_: np.abs(e[0]) / math.sqrt(len(e))),
+        (_step, "first_only", lambda e, *_: np.abs(e[0])),
+        (_step, "first_column_twice", lambda e, *_: np.sqrt(np.mean(e**2, axis=0))[[0, 0]]),
+        (_step, "no_root", lambda e, *_: np.mean(e**2, axis=0)),
+        (_step, "summed", lambda e, *_: np.sqrt(np.sum(e**2, axis=0))),
+        (_step, "axis_over_2n", lambda e, *_: np.sqrt(np.sum(e**2, axis=0) / (2 * len(e)))),
+        (_step, "largest", lambda e, *_: np.max(np.abs(e), axis=0)),
+        (_step, "median_absolute", lambda e, *_: np.median(np.abs(e), axis=0)),
+        (_step, "wrong_axis", lambda e, *_: np.sqrt(np.mean(e**2, axis=1))[:2]),
+    )
 REPROJECTION_RMS.add_mistakes(
-    # The first ten are in the numbers of the two axes, whether or not the 2-D number is made of
-    # them.
-    ("axis", "mean_removed", lambda e: np.std(e, axis=0)),
-    ("shown", "mean_removed", lambda e, axes: np.std(e, axis=0)),
     (
         "whole",
         "mean_removed",
         lambda e, result: np.std(np.c_[e, np.linalg.norm(e, axis=1)], axis=0),
     ),
-    ("axis", "divided_by_n_minus_1", lambda e: np.sqrt(np.sum(e**2, axis=0) / (len(e) - 1))),
-    ("shown", "divided_by_n_minus_1", lambda e, axes: np.sqrt(np.sum(e**2, axis=0) / (len(e) - 1))),
-    ("axis", "mean_absolute", lambda e: np.mean(np.abs(e), axis=0)),
-    ("shown", "mean_absolute", lambda e, axes: np.mean(np.abs(e), axis=0)),
-    ("axis", "signed_mean", lambda e: np.mean(e, axis=0)),
-    ("shown", "signed_mean", lambda e, axes: np.mean(e, axis=0)),
-    ("axis", "mean_before_square", lambda e: np.abs(np.mean(e, axis=0))),
-    ("axis", "first_only", lambda e: np.abs(e[0]) / math.sqrt(len(e))),
-    ("axis", "first_only", lambda e: np.abs(e[0])),
-    (
-        "",
-        "rms_of_positions",
-        lambda f: lambda seen, predicted: _with_hypot(f(seen, 0 * seen) - f(predicted, 0 * seen)),
-    ),
-    ("axis", "first_column_twice", lambda e: np.sqrt(np.mean(e**2, axis=0))[[0, 0]]),
-    ("axis", "no_root", lambda e: np.mean(e**2, axis=0)),
-    ("shown", "no_root", lambda e, axes: np.mean(e**2, axis=0)),
-    ("axis", "summed", lambda e: np.sqrt(np.sum(e**2, axis=0))),
-    ("shown", "summed", lambda e, axes: np.sqrt(np.sum(e**2, axis=0))),
-    ("axis", "axis_over_2n", lambda e: np.sqrt(np.sum(e**2, axis=0) / (2 * len(e)))),
-    ("shown", "axis_over_2n", lambda e, axes: np.sqrt(np.sum(e**2, axis=0) / (2 * len(e)))),
-    ("axis", "largest", lambda e: np.max(np.abs(e), axis=0)),
-    ("shown", "largest", lambda e, axes: np.max(np.abs(e), axis=0)),
     (
         "whole",
         "largest",
         lambda e, result: np.max(np.abs(np.c_[e, np.linalg.norm(e, axis=1)]), axis=0),
     ),
-    ("axis", "median_absolute", lambda e: np.median(np.abs(e), axis=0)),
-    ("shown", "median_absolute", lambda e, axes: np.median(np.abs(e), axis=0)),
     (
         "whole",
         "median_absolute",
         lambda e, result: np.median(np.abs(np.c_[e, np.linalg.norm(e, axis=1)]), axis=0),
     ),
-    ("axis", "wrong_axis", lambda e: np.sqrt(np.mean(e**2, axis=1))[:2]),
-    ("shown", "wrong_axis", lambda e, axes: np.sqrt(np.mean(e**2, axis=1))[:2]),
     ("both", "both_over_2n", lambda residuals, axes: float(np.sqrt(np.mean(axes**2)))),
     ("both", "mean_distance", lambda e, axes: float(np.mean(np.linalg.norm(e, axis=1)))),
     ("both", "added", lambda residuals, axes: float(np.sum(axes))),
