@@ -118,7 +118,7 @@ def page(opened, name):
     prompt = opened.locator(".jp-CodeCell .jp-InputArea-prompt").last
     expect(prompt).to_have_text("[*]:")
     expect(prompt).to_have_text(re.compile(r"\[\d+\]:"))
-    yield opened
+    return opened
 
 
 def photograph(page, name):
