@@ -369,6 +369,15 @@ def rms_under(lens: Intrinsics, detections: Sequence[Detection], points: Floats)
     """The RMS in px (2-D) of corners under a camera that is held: only the poses are fitted.
 
     points (N, 3): the board's corners, m. A K that is wrong shows where the corners can tell.
+
+    >>> lens = Intrinsics(640, 480, 600, 600, 320, 240)
+    >>> board = Board("checkerboard", (10, 7), 0.025)
+    >>> turn = Rotation.from_euler("x", 30, degrees=True).as_matrix()
+    >>> seen = project(board.points @ turn.T + [-0.1, -0.1, 0.5], lens.K)
+    >>> views = [Detection(np.arange(54), seen, lens.size)]
+    >>> wrong = Intrinsics(640, 480, 660, 600, 320, 240)
+    >>> print(f"{rms_under(wrong, views, board.points):.1f} px")
+    1.7 px
     """
     import cv2
 
@@ -640,6 +649,11 @@ def coverage(detections: Sequence[Detection], cells: tuple[int, int] = (6, 8)) -
     """Where in the image the corners of all views lie.
 
     cells: (rows, columns) in which to count them. Raises ValueError for no detections.
+
+    >>> corners = np.array([[15.5, 11.5], [623.5, 11.5], [15.5, 467.5], [623.5, 467.5]])
+    >>> coverage([Detection(np.arange(4), corners, (640, 480))], (2, 2))
+    corners in 100 % of 2x2 image cells, out to 95 % of the half diagonal
+    empty margins: 2 % left, 2 % top, 2 % right, 2 % bottom
     """
     want(len(detections), "detections", 0, "at least one view")
     width, height = size = np.array(detections[0].size)
@@ -685,7 +699,12 @@ class Tilts:
 
 
 def tilts(result: IntrinsicsResult) -> Tilts:
-    """How far the board was tilted in each view."""
+    """How far the board was tilted in each view.
+
+    >>> from types import SimpleNamespace
+    >>> tilts(SimpleNamespace(T_camera_board=np.eye(4)[None]))
+    boards tilted 0 to 0 deg, spread 0 and 0 deg about x and y
+    """
     normals = result.T_camera_board[:, :3, 2]
     x, y, z = (normals * np.sign(normals[:, 2:])).T  # away from the camera, whatever the origin
     return Tilts(

@@ -65,8 +65,8 @@ def two_eyes(fx: float, baseline_m: float, distance_m: float) -> LessonFigure:
         ax.text(high, y, f"  {what}", va="center")
     above.set(xlim=(-40, 130), ylim=(-0.4, 2.15), xlabel="X (mm)", ylabel="Z (m)")
     above.set_title(f"Z = {distance_m:.2f} m, B = {1000 * baseline_m:.0f} mm")
-    image.set(xlim=(-150, 100), ylim=(-0.5, 2.5), xlabel="$u - c_x$ (px)")
-    image.set_yticks([0, 1], ["left eye's\nimage", "right eye's\nimage"])
+    image.set(xlim=(-150, 100), ylim=(-0.5, 2.5), xlabel="$u - c_x$ (px)", ylabel="in the eye")
+    image.set_yticks([0, 1], ["left", "right"])
     d = u["left"] - u["right"]
     image.set_title(f"d = {u['left']:.1f} - ({u['right']:.1f}) = {d:.1f} px")
     return fig.saying(

@@ -196,6 +196,11 @@ def without_mismatches(z: Floats, step: float | None) -> tuple[Floats, int]:
     """The stack (N, h, w) with NaN for mismatches, and their number.
 
     A mismatch is far from its pixel's median, or this median is far off the window's plane.
+
+    >>> z = np.full((5, 3, 3), 0.45)
+    >>> z[2, 1, 1] = 0.52
+    >>> without_mismatches(z, 0.0001)[1]
+    1
     """
     middle = valid_median(z)
     jumps = _far(z - middle, step)
@@ -500,7 +505,11 @@ def averaging_curve(series_m: ArrayLike) -> AveragingCurve:
 
 
 def valid_mean(values: Floats, axis: int) -> Floats:
-    """The mean without NaN, NaN where there is nothing else."""
+    """The mean without NaN, NaN where there is nothing else.
+
+    >>> valid_mean(np.array([[0.45, np.nan], [0.47, np.nan]]), axis=0)
+    array([0.46,  nan])
+    """
     return np.asarray(np.ma.masked_invalid(values).mean(axis=axis).filled(np.nan))
 
 
@@ -510,7 +519,12 @@ def valid_median(stack: Floats) -> Floats:
 
 
 def off_plane(images: Floats) -> float:
-    """RMS over the pixels of images (N, h, w), each about its own plane, see `about_plane`."""
+    """RMS over the pixels of images (N, h, w), each about its own plane, see `about_plane`.
+
+    >>> image = np.array([[0.5, 0.5, 0.5], [0.5, 0.509, 0.5], [0.5, 0.5, 0.5]])
+    >>> print(f"{off_plane(image[None]):.4f} m")
+    0.0028 m
+    """
     off = np.array([about_plane(image)[0] for image in images])
     return math.sqrt(np.nanmean(np.square(off))) if np.isfinite(off).any() else math.nan
 
