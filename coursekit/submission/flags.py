@@ -360,7 +360,7 @@ def _shared(one: StackPrint, others: Sequence[StackPrint]) -> list[tuple[bool, b
     rows = np.linspace(0, len(one.frames) - 1, min(len(one.frames), FRAMES_ASKED)).round()
     ask = one.frames[rows.astype(int)]
     likeness = _unit(ask) @ _unit(np.concatenate([other.frames for other in others])).T
-    ends = np.cumsum(sizes)
+    ends = np.cumsum(sizes, dtype=np.intp)
     most = np.partition(np.maximum.reduceat(likeness, ends - sizes, axis=1), -FRAMES_FOUND, axis=0)
     found = []
     for end, other, ninth in zip(ends, others, most[-FRAMES_FOUND], strict=True):
