@@ -504,7 +504,8 @@ def test_own_points_survive_a_regrade_which_says_what_changed(in_process, tmp_pa
     assert summary.kept == before.graded == 2
     assert own.read_bytes() == kept
     assert all(path.exists() for path in foreign)
-    assert [path.read_text() for path in out.glob("grades_edited_*.csv")] == ["edited"]
+    (edited,) = out.glob("grades_edited_*.csv")
+    assert edited.read_text(encoding="utf-8") == "edited"
     monkeypatch.setitem(grading_rules()["points"], "paragraph", 4)
     monkeypatch.setattr(batch, "grader_version", lambda: "another")
     (change,) = [c for c in graded(folder, out, overwrite=True).changes if c[0] == "b"]
