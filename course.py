@@ -130,7 +130,7 @@ NO_PIP = "Only `!pip` in a notebook needs it."
 NO_KERNELS = "The notebooks compile them when they need them, and the next start tries again."
 KERNELS = ("kernels", "simulation/raycast", "simulation/rig", "simulation/board_images")
 COMPILED = (COURSE, *(f"coursekit/{name}.py" for name in KERNELS))
-COMPILE = ("-m", "coursekit.warm_up")
+COMPILE = ("tools/warm_up.py",)
 # A module's tests, and the cells of a notebook, stay together in one of the two processes.
 TWO_PROCESSES = ("-n", "2", "--dist", "loadscope", "--no-loadscope-reorder")
 PIP = ("-m", "ensurepip", "--default-pip")
@@ -463,7 +463,7 @@ def lab(arguments: list[str]) -> int:
         print(__doc__)
         return 0
     COMPILING.unlink(missing_ok=True)  # of a start that was killed
-    later = ("pip", "kernels") if has_uv() else ("kernels",)
+    later = ("pip", "kernels") if "pip" in (read_state() or {}) or has_uv() else ("kernels",)
     set_up(("test", *later))
     from tools import copies
 

@@ -1,4 +1,4 @@
-"""The per-pixel loops of geometry, compiled by numba; its cache is filled by `warm_up`."""
+"""The per-pixel loops of geometry, compiled by numba; its cache is filled by `tools/warm_up.py`."""
 
 from __future__ import annotations
 

@@ -90,6 +90,8 @@ class Quantity:
             checks.number("sigma", self.sigma, "a standard deviation >= 0", least=0.0)
         checks.choice("kind", self.kind, (None, *get_args(ErrorKind)))
         want(self.unit, "unit", self.unit, "for example 'px', 'mm' or '1'")
+        for name in ("unit", "note"):
+            checks.instance(name, getattr(self, name), str)
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,7 @@ class Covariance:
     matrix: tuple[tuple[float, ...], ...]
 
     def __post_init__(self) -> None:
-        names = tuple(self.names)
+        names = tuple(checks.instance("names", name, str) for name in self.names)
         matrix = checks.covariance("matrix", self.matrix, len(names))
         object.__setattr__(self, "names", names)
         object.__setattr__(self, "matrix", tuple(map(tuple, matrix.tolist())))
@@ -245,6 +247,8 @@ def read(path: Path) -> Result:
         quantities = {k: Quantity(**v) for k, v in content.pop("quantities").items()}
         covariances = {k: Covariance(**v) for k, v in content.pop("covariances", {}).items()}
         checks.choice("source", content["source"], get_args(Source))
+        for name in ("lesson", "camera", "date"):
+            checks.instance(name, content[name], str)
         lens = content.pop("lens", None)
         content["lens"] = lens and Intrinsics.from_dict(lens)
         for name in ("placement", "eye_to_hand"):
@@ -408,7 +412,7 @@ def read_json(path: Path) -> Any:
     """The object in a JSON file; ValueError naming the file when it is damaged."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:  # also not UTF-8
+    except (ValueError, RecursionError) as error:  # also not UTF-8
         raise ValueError(f"{path.name}: not a JSON file ({error})") from error
     if not isinstance(content, dict):
         raise ValueError(f"{path.name}: got a {type(content).__name__}, want an object")

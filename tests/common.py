@@ -1,6 +1,9 @@
 """Boards, the bounds of counted shares and the form of refusals that many test modules share."""
 
+import json
 import os
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -53,3 +56,21 @@ def each(message, call, name, *values):
 def named(call, **bad):
     """Cases in which one argument is bad, and the message begins with its name."""
     return [c for name, values in bad.items() for c in each(rf"^{name}: ", call, name, *values)]
+
+
+def mutants(whole: Any) -> Iterator[str]:
+    """JSON of the same with one part of another shape, for each part; and what is no JSON."""
+    yield from ("", "[]", "\x00", "[" * 100_000, '{"a":' * 100_000)
+    others = (None, 5, -1e999, "x", [], [[]], {"x": []})
+    parts = [(whole, key) for key in whole]
+    while parts:
+        at, key = parts.pop()
+        kept = at[key]
+        for other in others:
+            at[key] = other
+            yield json.dumps(whole)
+        at[key] = kept
+        inside = (
+            kept if isinstance(kept, dict) else range(len(kept)) if isinstance(kept, list) else ()
+        )
+        parts += [(kept, below) for below in inside]

@@ -347,3 +347,13 @@ test_what_cannot_be_is_refused = refusals(
     ("^mount: ", lambda: eb.Chain(eb.lesson_view(), "eye_on_stalk")),
     ("^n: ", lambda: eb.monte_carlo(PLACE, eb.Covariances(), 0)),
 )
+
+
+def test_the_closing_column_of_noise_adds_up_to_the_sum_printed_below() -> None:
+    """What stays of a noise is in the single frame that the column speaks of."""
+    noisy = replace(eb.lesson_budget(stated=False)["depth noise"], floor=0.0006)
+    budget = eb.lesson_budget(stated=False).with_term(noisy).at(
+        T_base_camera=eb.looking_down(tilt_deg=25)
+    )  # fmt: skip
+    columns = [row.along_m[0] for row in budget.rows if row.term.kind == "noise"]
+    assert math.hypot(*columns) == pytest.approx(budget.along("closing").noise_m, rel=1e-6)

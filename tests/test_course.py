@@ -42,6 +42,7 @@ def project(tmp_path: Path, course: ModuleType) -> Path:
     (root / "course.py").write_bytes((ROOT / "course.py").read_bytes())
     for name in {name for step in course.STEPS for name in step.inputs}:
         (root / name).write_text(f"# {name}\n", encoding="utf-8")
+    (root / "tools/warm_up.py").touch()
     (root / "tools/bench.py").write_text("print('bench ran')\n", encoding="utf-8")
     (root / "stand-ins/ensurepip").mkdir(parents=True)
     (root / "stand-ins/ensurepip/__init__.py").touch()
@@ -49,10 +50,7 @@ def project(tmp_path: Path, course: ModuleType) -> Path:
         "import pathlib, sysconfig\n"
         "folder = pathlib.Path(sysconfig.get_path('purelib'))\n"
         "(folder / 'pip').mkdir(parents=True)\n"
-        f"(folder / 'pip/__main__.py').write_text({PIP!r})\n"
-        "(folder / 'coursekit').mkdir()\n"
-        "(folder / 'coursekit/__init__.py').touch()\n"
-        "(folder / 'coursekit/warm_up.py').touch()\n",
+        f"(folder / 'pip/__main__.py').write_text({PIP!r})\n",
         encoding="utf-8",
     )
     return root

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from common import mutants
 from simulated_hand_eye import holds
 
 from coursekit.arm import ArmErrors, widowx
@@ -367,3 +368,22 @@ def test_folders_that_are_no_session(small, tmp_path) -> None:
     (small / "poses.csv").write_text("\n".join(text.splitlines()[:3]), encoding="utf-8")
     with pytest.raises(ValueError, match="2 usable pairs"):
         read(small, **known)
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_a_damaged_folder_is_a_sentence(tmp_path):
+    lens = {"width": 640, "height": 480, "fx": 600.0, "fy": 600.0, "cx": 320.0, "cy": 240.0}
+    board = {"kind": "charuco", "squares": [9, 12], "square_m": 0.02}
+    card = {"mount": "eye_in_hand", "board": board, "intrinsics": lens}
+    lines = [f"v{i}.png,0.{i},0.2,0.3,0,0,0,1\n" for i in range(5)]
+    poses = "".join(["file,x,y,z,qx,qy,qz,qw\n", *lines]).encode()
+    random, tables = np.random.default_rng(1), [poses]
+    for sign in (b'"', b"'", b";", b"\0", b"\xff", b"nan", b"1e999", b"9" * 400, b"x" * 200_000):
+        for at in random.integers(0, len(poses), 20):
+            tables.append(poses[:at] + sign + poses[at + 1 :])
+    cards = [*mutants(card), json.dumps(card | {"board": board | {"squares": [10**9] * 2}})]
+    for text, table in [(c, poses) for c in cards] + [(json.dumps(card), t) for t in tables]:
+        (tmp_path / "session.json").write_text(text, encoding="utf-8")
+        (tmp_path / "poses.csv").write_bytes(table)
+        with pytest.raises(ValueError, match=r"\w+.*: "):
+            HandEyeSession.from_folder(tmp_path, progress=False)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from common import mutants
 
 import coursekit as ck
 from coursekit import lessons, results
 from coursekit.lessons.questions import Choice
-from coursekit.results import Quantity
+from coursekit.results import Covariance, Quantity
 
 CAMERA = SimpleNamespace(source="live", name="D435 on the bench")
 
@@ -72,6 +75,32 @@ def test_a_damaged_result_is_named() -> None:
     now = ck.progress()
     assert "cannot be read" in now.standings[0].result
     assert "01_pinhole" in now.next
+
+
+@pytest.mark.filterwarnings("ignore:progress.json is damaged")
+def test_files_of_another_shape_stop_nothing() -> None:
+    name = next(iter(lessons.CHECKPOINTS))
+    lessons.CHECKPOINTS[name].answer("A")
+    covariance = {"two": Covariance(("fx", "k1"), [[1.0, 0.0], [0.0, 1.0]])}
+    quantities = {"fx": Quantity(430.0, "px", 1.0, note="a"), "k1": Quantity(0.1, "1")}
+    kept = [
+        results.folder() / "progress.json",
+        results.save("01_pinhole", CAMERA, quantities, covariance),
+    ]
+    for path in kept:
+        text = path.read_text(encoding="utf-8")
+        for mutant in mutants(json.loads(text)):
+            path.write_text(mutant, encoding="utf-8")
+            assert "01_pinhole" in repr(ck.progress()) + ck.progress()._repr_html_()
+            assert repr(ck.evidence(name.partition(".")[0]))
+            with contextlib.suppress(ValueError):
+                repr(results.load("01_pinhole"))
+        path.write_text(text, encoding="utf-8")
+    kept[0].write_text('{"a": 1}', encoding="utf-8")
+    with pytest.warns(UserWarning, match=r"damaged .*a: got int, want list.*set aside as"):
+        ck.progress()
+    ck.progress()  # says it once
+    assert not kept[0].exists()
 
 
 def test_when_all_is_kept_it_names_what_is_open() -> None:

@@ -79,8 +79,9 @@ class Board:
     def __post_init__(self) -> None:
         fewest = FEWEST_SQUARES[choice("kind", self.kind, get_args(BoardKind))]
         squares = np.asarray(self.squares)
-        fits = squares.dtype.kind in "iu" and squares.shape == (2,) and squares.min() >= fewest
-        wanted = f"(columns, rows) of squares, at least {fewest} each (inner corners are one fewer)"
+        fits = squares.dtype.kind in "iu" and squares.shape == (2,)
+        fits = fits and fewest <= squares.min() and squares.max() <= 1000
+        wanted = f"(columns, rows) of squares, {fewest} to 1000 each (inner corners are one fewer)"
         want(fits, "squares", self.squares, wanted)
         object.__setattr__(self, "squares", tuple(squares.tolist()))
         object.__setattr__(self, "square_m", _side("square_m", self.square_m))

@@ -189,12 +189,15 @@ class ErrorTerm:
         return np.asarray(matrix @ checks.array("mean", self.mean, (matrix.shape[1],)))
 
     def ends_m(self, view: View, matrix: Floats, direction: Floats) -> Interval:
-        """(low, high) of a bias's part along a direction (3,), each with its greatest effect there.
+        """(low, high) of a term's part along a direction (3,), each with its greatest effect there.
 
-        matrix: that of this view, known already.
+        matrix: that of this view, known already. For noise both are a single frame's, what repeats
+        included.
         """
         gain, middle = float(np.linalg.norm(direction @ matrix)), direction @ self.middle_m(view)
         (low, high), off = self.range, abs(float(middle))
+        if self.kind == "noise":
+            low = high = math.hypot(high, self.floor)
         return max(low * gain, off - high * gain), off + high * gain
 
     def at_object_m(self, view: View) -> Interval:

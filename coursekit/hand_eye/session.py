@@ -337,11 +337,11 @@ class HandEyeSession:
 def _card(folder: Path) -> dict[str, Any]:
     """What session.json says, {} where there is none."""
     path = folder / SESSION
-    if not path.exists():
+    if not path.is_file():
         return {}
     try:
         card = json.loads(path.read_text("utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"folder: {SESSION} is no JSON ({error})") from error
     return instance(SESSION, card, dict)
 
@@ -355,7 +355,7 @@ def _from_card(card: dict[str, Any], key: str) -> Any:
 def _board(card: dict[str, Any]) -> Board:
     try:
         return Board(**card | {"squares": tuple(card["squares"])})
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"board: {SESSION} does not describe one ({error})") from error
 
 
@@ -364,7 +364,7 @@ def _table(
 ) -> tuple[dict[str, dict[str, Any]], list[Skipped]]:
     """The usable rows of poses.csv by their file, and what is wrong with the others."""
     path = folder / POSES
-    if not path.exists():
+    if not path.is_file():
         raise ValueError(f"folder: has no {POSES}, the table of arm poses")
     table, read = pose_files.read_table(path, **notation)
     columns = set(table.places)

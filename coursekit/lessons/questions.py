@@ -11,13 +11,14 @@ import html
 import math
 import re
 import tomllib
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from coursekit import results
+from coursekit import checks, results
 
 EXAMPLES = "0.37 or 150"  # of numbers, and no checkpoint's answer
 LENGTHS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
@@ -377,10 +378,16 @@ def read_attempts() -> dict[str, list[dict[str, Any]]]:
     Each attempt has the keys kind (as in `Verdict`), answer and date.
     """
     path = results.folder() / RECORD
-    if not path.exists():
+    if not path.is_file():
         return {}
     try:
-        return dict(results.read_json(path))
-    except ValueError:
-        path.replace(path.with_suffix(".damaged.json"))
+        found: dict[str, list[dict[str, Any]]] = results.read_json(path)
+        for name, tries in found.items():
+            for attempt in checks.instance(name, tries, list):
+                for key in ("kind", "answer", "date"):
+                    checks.instance(key, attempt[key], str)
+        return found
+    except (KeyError, TypeError, ValueError) as error:
+        aside = path.replace(path.with_suffix(".damaged.json")).name
+        warnings.warn(f"{RECORD} is damaged ({error}): set aside as {aside}", stacklevel=2)
         return {}

@@ -39,6 +39,7 @@ FRAME_LIKENESS = (
 COMPARED, MOST_FRAMES = 150_000, 40_000  # pairs of stacks in all, and frames for each, at most
 FRAMES_ASKED = 12  # frames of a stack that are looked for in others
 FRAMES_FOUND = 9  # of these, for the stacks to be the same measurement
+STRANGERS, STANDS_OUT = 0.55, 0.3  # second look: a likeness worth it, and the lead (atanh) it asks
 PERFECT_CLOCK_S = 1e-8  # no real clock keeps step so well
 WORDS_IN_A_ROW = 3  # words in a row, by which paragraphs are compared
 MOODLE = re.compile(
@@ -228,8 +229,8 @@ def _one_stack_twice(prints: Sequence[StackPrint]) -> Iterator[Flag]:
     """Whether one distance was made out of another."""
     for i, one in enumerate(prints):
         for two in prints[:i]:
-            alike = max(_shared(one, [two])[0][0], _shared(two, [one])[0][0])
-            if one.digest == two.digest or alike >= FRAMES_FOUND:
+            alike = _shared(one, [two])[0][0] or _shared(two, [one])[0][0]
+            if one.digest == two.digest or alike:
                 yield _flag("one_stack_twice", one=two.distance_m, two=one.distance_m)
 
 
@@ -346,39 +347,50 @@ def _unit(values: NDArray[np.int8]) -> NDArray[np.float32]:
     return np.asarray(rows / np.where(length > 0, length, 1.0), np.float32)
 
 
-def _shared(one: StackPrint, others: Sequence[StackPrint]) -> list[tuple[int, bool]]:
-    """How many of some frames of `one` are in each of the others, and whether exactly."""
-    n = len(one.frames)
+def _shared(one: StackPrint, others: Sequence[StackPrint]) -> list[tuple[bool, bool]]:
+    """Whether some frames of `one` are in each of the others, and whether exactly.
+
+    Either most are found at once, or on average the nearest frame stands out from the next one, as
+    it does under noise as large as the camera's, and never with a stranger.
+    """
+    sizes = [len(other.frames) for other in others]
+    n = min([len(one.frames), *sizes])
     if n < FRAMES_FOUND or not others:
-        return [(0, False)] * len(others)
-    ask = one.frames[np.linspace(0, n - 1, min(n, FRAMES_ASKED)).round().astype(int)]
-    every = np.concatenate([other.frames for other in others])
-    ends = np.cumsum([len(other.frames) for other in others])
-    likeness = _unit(ask) @ _unit(every).T
+        return [(False, False)] * len(others)
+    rows = np.linspace(0, len(one.frames) - 1, min(len(one.frames), FRAMES_ASKED)).round()
+    ask = one.frames[rows.astype(int)]
+    likeness = _unit(ask) @ _unit(np.concatenate([other.frames for other in others])).T
+    ends = np.cumsum(sizes, dtype=np.intp)
+    most = np.partition(np.maximum.reduceat(likeness, ends - sizes, axis=1), -FRAMES_FOUND, axis=0)
     found = []
-    for end, other in zip(ends, others, strict=True):
+    for end, other, ninth in zip(ends, others, most[-FRAMES_FOUND], strict=True):
         part = likeness[:, end - len(other.frames) : end]
-        hits = np.flatnonzero(part.max(axis=1, initial=0) >= FRAME_LIKENESS)
+        best = part.max(axis=1)
+        hits = np.flatnonzero(best >= FRAME_LIKENESS)
+        alike = bool(ninth >= FRAME_LIKENESS)
+        if STRANGERS < ninth < FRAME_LIKENESS:
+            two = np.arctanh(np.clip(np.partition(part, -2, axis=1)[:, -2:], 0, 0.99))
+            alike = bool((two[:, 1] - two[:, 0]).mean() >= STANDS_OUT)
         same = len(hits) and (other.frames[part[hits].argmax(axis=1)] == ask[hits]).all()
-        found.append((len(hits), bool(same)))
+        found.append((alike, alike and bool(same)))
     return found
 
 
 def copies(prints: Mapping[str, Fingerprint]) -> list[Copy]:
     """Bundles whose raw data are identical or nearly so, by their keys: one `Copy` a group.
 
-    Found whatever the order and number of the frames, mirrored, turned, transposed or rolled, with
-    a constant or a little noise added, rescaled, a few values changed. In a large class a stack is
+    Found whatever the order and number of the frames, mirrored, turned, transposed, rolled, with
+    noise of a count or a constant added, rescaled, some values changed. In a large class a stack is
     compared with those of the nearest level, so that the work is bounded.
     """
     stacks = [(k, s) for k, p in prints.items() for s in p.stacks if len(s.frames) >= FRAMES_FOUND]
     levels = np.array([stack.level for _, stack in stacks]).reshape(len(stacks), N_WAVES)
-    pairs: dict[tuple[str, str], dict[float, tuple[int, bool]]] = {}
+    pairs: dict[tuple[str, str], dict[float, bool]] = {}
     first: dict[tuple[str, ...], str] = {}
     for key, fingerprint_of in prints.items():
         digests = tuple(sorted(stack.digest for stack in fingerprint_of.stacks))
         if digests and first.setdefault(digests, key) != key:
-            pairs[first[digests], key] = {s.distance_m: (12, True) for s in fingerprint_of.stacks}
+            pairs[first[digests], key] = {s.distance_m: True for s in fingerprint_of.stacks}
     alone = {*first.values()}
     for i, (key, stack) in enumerate(stacks):
         if key not in alone:
@@ -388,10 +400,11 @@ def copies(prints: Mapping[str, Fingerprint]) -> list[Copy]:
         near = near[: max(24, COMPARED // len(stacks))]
         frames = np.cumsum([len(its.frames) for _, its in near])
         near = near[: 1 + int(np.searchsorted(frames, MOST_FRAMES))]
-        for (other, _), found in zip(near, _shared(stack, [s for _, s in near]), strict=True):
-            if found[0] >= FRAMES_FOUND:
+        likes = _shared(stack, [s for _, s in near])
+        for (other, _), (alike, exact) in zip(near, likes, strict=True):
+            if alike:
                 part = pairs.setdefault((min(key, other), max(key, other)), {})
-                part[stack.distance_m] = max(found, part.get(stack.distance_m, found))
+                part[stack.distance_m] = exact or part.get(stack.distance_m, False)
     return [_copy(keys, pairs, prints) for keys in _groups(list(prints), list(pairs))]
 
 
@@ -411,22 +424,20 @@ def _groups(keys: Sequence[Any], pairs: Sequence[tuple[Any, Any]]) -> list[list[
 
 def _copy(
     keys: Sequence[str],
-    pairs: Mapping[tuple[str, str], Mapping[float, tuple[int, bool]]],
+    pairs: Mapping[tuple[str, str], Mapping[float, bool]],
     prints: Mapping[str, Fingerprint],
 ) -> Copy:
     """What is said of a group: how much the same they are, and why that may be by right."""
     some = [prints[key] for key in keys]
     parts = [found for pair, part in pairs.items() if pair[0] in keys for found in part.items()]
     digests = {tuple(sorted(stack.digest for stack in one.stacks)) for one in some}
-    exact = all(same for _, (_, same) in parts)
+    exact = all(same for _, same in parts)
     many = f"{len(keys)} bundles have" if len(keys) > 2 else "Two bundles have"
     if len(digests) == 1:
         code, says = "identical", f"{many} the same raw depths, byte for byte"
     else:
         where = " and ".join(f"{z:.2f} m" for z in sorted({z for z, _ in parts}))
-        share = sum(n for _, (n, _) in parts) / (FRAMES_ASKED * len(parts))
-        kind = "the same" if exact else "nearly the same"
-        says = f"{many} {kind} frames at {where} ({min(share, 1):.0%} of those looked for)"
+        says = f"{many} {'the same' if exact else 'nearly the same'} frames at {where}"
         code = "nearly_identical"
     innocent = ""
     if len({person(one.student) for one in some}) == 1:

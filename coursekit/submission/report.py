@@ -479,7 +479,7 @@ def _law_curves(
     z = np.linspace(axes.low, axes.high, 40)
     middle, low, high = ((1e3 * curve).tolist() for curve in found.law.std_m(z))
     band = np.minimum(low + high[::-1], axes.top)
-    key.append(("law", f"law with their σ_d of {found.law.sigma_d_px:.3f} px"))
+    key.append(("law", f"law with their σ_d of {found.law.sigma_d_px:.3f} px, and its 95 % band"))
     if rounding_shows(min(ends)):
         key.append(("rounded", f"the same in depth counts of {step_mm:g} mm"))
     shows = rounding_shows(axes.low)

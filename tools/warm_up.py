@@ -1,4 +1,4 @@
-"""Compile every numba kernel once and leave it in the cache: `python -m coursekit.warm_up`."""
+"""Compile every numba kernel once and leave it in the cache: `python tools/warm_up.py`."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+import coursekit
 from coursekit import geometry, simulation
 from coursekit.boards import Board
 from coursekit.geometry import Intrinsics, make_transform
@@ -14,7 +15,7 @@ from coursekit.simulation.board_images import render_board
 
 def forget() -> None:
     """Empty the cache: a cached kernel does not notice that one which it calls has changed."""
-    for folder in Path(__file__).parent.rglob("__pycache__"):
+    for folder in Path(coursekit.__file__).parent.rglob("__pycache__"):
         for file in (*folder.glob("*.nbi"), *folder.glob("*.nbc")):
             file.unlink(missing_ok=True)
 
