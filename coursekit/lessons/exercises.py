@@ -522,7 +522,7 @@ EDITS: dict[str, Edit] = {
 }
 ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh")
 NUMERIC = (int, float, np.generic, np.ndarray)
-NAMES = re.compile(r"(what is made of )?`\w+`((, | and )`\w+`)*")
+NAMES = re.compile(r"(what is made of )?`\w+`((, | and | of )`\w+`)*")
 MOST_NAMES = 3  # of more of them no learner finds the place
 MOST_SITES = 55  # of more of them in one step no two are tried together
 
