@@ -185,7 +185,7 @@ right = ROBUST_DEPTH.model()
         (lambda *args: [right(*args)], "wrong", "shape (1,), and one number is wanted"),
         (lambda *args: np.array(right(*args)), "right", "All 22 cases agree"),
         (lambda *args: "0.45", "wrong", "a str"),
-        (lambda *args: math.nan, "wrong", "the same in every case"),
+        (lambda *args: math.nan, "wrong", "runs away"),
         (nan_for_zero_in_place, "wrong", "changes the array it is given. The numbers are right"),
         (lambda image, u, v: 0.45, "raised", "positional arguments"),
     ],

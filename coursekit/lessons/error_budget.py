@@ -39,7 +39,7 @@ SENSITIVITIES = Exercise(
     ],
     per_row=0,
     unit="m/px, 1 and m",
-    tolerance=1e-10,
+    tolerance=1e-9,
     describe=lambda args: (
         "u = {:g} px, Z = {:g} m, fx = {:g} px, cx = {:g} px, depth error {:g} m".format(*args)
     ),
@@ -61,6 +61,11 @@ SENSITIVITIES.add_mistakes(
     ("depth", "other_way", lambda u, Z, fx, cx: (cx - u) / fx),
     ("depth", "angle", lambda u, Z, fx, cx: math.atan2(u - cx, fx)),
     ("depth", "sine", lambda u, Z, fx, cx: (u - cx) / math.hypot(u - cx, fx)),
+    ("leak", "leak_is_the_error", lambda dX_du, dX_dZ, depth_error, Z: depth_error),
+    ("", "at_the_wrong_depth", lambda f: lambda u, Z, fx, cx, off: f(u, Z + off, fx, cx, off)),
+    ("pixel", "floored", lambda u, Z, fx, cx: Z // fx),
+    ("depth", "floored", lambda u, Z, fx, cx: (u - cx) // fx),
+    ("depth", "u_with_Z", lambda u, Z, fx, cx: (cx - u) / Z),
     ("leak", "wrong_price", lambda dX_du, dX_dZ, depth_error, Z: dX_du * depth_error),
     ("leak", "sign_lost", lambda dX_du, dX_dZ, depth_error, Z: abs(dX_dZ * depth_error)),
     ("leak", "millimetres", lambda dX_du, dX_dZ, depth_error, Z: 1000 * dX_dZ * depth_error),
@@ -79,7 +84,7 @@ def _build_sums(steps: Mapping[str, Step]) -> Model:
     def add_up(rows: Rows, tolerance: float) -> Floats:
         noise, bias = steps["kinds"](rows)
         along = steps["along"]
-        noises = [high * along(toward) for _, high, toward, _ in noise]
+        noises = [high * steps["noise part"](toward, along) for _, high, toward, _ in noise]
         most = [steps["most"](low, high, toward) * along(toward) for low, high, toward, _ in bias]
         squares, others = (
             [
@@ -139,6 +144,7 @@ ADD_UP = Exercise(
         "kinds": _sorted,
         "along": _along,
         "most": lambda low, high, toward: high,
+        "noise part": lambda toward, along: along(toward),
         "noise": _root,
         "worst": sum,
         "quadrature": _root,
@@ -177,6 +183,9 @@ def _row_in_words(row: tuple[float, float, Any, str]) -> str:
 ADD_UP.add_mistakes(
     ("kinds", "kinds_exchanged", lambda rows: _sorted(rows)[::-1]),
     ("kinds", "noise_in_the_bias", lambda rows: (_sorted(rows)[0], rows)),
+    ("kinds", "kind_ignored", lambda rows: (rows, rows)),
+    ("", "first_row_only", lambda sums: lambda rows, tolerance: sums(rows[:1], tolerance)),
+    ("noise part", "noise_shared_out", lambda way, along: along(way) if way else 3**-0.5),
     ("summed", "noise_in_the_bias", lambda most, noises: most + noises),
     ("kinds", "bias_in_the_noise", lambda rows: (rows, _sorted(rows)[1])),
     ("along", "not_projected", lambda toward: 1.0),
@@ -216,6 +225,7 @@ ADD_UP.add_mistakes(
     ("rigs", "noise_in_the_share", lambda squares, noises, others: sum(squares) + sum(others)),
     ("sigma", "variance_for_sigma", lambda variance, most: variance),
     ("sigma", "quadrature_for_sigma", lambda variance, most: _root(most)),
+    ("sigma", "quadrature_over_root_3", lambda variance, most: _root(most) / 3**0.5),
     ("sigma", "worst_for_sigma", lambda variance, most: sum(most)),
     ("share", "one_sided", lambda z: _beyond(z) / 2),
     ("share", "within_for_beyond", lambda z: 1 - _beyond(z)),

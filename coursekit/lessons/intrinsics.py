@@ -64,50 +64,45 @@ REPROJECTION_RMS = Exercise(
     ],
     per_row=0,
     unit="px",
-    tolerance=1e-7,
+    tolerance=5e-5,
     describe=_describe_rms,
     show=lambda row: "(" + ", ".join(f"{v:.4f}" for v in np.ravel(row)) + ")",
 )
 
 
+for _step in ("axis", "shown"):  # whether or not the 2-D number is made of them
+    REPROJECTION_RMS.add_mistakes(
+        (_step, "mean_removed", lambda e, *_: np.std(e, axis=0)),
+        (_step, "divided_by_n_minus_1", lambda e, *_: np.sqrt(np.sum(e**2, axis=0) / (len(e) - 1))),
+        (_step, "mean_absolute", lambda e, *_: np.mean(np.abs(e), axis=0)),
+        (_step, "signed_mean", lambda e, *_: np.mean(e, axis=0)),
+        (_step, "mean_before_square", lambda e, *_: np.abs(np.mean(e, axis=0))),
+        (_step, "first_only", lambda e, *_: np.abs(e[0]) / math.sqrt(len(e))),
+        (_step, "first_only", lambda e, *_: np.abs(e[0])),
+        (_step, "first_column_twice", lambda e, *_: np.sqrt(np.mean(e**2, axis=0))[[0, 0]]),
+        (_step, "no_root", lambda e, *_: np.mean(e**2, axis=0)),
+        (_step, "summed", lambda e, *_: np.sqrt(np.sum(e**2, axis=0))),
+        (_step, "axis_over_2n", lambda e, *_: np.sqrt(np.sum(e**2, axis=0) / (2 * len(e)))),
+        (_step, "largest", lambda e, *_: np.max(np.abs(e), axis=0)),
+        (_step, "median_absolute", lambda e, *_: np.median(np.abs(e), axis=0)),
+        (_step, "wrong_axis", lambda e, *_: np.sqrt(np.mean(e**2, axis=1))[:2]),
+    )
 REPROJECTION_RMS.add_mistakes(
-    # The first ten are in the numbers of the two axes, whether or not the 2-D number is made of
-    # them.
-    ("axis", "mean_removed", lambda e: np.std(e, axis=0)),
-    ("shown", "mean_removed", lambda e, axes: np.std(e, axis=0)),
     (
         "whole",
         "mean_removed",
         lambda e, result: np.std(np.c_[e, np.linalg.norm(e, axis=1)], axis=0),
     ),
-    ("axis", "divided_by_n_minus_1", lambda e: np.sqrt(np.sum(e**2, axis=0) / (len(e) - 1))),
-    ("shown", "divided_by_n_minus_1", lambda e, axes: np.sqrt(np.sum(e**2, axis=0) / (len(e) - 1))),
-    ("axis", "mean_absolute", lambda e: np.mean(np.abs(e), axis=0)),
-    ("shown", "mean_absolute", lambda e, axes: np.mean(np.abs(e), axis=0)),
-    ("axis", "signed_mean", lambda e: np.mean(e, axis=0)),
-    ("shown", "signed_mean", lambda e, axes: np.mean(e, axis=0)),
-    ("axis", "no_root", lambda e: np.mean(e**2, axis=0)),
-    ("shown", "no_root", lambda e, axes: np.mean(e**2, axis=0)),
-    ("axis", "summed", lambda e: np.sqrt(np.sum(e**2, axis=0))),
-    ("shown", "summed", lambda e, axes: np.sqrt(np.sum(e**2, axis=0))),
-    ("axis", "axis_over_2n", lambda e: np.sqrt(np.sum(e**2, axis=0) / (2 * len(e)))),
-    ("shown", "axis_over_2n", lambda e, axes: np.sqrt(np.sum(e**2, axis=0) / (2 * len(e)))),
-    ("axis", "largest", lambda e: np.max(np.abs(e), axis=0)),
-    ("shown", "largest", lambda e, axes: np.max(np.abs(e), axis=0)),
     (
         "whole",
         "largest",
         lambda e, result: np.max(np.abs(np.c_[e, np.linalg.norm(e, axis=1)]), axis=0),
     ),
-    ("axis", "median_absolute", lambda e: np.median(np.abs(e), axis=0)),
-    ("shown", "median_absolute", lambda e, axes: np.median(np.abs(e), axis=0)),
     (
         "whole",
         "median_absolute",
         lambda e, result: np.median(np.abs(np.c_[e, np.linalg.norm(e, axis=1)]), axis=0),
     ),
-    ("axis", "wrong_axis", lambda e: np.sqrt(np.mean(e**2, axis=1))[:2]),
-    ("shown", "wrong_axis", lambda e, axes: np.sqrt(np.mean(e**2, axis=1))[:2]),
     ("both", "both_over_2n", lambda residuals, axes: float(np.sqrt(np.mean(axes**2)))),
     ("both", "mean_distance", lambda e, axes: float(np.mean(np.linalg.norm(e, axis=1)))),
     ("both", "added", lambda residuals, axes: float(np.sum(axes))),
@@ -168,7 +163,7 @@ FOCAL_SIGMA = Exercise(
     ],
     per_row=0,
     unit="px",
-    tolerance=1e-9,
+    tolerance=1e-6,
     describe=lambda args: (
         f"J is {args[0].shape[0]}x{args[0].shape[1]}"
         + (f" with rows {args[0].tolist()}, residuals {args[1].tolist()}" * (len(args[0]) < 7))
@@ -188,6 +183,10 @@ FOCAL_SIGMA.add_mistakes(
     ("noise", "noise_summed", lambda e, freedom: e @ e),
     ("noise", "spread_of_residuals", lambda residuals, freedom: np.var(residuals)),
     ("noise", "spread_of_residuals", lambda residuals, freedom: np.var(residuals, ddof=1)),
+    ("noise", "mean_taken_off", lambda e, freedom: len(e) * np.var(e) / freedom),
+    ("noise", "divided_twice", lambda e, freedom: np.mean(e**2) / freedom),
+    ("noise", "square_of_the_sum", lambda e, freedom: np.sum(e) ** 2 / freedom),
+    ("scale", "root_of_the_noise_alone", lambda noise, first: noise * first**2),
     ("noise", "two_dimensional_rms", lambda residuals, freedom: 2 * np.mean(residuals**2)),
     ("first", "others_known", lambda information: 1.0 / information[0, 0]),
     ("first", "not_inverted", lambda information: information[0, 0]),

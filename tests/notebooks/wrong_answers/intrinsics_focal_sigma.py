@@ -30,7 +30,7 @@ changed(
         "np.sqrt(C[0, 0]) -> 1.96 * np.sqrt(C[0, 0])": "ninety_five",
         "(M - P) -> M and np.sqrt(C[0, 0]) -> C[0, 0]": "several, first nothing_fitted",
         "C[0, 0] -> np.diag(C)": None,
-        "residuals @ residuals -> np.var(residuals) * M": None,
+        "residuals @ residuals -> np.var(residuals) * M": "mean_taken_off",
         "np.linalg.inv(J.T @ J) -> (J @ J.T) * residuals @ J.T": "raised",
     },
 )
