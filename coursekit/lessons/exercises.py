@@ -498,7 +498,7 @@ def _in_words(mistake: Mistake, known: set[str]) -> Mistake:
     names = set(re.findall(r"`(\w+)`", mistake.says))
     if not mistake.device or (len(names) <= MOST_NAMES and known.issuperset(names)):
         return mistake
-    return replace(mistake, says=NAMES.sub(FOUND["unseen"], mistake.says))
+    return replace(mistake, says=_NAMED.sub(FOUND["unseen"], mistake.says))
 
 
 def _shape(array: Floats) -> str:
@@ -522,7 +522,7 @@ EDITS: dict[str, Edit] = {
 }
 ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh")
 NUMERIC = (int, float, np.generic, np.ndarray)
-NAMES = re.compile(r"(what is made of )?`\w+`((, | and )`\w+`)*")
+_NAMED = re.compile(r"(what is made of )?`\w+`((, | and | of )`\w+`)*")
 MOST_NAMES = 3  # of more of them no learner finds the place
 MOST_SITES = 55  # of more of them in one step no two are tried together
 
