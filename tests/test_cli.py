@@ -87,7 +87,7 @@ def test_board_writes_a_sheet_and_says_what_it_is(tmp_path, capsys):
 
 
 BOARD = "board --squares 9 --square-mm 25 --out a.pdf"
-WRONG = ["", "fly", "board", BOARD, "record", "record --out a.db3", "record --frames x", "grade ."]
+WRONG = ["", "fly", "board", BOARD, "record", "record --out a.db3", "record --frames x", "grade"]
 
 
 @pytest.mark.parametrize("arguments", WRONG)

@@ -278,14 +278,16 @@ def test_paths_are_said_as_somebody_in_the_course_would_type_them(tmp_path, monk
 
 
 def test_what_was_answered_goes_along(kept, own_results):
-    results.write_json(
-        own_results / questions.RECORD,
-        {
-            "depth_noise.width": [{"kind": "wrong"}, {"kind": "right"}],
-            "depth_noise.robust_depth": [{"kind": "core right"}],
-            "pinhole.zoom": [{"kind": "right"}],
-        },
-    )
+    kinds = {
+        "depth_noise.width": ("wrong", "right"),
+        "depth_noise.robust_depth": ("core right",),
+        "pinhole.zoom": ("right",),
+    }
+    tried = {
+        name: [{"kind": kind, "answer": "", "date": results.now()} for kind in tries]
+        for name, tries in kinds.items()
+    }
+    results.write_json(own_results / questions.RECORD, tried)
     found = handing_in.outcomes()
     assert {name: (o.right, o.attempts) for name, o in found.items()} == {
         "depth_noise.width": (True, 2),
