@@ -168,7 +168,7 @@ class Draggable:
 
         fields = {}
         for name, (low, high, start) in self.sliders.items():
-            step = 10.0 ** math.floor(math.log10((high - low) / 50))
+            step = 10.0 ** math.floor(math.log10((high - low) / 40))  # 40 to 400 of them
             fields[name] = ipywidgets.FloatSlider(
                 value=start,
                 min=start - step * math.floor((start - low) / step),  # a slider counts from here
