@@ -6,9 +6,11 @@ import copy
 import html
 import textwrap
 import time
+import tomllib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Self, TypeVar, overload
+from pathlib import Path
+from typing import Any, Self, TypeVar, overload
 
 from coursekit.arrays import Interval
 from coursekit.checks import is_number, want
@@ -24,6 +26,20 @@ def wrapped(text: str, width: int = WIDTH, first: str = "", indent: str = "  ") 
         kept, width, initial_indent=first, subsequent_indent=indent, break_on_hyphens=False
     )
     return filled.replace("\0", " ")
+
+
+class Sentences:
+    """What a room says, as the texts.toml beside a file of it has it: `say(name, facts=...)`.
+
+    texts: that table. Raises KeyError for a name or a fact that is not there.
+    """
+
+    def __init__(self, file: str) -> None:
+        path = Path(file).with_name("texts.toml")
+        self.texts: dict[str, Any] = tomllib.loads(path.read_text("utf-8"))
+
+    def __call__(self, sentence: str, /, **facts: Any) -> str:
+        return str(self.texts[sentence].format(**facts))
 
 
 def with_notes(text: str, notes: Sequence[str]) -> str:
