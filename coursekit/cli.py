@@ -13,7 +13,6 @@ import tomllib
 from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 import coursekit as ck
 from coursekit import doctor
