@@ -253,13 +253,7 @@ def _damped_step(J: Floats, miss: Floats) -> Floats:
 @cache
 def widowx() -> Arm:
     """The WidowX AI follower arm with its wrist camera, from data/wxai.json; arrays read-only."""
-    path = DATA / "wxai.json"
-    if not path.is_file():
-        raise ValueError(
-            f"{path} is missing: coursekit reads it from the course's folder, "
-            "so install the course with `python3 course.py lab`"
-        )
-    table = json.loads(path.read_text("utf-8"))
+    table = json.loads((DATA / "wxai.json").read_text("utf-8"))
     joints = table["joints"]
     T_flange_gripper = _chain(table["gripper"])
     arm = Arm(

@@ -240,13 +240,20 @@ def distort(xy: ArrayLike, dist: ArrayLike) -> Floats:
     Source: OpenCV, "Camera Calibration and 3D Reconstruction", with k4..k6 = 0.
     """
     xy = array("xy", xy, (2,), leading=True)
-    k1, k2, p1, p2, k3 = _coefficients("dist", dist)
-    x, y = xy[..., 0], xy[..., 1]
+    return np.stack(bent(xy[..., 0], xy[..., 1], _coefficients("dist", dist)), axis=-1)
+
+
+def bent(x: Floats, y: Floats, lens: Sequence[Any] | Floats) -> tuple[Floats, Floats]:
+    """What `distort` makes of coordinates x and y, (...) each; lens: k1, k2, p1, p2, k3.
+
+    Each of the five is one number or (...): a lens for each point.
+    """
+    k1, k2, p1, p2, k3 = lens
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
     x_bent = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
     y_bent = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
-    return np.stack([x_bent, y_bent], axis=-1)
+    return x_bent, y_bent
 
 
 def undistort(xy: ArrayLike, dist: ArrayLike) -> tuple[Floats, NDArray[np.bool_]]:

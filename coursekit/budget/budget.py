@@ -426,24 +426,20 @@ class ErrorBudget:
     @property
     def worst_case_m(self) -> Interval:
         """(low, high) of the biases if all point one way."""
-        lows, highs = self._bias_lengths
-        return sum(lows), sum(highs)
+        return _added(self._bias_ends)[0]
 
     @property
     def quadrature_m(self) -> Interval:
         """(low, high) of the biases if their directions are unrelated."""
-        lows, highs = self._bias_lengths
-        return math.hypot(*lows), math.hypot(*highs)
+        return _added(self._bias_ends)[1]
 
     def along(self, axis: str) -> AxisBudget:
         """Along "closing", "approach" or "lateral": each term with its greatest effect there."""
         i = axis_index(axis)
         direction = self.grasp.directions[i]
         ends = [term.ends_m(self.view, matrix, direction) for term, matrix in self._of("bias")]
-        lows, highs = [low for low, _ in ends], [high for _, high in ends]
         noise = float(np.sqrt(direction @ self.noise_covariance @ direction))
-        worst, quadrature = (sum(lows), sum(highs)), (math.hypot(*lows), math.hypot(*highs))
-        return AxisBudget(axis, self.grasp.tolerance_m[i], noise, worst, quadrature)
+        return AxisBudget(axis, self.grasp.tolerance_m[i], noise, *_added(ends))
 
     # how often
 
@@ -511,9 +507,8 @@ class ErrorBudget:
         return math.hypot(term.range[1] / math.sqrt(effective), term.floor)
 
     @property
-    def _bias_lengths(self) -> tuple[list[float], list[float]]:
-        ranges = [term.at_object_m(self.view) for term, _ in self._of("bias")]
-        return [low for low, _ in ranges], [high for _, high in ranges]
+    def _bias_ends(self) -> list[Interval]:
+        return [term.at_object_m(self.view) for term, _ in self._of("bias")]
 
     # for people
 
@@ -575,6 +570,12 @@ class ErrorBudget:
     def _repr_html_(self) -> str:
         heading, sums = html.escape(self._heading()), [*self.summary(), *self.sources()]
         return f"<p><b>{heading}</b></p>{html_table(*self.table())}{html_list(sums)}"
+
+
+def _added(ends: list[Interval]) -> tuple[Interval, Interval]:
+    """(low, high) of lengths that have such ends: all in one direction, and in quadrature."""
+    lows, highs = [low for low, _ in ends], [high for _, high in ends]
+    return (sum(lows), sum(highs)), (math.hypot(*lows), math.hypot(*highs))
 
 
 def axis_index(axis: str) -> int:

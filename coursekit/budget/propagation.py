@@ -19,7 +19,7 @@ from coursekit import checks
 from coursekit.arrays import ArrayLike, Floats
 from coursekit.budget.view import View
 from coursekit.checks import want
-from coursekit.geometry import cross_matrix, distortion_jacobian
+from coursekit.geometry import bent, cross_matrix, distortion_jacobian
 from coursekit.hand_eye.poses import Mount
 from coursekit.intrinsics.derivatives import PARAMETERS, scaled_root
 
@@ -254,13 +254,9 @@ def _ideal(x: Floats, y: Floats, start: Floats, lens: Any) -> tuple[Floats, Floa
     lens: k1, k2, p1, p2, k3, of one number or (m,) each.
     NaN where Newton's method has not arrived: close to a fold, or beyond it.
     """
-    k1, k2, p1, p2, k3 = lens
     a, b = np.full_like(x, start[0]), np.full_like(y, start[1])
     for _ in range(UNDISTORTION_STEPS):
-        r2 = a * a + b * b
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        off_x = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a) - x
-        off_y = b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b - y
+        off_x, off_y = np.subtract(bent(a, b, lens), (x, y))
         xx, xy, yy = distortion_jacobian(np.stack([a, b], axis=-1), lens)
         determinant = xx * yy - xy * xy
         step_a = (yy * off_x - xy * off_y) / determinant

@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from coursekit import checks
 from coursekit.cameras import recording
@@ -95,6 +95,11 @@ class Camera(Description, ABC):
         RealSense changes nothing else, and this only where the device offers it. A recording cannot
         be changed. Raises ValueError for a figure out of range, and CameraError.
         """
+        asked = {"ambient": ambient, "exposure": exposure, "depth_scale_m": depth_scale_m}
+        return self._change({name: value for name, value in asked.items() if value is not None})
+
+    def _change(self, asked: dict[str, Any]) -> str:
+        """Do what `set` was asked for, and say what was done."""
         return "A recording cannot be changed: light, exposure and units are as recorded."
 
     def reveal(self) -> HiddenTruth:

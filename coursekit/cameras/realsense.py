@@ -10,7 +10,7 @@ import threading
 import weakref
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -264,21 +264,17 @@ class RealSense(Camera):
         input("Press Enter when it stands there")
         self._skip(WARM_UP_FRAMES)  # those from before, and until automatic exposure has settled
 
-    def set(
-        self,
-        ambient: float | None = None,
-        exposure: float | Literal["auto"] | None = None,
-        depth_scale_m: float | None = None,
-    ) -> str:
+    def _change(self, asked: dict[str, Any]) -> str:
         if self._path is not None:
-            return super().set(ambient, exposure, depth_scale_m)
+            return super()._change(asked)
         said = []
-        if ambient is not None:
+        if "ambient" in asked:
             said.append("the room's light is yours to change: draw the curtains, turn on a lamp")
-        if exposure is not None:
+        if "exposure" in asked:
             said.append("exposure stays: lock() fixes it where automatic exposure has put it")
-        if depth_scale_m is not None:
-            said.append(self._set_depth_scale(recording.check_depth_scale(depth_scale_m)))
+        if "depth_scale_m" in asked:
+            scale_m = recording.check_depth_scale(asked["depth_scale_m"])
+            said.append(self._set_depth_scale(scale_m))
         sentence = "; ".join(said or ["nothing to change"])
         return sentence[0].upper() + sentence[1:] + "."
 

@@ -155,16 +155,9 @@ class SimulatedCamera(Camera):
         self._place_name, self._distance_m = name, float(T[2, 3])
         self._start_afresh()
 
-    def set(
-        self,
-        ambient: float | None = None,
-        exposure: float | Literal["auto"] | None = None,
-        depth_scale_m: float | None = None,
-    ) -> str:
-        scale_m = self.depth_scale_m if depth_scale_m is None else check_depth_scale(depth_scale_m)
-        asked: dict[str, Any] = {"ambient": ambient, "exposure": exposure}
-        changed = {name: value for name, value in asked.items() if value is not None}
-        self._rig, self.depth_scale_m = replace(self._rig, **changed), scale_m
+    def _change(self, asked: dict[str, Any]) -> str:
+        scale_m = check_depth_scale(asked.pop("depth_scale_m", self.depth_scale_m))
+        self._rig, self.depth_scale_m = replace(self._rig, **asked), scale_m
         self._start_afresh()
         fixed = self._rig.exposure
         exposure_ms = fixed if fixed == "auto" else f"{fixed:.3g} ms"
