@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import ast
+import string
+from pathlib import Path
+
 import pytest
 
-from coursekit.words import Finding, Findings
+from coursekit import boards, cameras, doctor
+from coursekit.words import Finding, Findings, Sentences
 
 BOW = Finding("bowed_board", "The board is <not> flat.", "0.51 ± 0.04 mm", "Use glass.", 1e-9)
 FEW = Finding("few_views", "Too few views.", "4 views", "Take more.")
@@ -50,6 +55,29 @@ def test_the_html_is_escaped_and_has_the_same_words() -> None:
     assert "<li>" not in Findings()._repr_html_()
 
 
-def test_a_finding_cannot_be_changed() -> None:
-    with pytest.raises(AttributeError):
-        BOW.name = "other"  # type: ignore[misc]
+ROOMS = {  # the name of the function there, the sentences that it says, the files
+    "boards": ("say", Sentences(boards.__file__).texts, Path(boards.__file__).parent),
+    "cameras": ("say", Sentences(cameras.__file__).texts, Path(cameras.__file__).parent),
+    "doctor": ("found", doctor.TEXTS["findings"], Path(doctor.__file__)),
+}
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_every_sentence_is_there_used_and_gets_its_facts(room: str) -> None:
+    function, sentences, place = ROOMS[room]
+    files = place.glob("*.py") if place.is_dir() else [place]
+    nodes = [node for file in files for node in ast.walk(ast.parse(file.read_text("utf-8")))]
+    shared = doctor.TEXTS["shared"].keys() if room == "doctor" else set()
+    for call in nodes:
+        if isinstance(call, ast.Call) and ast.unparse(call.func) == function:
+            facts = {fact.arg for fact in call.keywords} | shared
+            if isinstance(call.args[0], ast.Constant) and None not in facts:
+                text = (
+                    " ".join(sentences[call.args[0].value])
+                    if room == "doctor"
+                    else (sentences[call.args[0].value])
+                )
+                wanted = {field for _, field, _, _ in string.Formatter().parse(text) if field}
+                assert {field.split(".")[0].split("[")[0] for field in wanted} <= facts, text
+    strings = {node.value for node in nodes if isinstance(node, ast.Constant)}
+    assert sentences.keys() <= strings
