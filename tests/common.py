@@ -2,6 +2,7 @@
 
 import json
 import os
+import symtable
 from collections.abc import Iterator
 from typing import Any
 
@@ -74,3 +75,19 @@ def mutants(whole: Any) -> Iterator[str]:
             kept if isinstance(kept, dict) else range(len(kept)) if isinstance(kept, list) else ()
         )
         parts += [(kept, below) for below in inside]
+
+
+def names(source: str) -> tuple[set[str], set[str]]:
+    """What a cell's source takes from the notebook's names, in functions, too; and what it sets."""
+    top = symtable.symtable(source, "a cell", "exec")
+    tables = [top]
+    for table in tables:
+        tables += table.get_children()
+    used = {
+        symbol.get_name()
+        for table in tables
+        for symbol in table.get_symbols()
+        if symbol.is_referenced() and (table is top or symbol.is_global())
+    }
+    bound = (s.get_name() for s in top.get_symbols() if s.is_assigned() or s.is_imported())
+    return used, set(bound)
