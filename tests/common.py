@@ -38,6 +38,18 @@ def least(share, of):
     return binom.ppf(0.001, of, share) / of
 
 
+def check_named(found, name, label):
+    """Fail unless a diagnosis named a mistake as often as it should, and nothing besides.
+
+    found: how often which names were given. At least 95 of 100, at most 5 with a wrong name
+    besides (nightly); of a few, all and none.
+    """
+    print(label, dict(found))
+    count = sum(found.values())
+    assert sum(n for names, n in found.items() if name in names) >= count - count // 20
+    assert sum(n for names, n in found.items() if set(names) - {name}) <= count // 20
+
+
 def refusals(*cases):
     """The test of a table of (message, call): each call raises ValueError with such a message."""
 
