@@ -16,6 +16,7 @@ from pathlib import Path
 
 import coursekit as ck
 from coursekit import doctor
+from coursekit.words import say
 
 OPTIONS = {"path": "--out", "n": "--frames", "which": "--camera", "distance_m": "--distance"}
 OPTIONS |= {f"{name}_m": f"--{name}-mm (here in m)" for name in ("square", "marker")}
@@ -106,10 +107,7 @@ def _submit(options: argparse.Namespace) -> None:
         try:
             paragraph = Path(options.paragraph_file).read_text(encoding="utf-8-sig")
         except UnicodeDecodeError:
-            raise ValueError(
-                f"{options.paragraph_file}: is no plain text in UTF-8; save it as that (in Word or "
-                "Notepad: plain text, encoding UTF-8) and try again"
-            ) from None
+            raise ValueError(say("others.not_text", file=options.paragraph_file)) from None
     claims = options.distance, options.dominates, paragraph, options.frames
     where = options.folder, options.overwrite, options.mismatches
     handed = ck.submit(options.student, *claims, *where)

@@ -54,7 +54,7 @@ LEAST_FRAMES_FOR_NOISE = 5
 USUAL_VALID, HARDLY_VALID = 0.60, 0.05
 USUAL_NOISE_PX = (0.03, 0.20)  # one pixel's disparity over time: data/published_depth_noise.json
 
-TEXTS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
+FOUND = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
 MOST_NAMES = 5  # that a line lists
 
 
@@ -89,8 +89,8 @@ def found(what: str, good: bool = False, check: str = "", **facts: Any) -> Check
 
     good: whether all is well, so that the sentence alone is said. check: see `CheckUp`.
     """
-    verdict, *texts = TEXTS["findings"][what]
-    says, remedy = (text.format(**TEXTS["shared"], **facts) for text in [*texts, ""][:2])
+    verdict, *texts = FOUND["findings"][what]
+    says, remedy = (text.format(**FOUND["shared"], **facts) for text in [*texts, ""][:2])
     return CheckUp("ok", says, "", check) if good else CheckUp(verdict, says, remedy, check)
 
 

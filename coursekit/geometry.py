@@ -20,6 +20,7 @@ from coursekit import kernels
 from coursekit.arrays import ArrayLike, Floats, NDArray
 from coursekit.checks import array, instance, number, positive, transform, transforms, want, whole
 from coursekit.formats.lens import read_lens
+from coursekit.words import say
 
 DISTORTION_MODELS = ("none", "brown_conrady", "inverse_brown_conrady", "modified_brown_conrady")
 # What others call Brown-Conrady; ROS's rational_polynomial is that where k4 to k6 are zero
@@ -348,8 +349,8 @@ def deproject_image(
     if i.dist is None:
         kernels.deproject_pinhole(image, scale, i.fx, i.fy, i.cx, i.cy, points)
     else:
-        rays = deproject(pixel_grid(*i.size), np.ones(shape), i.K, i.dist)
-        kernels.scale_rays(image, scale, rays, points)
+        z = np.where((image > 0) & (image < np.inf), image, np.nan) * scale
+        points[...] = deproject(pixel_grid(*i.size), np.ones(shape), i.K, i.dist) * z[..., None]
     return points
 
 
@@ -496,10 +497,7 @@ def moved(T: Floats, twists: Floats) -> Floats:
 
 # --- what a camera's numbers must be ---
 
-NO_OTHER = (
-    "rational, thin-prism and fisheye lenses are not supported: undistort the images first "
-    "(cv2.undistort, cv2.fisheye.undistortImage) and use the K of those, without distortion"
-)
+NO_OTHER = say("others.no_other_lens")
 
 
 def _intrinsic_matrix(K: ArrayLike) -> Floats:

@@ -16,6 +16,7 @@ from coursekit.arrays import Interval
 from coursekit.checks import is_number, want
 
 Thing = TypeVar("Thing")
+SENTENCES = tomllib.loads(Path(__file__).with_name("texts.toml").read_text("utf-8"))
 WIDTH = 88  # characters: fits a notebook's output cell; JupyterLab breaks longer lines in mid-word
 
 
@@ -28,18 +29,16 @@ def wrapped(text: str, width: int = WIDTH, first: str = "", indent: str = "  ") 
     return filled.replace("\0", " ")
 
 
-class Sentences:
-    """What a room says, as the texts.toml beside a file of it has it: `say(name, facts=...)`.
+def say(sentence: str, /, **facts: Any) -> str:
+    """A sentence of texts.toml, by "room.name", with the facts in its places.
 
-    texts: that table. Raises KeyError for a name or a fact that is not there.
+    Raises KeyError for a sentence or a fact that is not there.
+
+    >>> say("cameras.closed", what="the camera")
+    'the camera is closed: open it again with open_camera()'
     """
-
-    def __init__(self, file: str) -> None:
-        path = Path(file).with_name("texts.toml")
-        self.texts: dict[str, Any] = tomllib.loads(path.read_text("utf-8"))
-
-    def __call__(self, sentence: str, /, **facts: Any) -> str:
-        return str(self.texts[sentence].format(**facts))
+    room, name = sentence.split(".")
+    return str(SENTENCES[room][name].format(**facts))
 
 
 def with_notes(text: str, notes: Sequence[str]) -> str:

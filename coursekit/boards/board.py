@@ -23,9 +23,8 @@ from coursekit import geometry
 from coursekit.arrays import AnyArray, Bools, Floats, Grey, NDArray
 from coursekit.checks import array, choice, instance, number, want, whole
 from coursekit.geometry import Intrinsics
-from coursekit.words import Listed, Sentences, counted
+from coursekit.words import Listed, counted, say
 
-say = Sentences(__file__)  # of texts.toml, for the whole room
 BoardKind = Literal["checkerboard", "charuco"]
 FEWEST_SQUARES = {"checkerboard": 4, "charuco": 3}  # OpenCV finds none with fewer corners than 3x3
 SMALLEST_SQUARE_M, LARGEST_SQUARE_M = 0.0005, 1.0  # who gives millimetres is told so
@@ -603,7 +602,7 @@ def _page(board: Board, paper: str) -> tuple[float, float]:
     larger = next((other for other in PAPERS_MM if _fitting(board, other)), "a print shop")
     instead = {"paper": name, "larger": larger, "square": np.floor(10 * square) / 10}
     width, height = (1000 * side for side in board.size_m)
-    raise ValueError(say("too_big", width=width, height=height, **instead))
+    raise ValueError(say("boards.too_big", width=width, height=height, **instead))
 
 
 def _fitting(board: Board, paper: str) -> list[tuple[float, float]]:
@@ -647,7 +646,7 @@ def _draw(board: Board, page_mm: tuple[float, float]) -> Any:
         axes.add_patch(patch)
     right = MARGIN_MM + BAR_MM + 2.0
     axes.text(right, foot + 0.75, "100 mm", fontsize=8, va="center")
-    words = f"{caption(board)}.\n{say('advice')}"
+    words = f"{caption(board)}.\n{say('boards.advice')}"
     axes.text(MARGIN_MM, foot + 3.0, words, fontsize=6.5, va="top", linespacing=1.25)
     return figure
 

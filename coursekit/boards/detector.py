@@ -20,12 +20,12 @@ import cv2
 import numpy as np
 
 from coursekit.arrays import AnyArray, Grey, NDArray
-from coursekit.boards.board import Board, BoardNotFound, Detection, Detections, Skipped, say
+from coursekit.boards.board import Board, BoardNotFound, Detection, Detections, Skipped
 from coursekit.boards.corners import blur_covariance, refine_corners, steps
 from coursekit.boards.explain import BLANK_GREY, explain
 from coursekit.boards.find import OFF_PLANE, find_corners, on_plane
 from coursekit.checks import want
-from coursekit.words import counting
+from coursekit.words import SENTENCES, counting, say
 
 FEWEST_CORNERS = 6
 SMALLEST_IMAGE_PX = 40  # shorter side of an image in which a board can be told
@@ -66,7 +66,7 @@ def detect(image: NDArray[np.uint8], board: Board, name: str = "") -> Detection:
     except BoardNotFound:
         raise
     except Exception as error:  # no picture, however strange, may end a session of many
-        raise BoardNotFound(say("failed", error=_words(error))) from error
+        raise BoardNotFound(say("boards.failed", error=_words(error))) from error
 
 
 def _words(error: Exception) -> str:
@@ -77,9 +77,9 @@ def _words(error: Exception) -> str:
 def _detect(grey: Grey, board: Board, name: str) -> Detection:
     height, width = grey.shape
     if grey.size > MOST_PIXELS:
-        raise BoardNotFound(say("too_large", width=width, height=height))
+        raise BoardNotFound(say("boards.too_large", width=width, height=height))
     if min(grey.shape) < SMALLEST_IMAGE_PX or max(grey.shape) > NARROWEST * min(grey.shape):
-        raise BoardNotFound(say("too_small", width=width, height=height))
+        raise BoardNotFound(say("boards.too_small", width=width, height=height))
     found = find_corners(grey, board)
     if found is None or not _usable(found[0], board):
         raise BoardNotFound(explain(grey, board, 0 if found is None else len(found[0])))
@@ -127,7 +127,7 @@ def _eight_bits(pixels: AnyArray) -> Grey:
     some = some[np.isfinite(some)]
     low, high = np.quantile(some, [0.01, 0.99]) if some.size else (0.0, 0.0)
     if not high - low > (BLANK_GREY if pixels.dtype.kind in "iu" else 0.0):
-        raise BoardNotFound(say("blank", low=low, high=high))
+        raise BoardNotFound(say("boards.blank", low=low, high=high))
     dark, bright = RANGE
     scale = (bright - dark) / (high - low)
     levels = np.nan_to_num((pixels.astype(np.float32) - low) * scale + dark, nan=dark)
@@ -223,30 +223,30 @@ def _read(source: Any) -> AnyArray:
         return source
     try:
         if source.stat().st_size > MOST_BYTES:
-            raise BoardNotFound(say("too_many_bytes", size_gb=source.stat().st_size / 1e9))
+            raise BoardNotFound(say("boards.too_many_bytes", size_gb=source.stat().st_size / 1e9))
         data = source.read_bytes()
     except (OSError, MemoryError) as error:
         why = getattr(error, "strerror", error)
-        raise BoardNotFound(say("not_read", error=why)) from error
+        raise BoardNotFound(say("boards.not_read", error=why)) from error
     if not data:
-        raise BoardNotFound(say("empty"))
+        raise BoardNotFound(say("boards.empty"))
     for pattern, what in (
-        say.texts["other_files"].items() if not data.startswith((JPEG, PNG)) else ()
+        SENTENCES["boards"]["other_files"].items() if not data.startswith((JPEG, PNG)) else ()
     ):
         texts = (source.suffix.lower(), data[:16].decode("latin1"))
         if any(re.match(pattern, text, re.DOTALL) for text in texts):
             raise BoardNotFound(what)
     (width, height), cut_off = _header(data)
     if width * height > MOST_PIXELS:  # before it takes its memory
-        raise BoardNotFound(say("too_large", width=width, height=height))
+        raise BoardNotFound(say("boards.too_large", width=width, height=height))
     if cut_off:  # OpenCV would fill the rest with grey
-        raise BoardNotFound(say("cut_off"))
+        raise BoardNotFound(say("boards.cut_off"))
     try:
         return _eight_bits(_decoded(data))
     except BoardNotFound:
         raise
     except Exception as error:  # whatever a broken file makes the decoders raise
-        raise BoardNotFound(f"{say('no_image')} ({_words(error)})") from error
+        raise BoardNotFound(f"{say('boards.no_image')} ({_words(error)})") from error
 
 
 def _decoded(data: bytes) -> AnyArray:
@@ -254,7 +254,7 @@ def _decoded(data: bytes) -> AnyArray:
     coded = np.frombuffer(data, np.uint8)
     image = cv2.imdecode(coded, AS_STORED | cv2.IMREAD_ANYDEPTH)
     if image is None:
-        raise BoardNotFound(say("no_image"))
+        raise BoardNotFound(say("boards.no_image"))
     if data.startswith(PNG) and (data[25:26] in ALPHA or b"tRNS" in data[:4096]):
         layers: AnyArray = np.asarray(
             cv2.imdecode(coded, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -292,8 +292,8 @@ def _of_one_size(views: list[Detection], skipped: list[Skipped], names: list[str
     common = max(counts, key=lambda size: (counts[size], size), default=(0, 0))
     for view in views:
         if view.size != common:
-            reason = say("other_size", view=view.size, common=common)
-            reason += say("turned") * (view.size == common[::-1])
+            reason = say("boards.other_size", view=view.size, common=common)
+            reason += say("boards.turned") * (view.size == common[::-1])
             skipped.append(Skipped(view.name, reason, "other_size"))
     skipped.sort(key=lambda skip: names.index(skip.name))
     return Detections([view for view in views if view.size == common], skipped)

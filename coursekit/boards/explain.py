@@ -17,8 +17,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from coursekit.arrays import Floats, Grey, NDArray
-from coursekit.boards.board import DICTIONARIES, FEWEST_SQUARES, Board, OtherBoard, say
+from coursekit.boards.board import DICTIONARIES, FEWEST_SQUARES, Board, OtherBoard
 from coursekit.boards.find import checkerboard_seen, off_homography, real_beyond, shrunk
+from coursekit.words import SENTENCES, say
 
 LONGEST_PX = 1600  # an image is looked at no larger than this
 ANY_SIZE_PX = 800  # ... and where checkerboards of any size are looked for than this
@@ -68,12 +69,12 @@ def explain(grey: Grey, board: Board, corners: int) -> str:
     small = shrunk(grey, LONGEST_PX)
     low, high = np.quantile(small, [0.01, 0.99])
     if high - low < BLANK_GREY:
-        return say("blank", low=low, high=high)
+        return say("boards.blank", low=low, high=high)
     asked = f"the {board.text} asked for"
     if reason := _what_else(small, board):
-        raise OtherBoard(say("not_asked_for", asked=asked, reason=reason))
+        raise OtherBoard(say("boards.not_asked_for", asked=asked, reason=reason))
     if corners:
-        return say("few_corners", corners=corners, asked=asked)
+        return say("boards.few_corners", corners=corners, asked=asked)
     return _nothing(small, board)
 
 
@@ -85,7 +86,7 @@ def _what_else(grey: Grey, board: Board) -> str:
     if reason := _checkered(shrunk(grey, ANY_SIZE_PX), board, blurred):
         return reason
     circles = not blurred and _has_circles(grey)
-    return say("circles", not_usable=say("not_usable")) if circles else ""
+    return say("boards.circles", not_usable=say("boards.not_usable")) if circles else ""
 
 
 def _edges_px(grey: Grey) -> float:
@@ -99,8 +100,8 @@ def _nothing(grey: Grey, board: Board) -> str:
     """No board of any kind: the advice that fits the picture."""
     width_px = _edges_px(grey)
     if width_px > BLURRED_PX:
-        return say("blurred", width_px=width_px)
-    return say("no_charuco" if board.kind == "charuco" else "no_checkerboard", board=board)
+        return say("boards.blurred", width_px=width_px)
+    return say(f"boards.no_{board.kind}", board=board)
 
 
 # --- checkerboards of another size, circles ---
@@ -129,7 +130,7 @@ def _checkered(grey: Grey, board: Board, blurred: bool) -> str:
         what = "inner_corners"
     else:
         what = "other_squares"
-    return say(what, size=size, squares=squares)
+    return say(f"boards.{what}", size=size, squares=squares)
 
 
 def _is_cut(grey: Grey, grid: Floats) -> bool:
@@ -188,11 +189,12 @@ def _marked(markers: _Markers, board: Board) -> str:
     """What markers show, of this dictionary or another; "" where they fit the board asked for."""
     seen = f"{len(markers.ids)} markers of {_short_name(markers, board)}"
     if markers.way:
-        return f"{len(markers.ids)} markers, all {markers.way}: {say.texts['cures'][markers.way]}"
+        cure = SENTENCES["boards"]["cures"][markers.way]
+        return f"{len(markers.ids)} markers, all {markers.way}: {cure}"
     if _is_grid(markers):
-        return say("tags", seen=seen, not_usable=say("not_usable"))
+        return say("boards.tags", seen=seen, not_usable=say("boards.not_usable"))
     if board.kind == "checkerboard":
-        return say("with_markers", seen=seen)
+        return say("boards.with_markers", seen=seen)
     return _other_charuco(markers, board, seen)
 
 
@@ -202,15 +204,15 @@ def _other_charuco(markers: _Markers, board: Board, seen: str) -> str:
     plans = _plans(board, name, markers.ids) if enough else ()
     plan = next((plan for plan in plans if _on_plan(markers, plan)), None)
     if plan is None and name != board.dictionary:
-        return say("other_dictionary", seen=seen, name=name)
+        return say("boards.other_dictionary", seen=seen, name=name)
     if plan is None:
-        return say("no_plan", seen=seen, most=MOST_SQUARES) if enough else ""
+        return say("boards.no_plan", seen=seen, most=MOST_SQUARES) if enough else ""
     fields = ("dictionary", "squares", "first_marker", "old_origin")
     new = [(field, getattr(plan, field)) for field in fields]
     changes = [f"{field}={value!r}" for field, value in new if value != getattr(board, field)]
     if changes:
         size = "{}x{} squares".format(*plan.squares)
-        return say("other_plan", seen=seen, size=size, changes=", ".join(changes))
+        return say("boards.other_plan", seen=seen, size=size, changes=", ".join(changes))
     return ""
 
 

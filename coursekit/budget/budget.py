@@ -36,7 +36,7 @@ from coursekit.checks import want
 from coursekit.geometry import cross_matrix
 from coursekit.results import ErrorKind
 from coursekit.stereo.law import depth_slope
-from coursekit.words import html_list, html_table, wrapped
+from coursekit.words import html_list, html_table, say, wrapped
 
 Along = Literal["image", "ray", "disparity", "depth", "turn", "shift", "intrinsics"]
 Directions = Literal["own", "isotropic"]
@@ -362,10 +362,7 @@ class ErrorBudget:
         if changes:
             stated = [term.name for term in self.terms if term.stated_m is not None]
             if stated:
-                raise ValueError(
-                    f"{next(iter(changes))}: {stated[0]!r} is stated at the object and knows no "
-                    "other place; take a budget whose rows are converted"
-                )
+                raise ValueError(say("budget.elsewhere", what=next(iter(changes)), row=stated[0]))
             own["view"] = self.view.moved(**changes)
         return replace(self, **own)
 
@@ -543,19 +540,15 @@ class ErrorBudget:
             return text
         for axis in AXES:
             a = self.along(axis)
-            text.append(
-                f"{axis}: bias up to {1e3 * a.worst_case_m[1]:.1f} mm, in quadrature "
-                f"{1e3 * a.quadrature_m[1]:.1f}, noise {1e3 * a.noise_m:.2f}; "
-                f"tolerance ±{1e3 * a.tolerance_m:.1f}"
-            )
+            lengths = a.worst_case_m[1], a.quadrature_m[1], a.noise_m, a.tolerance_m
+            names = ("worst", "quadrature", "noise", "tolerance")
+            mm = {name: 1e3 * length for name, length in zip(names, lengths, strict=True)}
+            text.append(say("budget.axis", axis=axis, **mm))
         return text
 
     def _heading(self) -> str:
-        view = self.view
-        return (
-            f"{self.title}: Z = {view.distance_m:.2f} m, {view.off_axis_deg:.0f}° off axis, "
-            f"f = {view.intrinsics.fx:.0f} px, baseline {1e3 * view.baseline_m:.0f} mm"
-        )
+        baseline_mm = 1e3 * self.view.baseline_m
+        return say("budget.heading", title=self.title, view=self.view, baseline_mm=baseline_mm)
 
     @property
     def _stated(self) -> bool:

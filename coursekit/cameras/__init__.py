@@ -8,11 +8,12 @@ from pathlib import Path
 from coursekit.cameras import conventions
 from coursekit.cameras.camera import Camera, place
 from coursekit.cameras.files import ImageFolder, RecordedSet, RosBag, play
-from coursekit.cameras.frames import CameraError, Frame, Frames, say
+from coursekit.cameras.frames import CameraError, Frame, Frames
 from coursekit.cameras.librealsense import LibraryMissing, connected_realsenses
 from coursekit.cameras.realsense import RealSense
 from coursekit.cameras.recording import INDEX, INTRINSICS
 from coursekit.cameras.simulated import SimulatedCamera, my_unit
+from coursekit.words import say
 
 __all__ = [
     "Camera", "CameraError", "Frame", "Frames", "conventions", "my_unit", "open_camera", "place",
@@ -56,7 +57,7 @@ def open_camera(
         path = Path(which)
         if path.suffix or "/" in which or os.sep in which or (which and path.is_dir()):
             return _recording(path)
-    raise ValueError(f"{argument}: got {which!r}, {say('which')}")
+    raise ValueError(f"{argument}: got {which!r}, {say('cameras.which')}")
 
 
 def _connected_or_simulated(infrared: bool, seed: int | None) -> Camera:
@@ -72,7 +73,7 @@ def _live(serial: str, infrared: bool) -> Camera:
     if serial not in present:
         found = ", ".join(f"{number} ({name})" for number, name in present.items())
         instead = f"there is {found}: open that one" if found else "there is none: plug it in"
-        raise CameraError(say("no_such_serial", serial=serial, instead=instead))
+        raise CameraError(say("cameras.no_such_serial", serial=serial, instead=instead))
     return RealSense(serial, infrared=infrared)
 
 

@@ -13,10 +13,10 @@ from typing import Any, Literal
 
 from coursekit import checks
 from coursekit.cameras import recording
-from coursekit.cameras.frames import CameraError, Description, Frame, Frames, say
+from coursekit.cameras.frames import CameraError, Description, Frame, Frames
 from coursekit.geometry import Intrinsics
 from coursekit.results import Quantity
-from coursekit.words import counting
+from coursekit.words import counting, say
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class HiddenTruth:
         }
         lenses = map(_lens_text, (self.color_lens, self.reported_color_lens))
         both = dict(zip(("true_lens", "reported_lens"), lenses, strict=True))
-        return say("truth", t=self, percent=100 * self.scale_error, **baselines_mm, **both)
+        return say("cameras.truth", t=self, percent=100 * self.scale_error, **baselines_mm, **both)
 
 
 class Camera(Description, ABC):
@@ -80,7 +80,7 @@ class Camera(Description, ABC):
         and CameraError for what a recorded set does not hold (the message lists what it does).
         """
         recording.check_distance(distance_m)
-        print(f"{say('not_rearranged', name=self.name)}, it shows what it shows.")
+        print(f"{say('cameras.not_rearranged', name=self.name)}, it shows what it shows.")
 
     def set(
         self,
@@ -104,7 +104,7 @@ class Camera(Description, ABC):
 
     def reveal(self) -> HiddenTruth:
         """What the simulated camera really is, to be looked at last; CameraError for any other."""
-        raise CameraError(say("not_revealed", name=self.name))
+        raise CameraError(say("cameras.not_revealed", name=self.name))
 
     def factory_values(self) -> dict[str, Quantity]:
         """What the device says of itself, for `results.save`: nobody has told how uncertain it is.
@@ -178,7 +178,9 @@ class Camera(Description, ABC):
         """
         checks.whole("n", n)
         if not self.can_place:
-            raise CameraError(f"{say('not_rearranged', name=self.name)}, so it makes no set")
+            raise CameraError(
+                f"{say('cameras.not_rearranged', name=self.name)}, so it makes no set"
+            )
         index = recording.Index.to_extend(Path(folder).expanduser(), name, distances_m, overwrite)
         for distance_m in distances_m:
             scene = recording.scene_to_record(name, distance_m)
@@ -228,10 +230,12 @@ def camera_line(camera: Camera, where: str, without: str) -> str:
     color, baseline_m, unit_mm = camera.color, camera.baseline_m, 1000 * camera.depth_scale_m
     colour = f"colour {color.width}x{color.height}" if color else "no colour"
     baseline = without if baseline_m is None else f"{1000 * baseline_m:.1f} mm"
-    return say("camera", c=camera, where=where, colour=colour, baseline=baseline, unit_mm=unit_mm)
+    return say(
+        "cameras.camera", c=camera, where=where, colour=colour, baseline=baseline, unit_mm=unit_mm
+    )
 
 
 def _lens_text(lens: Intrinsics) -> str:
     names = ("k1", "k2", "p1", "p2", "k3")
     coeffs = ", ".join(f"{n} {c:+.4f}" for n, c in zip(names, lens.coeffs, strict=True) if c)
-    return say("lens", lens=lens, coeffs=coeffs or "no distortion")
+    return say("cameras.lens", lens=lens, coeffs=coeffs or "no distortion")

@@ -32,10 +32,11 @@ from coursekit.boards.board import seen, slide_into_view
 from coursekit.boards.detector import FEWEST_CORNERS, SESSION
 from coursekit.boards.find import find_corners
 from coursekit.cameras.camera import Camera
-from coursekit.cameras.frames import CameraError, say
+from coursekit.cameras.frames import CameraError
 from coursekit.cameras.simulated import SimulatedCamera
 from coursekit.geometry import Intrinsics, make_transform, project
 from coursekit.geometry import transform_points as through
+from coursekit.words import say
 
 FOLDER = "03_views"
 STILL_FRAMES = 5  # over so many frames in a row ...
@@ -117,7 +118,9 @@ def capture(
             if not album.views:
                 raise
         except CameraError as error:
-            kept = say("views_kept", error=error, count=len(album.views), folder=album.folder)
+            kept = say(
+                "cameras.views_kept", error=error, count=len(album.views), folder=album.folder
+            )
             raise CameraError(kept, error.frames) from error
     print(_summary(camera, album, views, before))
     return Detections(album.views, album.skipped)
@@ -133,10 +136,12 @@ class Shot(NamedTuple):
 def _summary(camera: Camera, album: Album, views: int, before: int) -> str:
     have, about = len(album.views), {"name": camera.name, "folder": album.folder.name}
     if have == before:
-        return say("none_taken", before=before, **about)
+        return say("cameras.none_taken", before=before, **about)
     count = f"{have} views" if have >= views else f"{have} of {views} views"
     moved = ": there is no board to hold, so the simulated camera was moved"
-    return say("taken", count=count, how=moved * isinstance(camera, SimulatedCamera), **about)
+    return say(
+        "cameras.taken", count=count, how=moved * isinstance(camera, SimulatedCamera), **about
+    )
 
 
 # --- where views come from ---
@@ -254,8 +259,8 @@ class _Waiting:
                 except BoardNotFound as error:
                     self._why = str(error)
         if time_s - self._since_s > self._timeout_s:
-            why = self._why or say("hold_still")
-            raise CameraError(say("too_long", timeout_s=self._timeout_s, why=why))
+            why = self._why or say("cameras.hold_still")
+            raise CameraError(say("cameras.too_long", timeout_s=self._timeout_s, why=why))
         return self._why or NO_BOARD * (detection is None)
 
     def is_over(self, detection: Detection, taken: Sequence[Detection]) -> bool:
@@ -311,7 +316,7 @@ class Album:
         if known != self._session:
             whose = "nobody knows what" if known is None else f"{known['camera']}, {known['board']}"
             held = {"folder": self.folder, "count": len(images), "whose": whose}
-            raise ValueError(say("other_views", card=self._session, **held))
+            raise ValueError(say("cameras.other_views", card=self._session, **held))
         for path in images:
             image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
             try:

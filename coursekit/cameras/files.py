@@ -17,11 +17,11 @@ from coursekit.arrays import AnyArray, Floats, NDArray
 from coursekit.boards.detector import natural
 from coursekit.cameras import recording
 from coursekit.cameras.camera import Camera, camera_line
-from coursekit.cameras.frames import FRAMES_PER_S, NO_DEPTH, CameraError, Description, Frame, say
+from coursekit.cameras.frames import FRAMES_PER_S, NO_DEPTH, CameraError, Description, Frame
 from coursekit.cameras.librealsense import LibraryMissing
 from coursekit.cameras.realsense import RealSense, shortest_decimal
 from coursekit.geometry import Intrinsics, invert_transform, make_transform
-from coursekit.words import counted
+from coursekit.words import counted, say
 
 FINE_M = 0.0001  # a count of depth that was recorded as metres
 STREAM = {  # by our name what is in the name of its topic
@@ -91,7 +91,7 @@ class RosBag(Camera):
         except CameraError:
             raise
         except Exception as error:  # of damaged bytes rosbags, SQLite and zstd raise what they like
-            raise CameraError(say("damaged", what=self._what, error=error)) from error
+            raise CameraError(say("cameras.damaged", what=self._what, error=error)) from error
 
     def _messages(self, reader: Any, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
         """Topic, time (ns) and message, in the order of their times."""
@@ -170,7 +170,7 @@ class RosBag(Camera):
         )
 
     def lock(self) -> str:
-        return say("as_recorded")
+        return say("cameras.as_recorded")
 
     def close(self) -> None:
         pass  # the file is open only while frames are read
@@ -329,7 +329,7 @@ class RecordedSet(Camera):
         if before is not None and played.serial != before.serial:
             played.close()
             serials = {"serial": played.serial, "before": before.serial}
-            raise CameraError(say("other_camera", file=scene.file, **serials))
+            raise CameraError(say("cameras.other_camera", file=scene.file, **serials))
         if before is not None:
             before.close()
         self._played, self._scene = played, scene
@@ -338,14 +338,14 @@ class RecordedSet(Camera):
 
     def __repr__(self) -> str:
         where = {"folder": self._index.folder.name, "index": self._index}
-        return say("set", name=self.name, scene=self._scene, **where)
+        return say("cameras.set", name=self.name, scene=self._scene, **where)
 
     def place(self, name: str, distance_m: float) -> None:
         recording.check_distance(distance_m)
         scene = next((s for s in self._index.scenes if s.is_at(name, distance_m)), None)
         if scene is None:
             where = {"folder": self._index.folder.name, "index": self._index}
-            raise CameraError(say("not_held", name=name, distance_m=distance_m, **where))
+            raise CameraError(say("cameras.not_held", name=name, distance_m=distance_m, **where))
         if scene != self._scene:
             self._turn_to(scene, before=self._played)
 
@@ -374,7 +374,7 @@ class ImageFolder(Camera):
         if not self._images or not path.exists():
             missing = recording.INTRINSICS if self._images else "16-bit PNGs"
             lacks = {"missing": missing, "intrinsics": recording.INTRINSICS}
-            raise CameraError(say("incomplete_folder", what=self._what, **lacks))
+            raise CameraError(say("cameras.incomplete_folder", what=self._what, **lacks))
         try:
             given = results.read_json(path)
             self.depth_scale_m = recording.check_depth_scale(given.pop("depth_scale_m", None))

@@ -10,9 +10,8 @@ import numpy as np
 
 from coursekit.arrays import AnyArray, Floats, Image, NDArray
 from coursekit.geometry import Intrinsics, align_depth_to_color, deproject_image
-from coursekit.words import Listed, Sentences, counted
+from coursekit.words import Listed, counted, say
 
-say = Sentences(__file__)  # of texts.toml, for the whole room
 NO_DEPTH = np.iinfo(np.uint16).max  # what some devices say of what is too far or not seen
 FRAMES_PER_S = 30  # of all streams that the course opens, simulates and records
 
@@ -86,7 +85,7 @@ class Frame:
         Raises CameraError when the camera has no colour stream.
         """
         if self.color_intrinsics is None or self.T_color_depth is None:
-            raise CameraError(say("no_colour"))
+            raise CameraError(say("cameras.no_colour"))
         return align_depth_to_color(
             self.depth_m, self.depth_intrinsics, self.color_intrinsics, self.T_color_depth
         )

@@ -10,11 +10,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from coursekit.cameras.frames import CameraError, say
+from coursekit.cameras.frames import CameraError
+from coursekit.words import SENTENCES, say
 
 USB_DEVICES = Path("/sys/bus/usb/devices")  # Linux only
 
-UDEV_ADVICE = say("udev")
+UDEV_ADVICE = say("cameras.udev")
 
 
 class LibraryMissing(CameraError):
@@ -34,9 +35,9 @@ def load_librealsense() -> ModuleType:
     try:
         import pyrealsense2
     except ModuleNotFoundError:
-        raise LibraryMissing(say("not_installed")) from None
+        raise LibraryMissing(say("cameras.not_installed")) from None
     except ImportError as error:
-        raise LibraryMissing(say("not_loading", error=error)) from error
+        raise LibraryMissing(say("cameras.not_loading", error=error)) from error
     return pyrealsense2
 
 
@@ -55,7 +56,7 @@ def connected_realsenses() -> dict[str, str]:
         raise CameraError(start_problem("the RealSense", error)) from error
     found.pop("", None)  # a device in recovery mode has no serial number
     if not found and _realsense_on_usb():
-        raise CameraError(say("not_permitted", udev=UDEV_ADVICE))
+        raise CameraError(say("cameras.not_permitted", udev=UDEV_ADVICE))
     return found
 
 
@@ -67,11 +68,11 @@ def device_info(rs: ModuleType, device: Any, name: str) -> str:
 
 def start_problem(what: str, error: RuntimeError) -> str:
     """The message for a live camera that does not start: what happened and what to do next."""
-    for words, advice in say.texts["start"].items():
+    for words, advice in SENTENCES["cameras"]["start"].items():
         if re.search(words, str(error).lower()):
             because = advice.format(udev=UDEV_ADVICE)
-            return say("not_starting_because", what=what, advice=because, error=error)
-    return say("not_starting", what=what, error=error)
+            return say("cameras.not_starting_because", what=what, advice=because, error=error)
+    return say("cameras.not_starting", what=what, error=error)
 
 
 def _realsense_on_usb() -> bool:

@@ -18,9 +18,10 @@ from coursekit import specifications
 from coursekit.arrays import AnyArray, Image
 from coursekit.cameras import recording
 from coursekit.cameras.camera import Camera, camera_line
-from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Frame, say
+from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Frame
 from coursekit.cameras.librealsense import device_info, load_librealsense, start_problem
 from coursekit.geometry import Intrinsics, make_transform
+from coursekit.words import SENTENCES, say
 
 DEPTH_SIZE, COLOR_SIZE = (848, 480), (640, 480)
 WARM_UP_FRAMES = 30  # automatic exposure settles in about a second
@@ -77,7 +78,7 @@ class RealSense(Camera):
         """Start streaming; of a recording from its beginning."""
         with self._running.turn:
             if self._running.left:
-                raise CameraError(say("closed_meanwhile", what=self._what))
+                raise CameraError(say("cameras.closed_meanwhile", what=self._what))
             try:
                 pipeline = self._rs.pipeline()
                 config = self._playback_config(pipeline) if self._path else self._live_config()
@@ -89,7 +90,9 @@ class RealSense(Camera):
                 if self._path is None:
                     raise CameraError(start_problem(self._what, error)) from error
                 reason = str(error).rsplit("Reason: ", maxsplit=1)[-1]
-                raise CameraError(say("not_read", what=self._what, reason=reason)) from error
+                raise CameraError(
+                    say("cameras.not_read", what=self._what, reason=reason)
+                ) from error
             self._running.run(pipeline, playback)
 
     def _live_config(self) -> Any:
@@ -136,7 +139,7 @@ class RealSense(Camera):
 
     def _check_open(self) -> None:
         if not self._running:
-            raise CameraError(say("closed", what=self._what))
+            raise CameraError(say("cameras.closed", what=self._what))
 
     def _depth_sensor(self) -> Any:
         return self._profile.get_device().first_depth_sensor()
@@ -209,7 +212,7 @@ class RealSense(Camera):
             if last is not None and last.number in numbers:
                 lost = numbers[::-1].index(last.number)
             if lost:
-                raise CameraError(say("damaged_end", what=self._what, lost=lost))
+                raise CameraError(say("cameras.damaged_end", what=self._what, lost=lost))
         if last is None:
             raise CameraError(f"{self._what} holds no frames: record it anew")
 
@@ -220,10 +223,12 @@ class RealSense(Camera):
             try:
                 arrived, frameset, status = self._running.poll()
             except RuntimeError as error:
-                stopped = f"{self._what} stopped giving frames ({error}): {say('unplugged')}"
+                stopped = (
+                    f"{self._what} stopped giving frames ({error}): {say('cameras.unplugged')}"
+                )
                 raise CameraError(stopped) from error
             if arrived is None:
-                raise CameraError(say("closed_meanwhile", what=self._what))
+                raise CameraError(say("cameras.closed_meanwhile", what=self._what))
             if arrived:
                 return frameset
             if ended:
@@ -231,7 +236,7 @@ class RealSense(Camera):
             ended = status is not None and status == self._rs.playback_status.stopped
         silence_s = MOST_POLLS * POLL_MS / 1000
         raise CameraError(
-            f"no frame came from {self._what} for {silence_s:g} s: {say('unplugged')}"
+            f"no frame came from {self._what} for {silence_s:g} s: {say('cameras.unplugged')}"
         )
 
     def _frame(self, group: _Group) -> Frame:
@@ -256,11 +261,11 @@ class RealSense(Camera):
         device = specified(self.name)
         glass_m = device.nominal.glass_m if device else 0.0
         what, distance_mm = (
-            say.texts["placing"].get(name, f"Put the {name}"),
+            SENTENCES["cameras"]["placing"].get(name, f"Put the {name}"),
             1000 * (distance_m - glass_m),
         )
         where = {"distance_mm": distance_mm, "distance_m": distance_m, "glass_mm": 1000 * glass_m}
-        print(say("place", what=what, **where))
+        print(say("cameras.place", what=what, **where))
         input("Press Enter when it stands there")
         self._skip(WARM_UP_FRAMES)  # those from before, and until automatic exposure has settled
 
@@ -294,7 +299,7 @@ class RealSense(Camera):
         self._query()
         self._skip(WARM_UP_FRAMES)
         if refused or not np.isclose(self.depth_scale_m, depth_scale_m, rtol=1e-3):
-            keeps = say("keeps_unit", what=self._what, unit_mm=1000 * self.depth_scale_m)
+            keeps = say("cameras.keeps_unit", what=self._what, unit_mm=1000 * self.depth_scale_m)
             raise CameraError(
                 keeps + (f" (librealsense says: {refused})" if refused else "")
             ) from refused
@@ -309,7 +314,7 @@ class RealSense(Camera):
         takes its manual setting. A recording is left as it is. Returns one sentence that says so.
         """
         if self._path is not None:
-            return say("as_recorded")
+            return say("cameras.as_recorded")
         self._check_open()
         rs, locked = self._rs, []
         try:

@@ -17,9 +17,10 @@ from typing import Any
 
 from coursekit import checks, results
 from coursekit.arrays import AnyArray
-from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Description, Frame, say
+from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Description, Frame
 from coursekit.cameras.librealsense import load_librealsense
 from coursekit.geometry import Intrinsics
+from coursekit.words import say
 
 FILE_STARTS = {
     ".db3": b"SQLite format 3\0",
@@ -45,7 +46,7 @@ SAME_PLACE_M = 0.0005  # distances closer than this are one place
 def check_recording(path: Path) -> None:
     """CameraError with what to do when `path` is no recording, before librealsense opens it."""
     if path.suffix not in FILE_STARTS:
-        raise CameraError(say("no_recording", path=path))
+        raise CameraError(say("cameras.no_recording", path=path))
     if not path.exists():
         raise CameraError(f"there is no file {path}: check the name and the folder")
     if not path.is_file():
@@ -59,7 +60,7 @@ def check_recording(path: Path) -> None:
     if not start:
         raise CameraError(f"{path} is empty: copy it again or record it anew")
     if not start.startswith(FILE_STARTS[path.suffix]):
-        raise CameraError(say("other_file", path=path, suffix=path.suffix))
+        raise CameraError(say("cameras.other_file", path=path, suffix=path.suffix))
     _topics(path)  # which says when it is truncated
 
 
@@ -74,7 +75,7 @@ def is_of_ros(path: Path) -> bool:
 def without_depth(path: Path, topics: Sequence[str]) -> CameraError:
     """What is wrong with a recording of ROS topics that hold no depth images."""
     nearest = sorted(topics, key=lambda topic: ("depth" not in topic, "info" in topic, topic))
-    return CameraError(say("without_depth", path=path, shown="".join(nearest[:1])))
+    return CameraError(say("cameras.without_depth", path=path, shown="".join(nearest[:1])))
 
 
 def _topics(path: Path) -> list[str]:
@@ -84,7 +85,7 @@ def _topics(path: Path) -> list[str]:
 
 
 def _truncated(path: Path, there: int, wanted: int) -> CameraError:
-    return CameraError(say("truncated", path=path, there=there / 1e6, wanted=wanted / 1e6))
+    return CameraError(say("cameras.truncated", path=path, there=there / 1e6, wanted=wanted / 1e6))
 
 
 def _topics_of_db3(path: Path) -> list[str]:
@@ -151,7 +152,7 @@ def _database(path: Path, mode: str = "ro") -> Iterator[sqlite3.Connection]:
         with contextlib.closing(sqlite3.connect(address, uri=True)) as file, file:
             yield file
     except sqlite3.DatabaseError as error:
-        raise CameraError(say("damaged_or_full", name=path.name, error=error)) from error
+        raise CameraError(say("cameras.damaged_or_full", name=path.name, error=error)) from error
 
 
 # --- writing -----------------------------------------------------------------------------------
@@ -234,11 +235,11 @@ def _publish(unfinished: Path, target: Path, given: int) -> None:
     """Give a finished recording its name, once all its frames are found in it."""
     written = len(depth_frame_numbers(unfinished))
     if written < given:  # librealsense does not say when it cannot write
-        raise CameraError(say("not_written", written=written, given=given, target=target))
+        raise CameraError(say("cameras.not_written", written=written, given=given, target=target))
     try:
         os.replace(unfinished, target)
     except OSError as error:
-        raise CameraError(say("not_named", target=target, error=error.strerror)) from error
+        raise CameraError(say("cameras.not_named", target=target, error=error.strerror)) from error
 
 
 class Writer:
@@ -366,7 +367,7 @@ class Index:
         """The index of a set; CameraError for a folder without one, and for a damaged one."""
         path = folder / INDEX
         if not path.exists():
-            raise CameraError(say("no_index", folder=folder, intrinsics=INTRINSICS))
+            raise CameraError(say("cameras.no_index", folder=folder, intrinsics=INTRINSICS))
         try:
             scenes = [RecordedScene(**entry) for entry in results.read_json(path)["scenes"]]
             for scene in scenes:
@@ -393,7 +394,7 @@ class Index:
         index = cls.read(folder) if (folder / INDEX).exists() else cls(folder, [])
         held = [scene for scene in index.scenes if any(scene.is_at(name, d) for d in distances_m)]
         if held and not overwrite:
-            raise ValueError(say("held_already", folder=folder, held=cls(folder, held)))
+            raise ValueError(say("cameras.held_already", folder=folder, held=cls(folder, held)))
         try:
             folder.mkdir(exist_ok=True)
         except OSError as error:

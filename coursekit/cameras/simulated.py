@@ -15,12 +15,13 @@ from coursekit import checks, results, specifications
 from coursekit.arrays import ArrayLike, Floats, Image
 from coursekit.boards import Board
 from coursekit.cameras.camera import Camera, HiddenTruth
-from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Frame, say
+from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Frame
 from coursekit.cameras.recording import check_depth_scale, check_distance
 from coursekit.geometry import Intrinsics, invert_transform
 from coursekit.simulation import Rig, RigView, Scene, artefact_scene, render, tabletop, wall_scene
 from coursekit.simulation.board_images import board_scene, check_pose, render_board
 from coursekit.specifications import Unit
+from coursekit.words import say
 
 SCENES: dict[str, Callable[[float], Scene]] = {
     "60 mm block": tabletop,
@@ -98,7 +99,7 @@ class SimulatedCamera(Camera):
         ambient: float = 0.01,
         exposure: float | Literal["auto"] = "auto",
         depth_scale_m: float | None = None,
-        advice: str = say("plug_in"),
+        advice: str = say("cameras.plug_in"),
     ) -> None:
         self.seed = my_unit() if seed is None else checks.whole("seed", seed, least=0)
         self._advice, self._closed = advice, False
@@ -162,7 +163,7 @@ class SimulatedCamera(Camera):
         fixed = self._rig.exposure
         exposure_ms = fixed if fixed == "auto" else f"{fixed:.3g} ms"
         light = {"ambient": self._rig.ambient, "exposure": exposure_ms}
-        return say("light", **light, unit_mm=1000 * scale_m)
+        return say("cameras.light", **light, unit_mm=1000 * scale_m)
 
     def lock(self) -> str:
         """Fix the exposure at what it is now, as on a real camera; one sentence that says so."""
@@ -203,7 +204,7 @@ class SimulatedCamera(Camera):
 
     def _check_open(self) -> None:
         if self._closed:
-            raise CameraError(say("closed", what=f"the {self.name}"))
+            raise CameraError(say("cameras.closed", what=f"the {self.name}"))
 
     def _start_afresh(self) -> None:
         """Start the named stream of random numbers, and the drift at a moment that it names."""
