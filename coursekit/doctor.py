@@ -54,8 +54,8 @@ LEAST_FRAMES_FOR_NOISE = 5
 USUAL_VALID, HARDLY_VALID = 0.60, 0.05
 USUAL_NOISE_PX = (0.03, 0.20)  # one pixel's disparity over time: data/published_depth_noise.json
 
-FOUND = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
-MOST_NAMES = 5  # that a line lists
+DOCTOR_TEXTS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
+MOST_PACKAGES = 5  # that a line lists
 
 
 @dataclass(frozen=True)
@@ -89,8 +89,8 @@ def found(what: str, good: bool = False, check: str = "", **facts: Any) -> Check
 
     good: whether all is well, so that the sentence alone is said. check: see `CheckUp`.
     """
-    verdict, *texts = FOUND["findings"][what]
-    says, remedy = (text.format(**FOUND["shared"], **facts) for text in [*texts, ""][:2])
+    verdict, *texts = DOCTOR_TEXTS["findings"][what]
+    says, remedy = (text.format(**DOCTOR_TEXTS["shared"], **facts) for text in [*texts, ""][:2])
     return CheckUp("ok", says, "", check) if good else CheckUp(verdict, says, remedy, check)
 
 
@@ -195,8 +195,8 @@ def _packages() -> Iterator[CheckUp]:
     faults = {"missing": missing, "unsuited": _out_of_range(), "others": others}
     for what, names in faults.items():
         if names:
-            more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
-            yield found(what, names=", ".join(names[:MOST_NAMES]) + more)
+            more = f" and {len(names) - MOST_PACKAGES} more" if len(names) > MOST_PACKAGES else ""
+            yield found(what, names=", ".join(names[:MOST_PACKAGES]) + more)
     if not any(faults.values()):
         yield found("pinned", count=len(wanted), file=PINS.name)
 

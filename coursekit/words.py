@@ -16,7 +16,7 @@ from coursekit.arrays import Interval
 from coursekit.checks import is_number, want
 
 Thing = TypeVar("Thing")
-SENTENCES = tomllib.loads(Path(__file__).with_name("texts.toml").read_text("utf-8"))
+ROOM_TEXTS = tomllib.loads(Path(__file__).with_name("texts.toml").read_text("utf-8"))
 WIDTH = 88  # characters: fits a notebook's output cell; JupyterLab breaks longer lines in mid-word
 
 
@@ -38,7 +38,7 @@ def say(sentence: str, /, **facts: Any) -> str:
     'the camera is closed: open it again with open_camera()'
     """
     room, name = sentence.split(".")
-    return str(SENTENCES[room][name].format(**facts))
+    return str(ROOM_TEXTS[room][name].format(**facts))
 
 
 def with_notes(text: str, notes: Sequence[str]) -> str:

@@ -57,9 +57,9 @@ def test_the_html_is_escaped_and_has_the_same_words() -> None:
 
 PACKAGE = Path(words.__file__).parent
 SENTENCES = {
-    "say": {f"{room}.{name}": text for room, texts in words.SENTENCES.items()
+    "say": {f"{room}.{name}": text for room, texts in words.ROOM_TEXTS.items()
             for name, text in texts.items() if isinstance(text, str)},
-    "found": {name: " ".join(texts) for name, texts in doctor.FOUND["findings"].items()},
+    "found": {name: " ".join(texts) for name, texts in doctor.DOCTOR_TEXTS["findings"].items()},
 }  # fmt: skip
 
 
@@ -67,7 +67,7 @@ SENTENCES = {
 def test_every_sentence_is_there_used_and_gets_its_facts(function: str) -> None:
     files = PACKAGE.rglob("*.py") if function == "say" else [PACKAGE / "doctor.py"]
     nodes = [node for file in files for node in ast.walk(ast.parse(file.read_text("utf-8")))]
-    shared = doctor.FOUND["shared"].keys() if function == "found" else set()
+    shared = doctor.DOCTOR_TEXTS["shared"].keys() if function == "found" else set()
     for call in nodes:
         if isinstance(call, ast.Call) and ast.unparse(call.func) == function:
             facts = {fact.arg for fact in call.keywords} | shared

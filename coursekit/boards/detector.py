@@ -25,7 +25,7 @@ from coursekit.boards.corners import blur_covariance, refine_corners, steps
 from coursekit.boards.explain import BLANK_GREY, explain
 from coursekit.boards.find import OFF_PLANE, find_corners, on_plane
 from coursekit.checks import want
-from coursekit.words import SENTENCES, counting, say
+from coursekit.words import ROOM_TEXTS, counting, say
 
 FEWEST_CORNERS = 6
 SMALLEST_IMAGE_PX = 40  # shorter side of an image in which a board can be told
@@ -231,7 +231,7 @@ def _read(source: Any) -> AnyArray:
     if not data:
         raise BoardNotFound(say("boards.empty"))
     for pattern, what in (
-        SENTENCES["boards"]["other_files"].items() if not data.startswith((JPEG, PNG)) else ()
+        ROOM_TEXTS["boards"]["other_files"].items() if not data.startswith((JPEG, PNG)) else ()
     ):
         texts = (source.suffix.lower(), data[:16].decode("latin1"))
         if any(re.match(pattern, text, re.DOTALL) for text in texts):

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from coursekit.arrays import Floats, Grey, NDArray
 from coursekit.boards.board import DICTIONARIES, FEWEST_SQUARES, Board, OtherBoard
 from coursekit.boards.find import checkerboard_seen, off_homography, real_beyond, shrunk
-from coursekit.words import SENTENCES, say
+from coursekit.words import ROOM_TEXTS, say
 
 LONGEST_PX = 1600  # an image is looked at no larger than this
 ANY_SIZE_PX = 800  # ... and where checkerboards of any size are looked for than this
@@ -189,7 +189,7 @@ def _marked(markers: _Markers, board: Board) -> str:
     """What markers show, of this dictionary or another; "" where they fit the board asked for."""
     seen = f"{len(markers.ids)} markers of {_short_name(markers, board)}"
     if markers.way:
-        cure = SENTENCES["boards"]["cures"][markers.way]
+        cure = ROOM_TEXTS["boards"]["cures"][markers.way]
         return f"{len(markers.ids)} markers, all {markers.way}: {cure}"
     if _is_grid(markers):
         return say("boards.tags", seen=seen, not_usable=say("boards.not_usable"))

@@ -11,7 +11,7 @@ from types import ModuleType
 from typing import Any
 
 from coursekit.cameras.frames import CameraError
-from coursekit.words import SENTENCES, say
+from coursekit.words import ROOM_TEXTS, say
 
 USB_DEVICES = Path("/sys/bus/usb/devices")  # Linux only
 
@@ -68,7 +68,7 @@ def device_info(rs: ModuleType, device: Any, name: str) -> str:
 
 def start_problem(what: str, error: RuntimeError) -> str:
     """The message for a live camera that does not start: what happened and what to do next."""
-    for words, advice in SENTENCES["cameras"]["start"].items():
+    for words, advice in ROOM_TEXTS["cameras"]["start"].items():
         if re.search(words, str(error).lower()):
             because = advice.format(udev=UDEV_ADVICE)
             return say("cameras.not_starting_because", what=what, advice=because, error=error)

@@ -21,7 +21,7 @@ from coursekit.cameras.camera import Camera, camera_line
 from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Frame
 from coursekit.cameras.librealsense import device_info, load_librealsense, start_problem
 from coursekit.geometry import Intrinsics, make_transform
-from coursekit.words import SENTENCES, say
+from coursekit.words import ROOM_TEXTS, say
 
 DEPTH_SIZE, COLOR_SIZE = (848, 480), (640, 480)
 WARM_UP_FRAMES = 30  # automatic exposure settles in about a second
@@ -261,7 +261,7 @@ class RealSense(Camera):
         device = specified(self.name)
         glass_m = device.nominal.glass_m if device else 0.0
         what, distance_mm = (
-            SENTENCES["cameras"]["placing"].get(name, f"Put the {name}"),
+            ROOM_TEXTS["cameras"]["placing"].get(name, f"Put the {name}"),
             1000 * (distance_m - glass_m),
         )
         where = {"distance_mm": distance_mm, "distance_m": distance_m, "glass_mm": 1000 * glass_m}
