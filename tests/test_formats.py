@@ -664,7 +664,6 @@ def test_a_wrong_statement_is_refused_or_found(tmp_path) -> None:
         for number, (columns, values, said) in enumerate(said_wrongly(session)):
             counts[number] += noticed(tmp_path, session, columns, values, said)
         accused += bool(diagnose(replace(session, q=None)).names)
-    print(counts, accused)
     assert len(counts) == 24
     assert min(counts.values()) >= 19
     assert accused <= 1
