@@ -76,6 +76,15 @@ def counting(things: Iterable[Thing], total: int, thing: str, shown: bool) -> It
     line.update({"text/plain": ""}, raw=True)
 
 
+def stacked(*widgets: Any) -> Any:
+    """Widgets one below the other, for a keyboard and a screen reader, too."""
+    import ipywidgets
+
+    script = Path(__file__).with_name("keyboard.html").read_text("utf-8")
+    unseen = ipywidgets.HTML(script, layout={"display": "none"})
+    return ipywidgets.VBox([*widgets, unseen])
+
+
 def p_text(p_value: float) -> str:
     """ "p = 0.03", and no more zeros than mean anything."""
     return f"p = {p_value:.2g}" if p_value >= 1e-6 else "p < 0.000001"
