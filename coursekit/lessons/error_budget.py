@@ -37,7 +37,7 @@ SENSITIVITIES = Exercise(
         (20.0, 0.30, 612.0, 322.0, 0.003),
         (700.0, 3.70, 390.4, 331.4, -0.006),
     ],
-    per_row=0,
+    parts=("dX/du", "dX/dZ", "the leak"),
     unit="m/px, 1 and m",
     tolerance=1e-9,
     describe=lambda args: (
@@ -165,9 +165,8 @@ ADD_UP = Exercise(
         ([(2.0, 4.0, None, "bias"), (0.8, 0.8, _tilted(30), "noise"),
           (0.5, 5.0, (0.6, 0.0, -0.8), "bias"), (0.4, 0.4, None, "noise")], 4.0),
     ],
-    per_row=0,
+    parts=("the noise", "the worst case", "the quadrature", "the share"),
     unit="(mm, mm, mm and a share)",
-    tolerance=1e-6,
     describe=lambda args: "; ".join(_row_in_words(row) for row in args[0])
     + f"; tolerance {args[1]:g} mm",
     show=lambda row: "(" + ", ".join(f"{v:.4g}" for v in np.ravel(row)) + ")",

@@ -62,12 +62,16 @@ REPROJECTION_RMS = Exercise(
         _corners(4, 60, (4.0, 7.0), -2.0),
         _corners(3, 120, (0.25, 0.08), 0.05),
     ],
-    per_row=0,
+    parts=("the RMS in u", "the RMS in v", "the RMS of both"),
     unit="px",
     tolerance=5e-5,
     describe=_describe_rms,
     show=lambda row: "(" + ", ".join(f"{v:.4f}" for v in np.ravel(row)) + ")",
 )
+
+
+def _with_lengths(residuals: Floats) -> Floats:
+    return np.c_[residuals, np.linalg.norm(residuals, axis=1)]
 
 
 for _step in ("axis", "shown"):  # whether or not the 2-D number is made of them
@@ -88,21 +92,9 @@ for _step in ("axis", "shown"):  # whether or not the 2-D number is made of them
         (_step, "wrong_axis", lambda e, *_: np.sqrt(np.mean(e**2, axis=1))[:2]),
     )
 REPROJECTION_RMS.add_mistakes(
-    (
-        "whole",
-        "mean_removed",
-        lambda e, result: np.std(np.c_[e, np.linalg.norm(e, axis=1)], axis=0),
-    ),
-    (
-        "whole",
-        "largest",
-        lambda e, result: np.max(np.abs(np.c_[e, np.linalg.norm(e, axis=1)]), axis=0),
-    ),
-    (
-        "whole",
-        "median_absolute",
-        lambda e, result: np.median(np.abs(np.c_[e, np.linalg.norm(e, axis=1)]), axis=0),
-    ),
+    ("whole", "mean_removed", lambda e, result: np.std(_with_lengths(e), axis=0)),
+    ("whole", "largest", lambda e, result: np.max(np.abs(_with_lengths(e)), axis=0)),
+    ("whole", "median_absolute", lambda e, result: np.median(np.abs(_with_lengths(e)), axis=0)),
     ("both", "both_over_2n", lambda residuals, axes: float(np.sqrt(np.mean(axes**2)))),
     ("both", "mean_distance", lambda e, axes: float(np.mean(np.linalg.norm(e, axis=1)))),
     ("both", "added", lambda residuals, axes: float(np.sum(axes))),
@@ -110,11 +102,7 @@ REPROJECTION_RMS.add_mistakes(
     ("both", "both_without_root", lambda residuals, axes: float(np.sum(axes**2))),
     ("both", "norm_of_everything", lambda residuals, axes: float(np.linalg.norm(residuals))),
     ("whole", "squares_everywhere", lambda residuals, result: result**2),
-    (
-        "whole",
-        "mean_distances_everywhere",
-        lambda e, result: np.mean(np.abs(np.c_[e, np.linalg.norm(e, axis=1)]), axis=0),
-    ),
+    ("whole", "mean_distances", lambda e, result: np.mean(np.abs(_with_lengths(e)), axis=0)),
     ("order", "v_before_u", lambda axes, both: np.array([axes[1], axes[0], both])),
     ("order", "both_first", lambda axes, both: np.array([both, *axes])),
 )
@@ -161,9 +149,7 @@ FOCAL_SIGMA = Exercise(
         _least_squares(3, 108, 15, 0.08),
         _least_squares(4, 60, 9, 2.0),
     ],
-    per_row=0,
     unit="px",
-    tolerance=1e-6,
     describe=lambda args: (
         f"J is {args[0].shape[0]}x{args[0].shape[1]}"
         + (f" with rows {args[0].tolist()}, residuals {args[1].tolist()}" * (len(args[0]) < 7))

@@ -64,7 +64,7 @@ changed(
         "math.sqrt(sum(a * a for a, _ in d) / n) -> sum(abs(a) for a, _ in d) / n "
         "and math.sqrt(sum(b * b for _, b in d) / n) -> sum(abs(b) for _, b in d) / n "
         "and math.hypot(u, v) -> sum(math.hypot(*one) for one in d) / n": (
-            "mean_distances_everywhere"
+            "mean_distances"
         ),
     },
 )
