@@ -46,7 +46,8 @@ class Mistake:
     """One wrong step: what it says to the learner, and a question that leads on.
 
     One that stands `alone` is not tried together with others (one of a long family, say). Without
-    a step, `wrong` is what is made of the whole function. One of the `device` is not listed.
+    a step, `wrong` is what is made of the whole function. One of the `device` is not listed;
+    one `of_result` needs nothing but what the function gives.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Mistake:
     wrong: Step = field(default=lambda: None)
     alone: bool = False
     device: bool = False
+    of_result: bool = False
 
 
 @dataclass(frozen=True)
@@ -151,10 +153,13 @@ class Exercise:
 
     @cached_property
     def _others(self) -> list[Exercise]:
-        """The exercise as those see it who answer it in another right way, without the device."""
+        """The exercise as those see it who answer it in another right way.
+
+        The device edits their results only.
+        """
         others = [replace(self, way=w, steps=self.steps | own, ways=[]) for w, own in self.ways]
         for other in others:
-            other._edits.extend(([], []))
+            other._edits.extend(([], _result_edits(other), []))
         return others
 
     def _verdict(self, function: Callable[..., Any]) -> Verdict:
@@ -374,13 +379,12 @@ class Exercise:
                 yield (a, b) if order.index(a.step) < order.index(b.step) else (b, a)
         if not self._edits:
             self._edits += _all_edits(self)
-        single, double = self._edits
-        yield from ((m,) for m in single)
-        yield from ((m,) for m in double)
+        yield from ((m,) for m in itertools.chain(*self._edits))
         common = [
-            m for m in single if not m.step and m.name in FOUND["common"] and "result" in m.says
+            m for m in self._edits[0] if m.name in FOUND["common"] and "each of" not in m.says
         ]
         yield from itertools.product(listed, common)
+        yield from itertools.combinations(common, 2)
 
     def _explains(self, mistakes: tuple[Mistake, ...], values: list[Floats]) -> bool:
         """Whether a wrong model gives exactly these values.
@@ -414,8 +418,12 @@ class Exercise:
         """
         key = (*map(id, mistakes), id(args))
         if key not in self._known:
+            model = self.model(*mistakes)
+            if mistakes and mistakes[-1].of_result:
+                given = self._answer(mistakes[:-1], args)
+                model = mistakes[-1].wrong(lambda *_: given)
             try:
-                value = _as_numbers(self.model(*mistakes)(*args))
+                value = _as_numbers(model(*args))
             except Exception:  # an edit of the device may come to nothing
                 value = None
             overflows = value is not None and not self.nan_answers and not np.isfinite(value).all()
@@ -531,8 +539,26 @@ MOST_NAMES = 3  # of more of them no learner finds the place
 MOST_SITES = 55  # of more of them in one step no two are tried together
 
 
-def _all_edits(exercise: Exercise) -> tuple[list[Mistake], list[Mistake]]:
-    """Single edits of the whole function and of its steps, and pairs within one step's source."""
+def _split(exercise: Exercise, result: Any) -> Any:
+    """The result of one case: its rows have columns, or it has a few parts."""
+    array = np.asarray(result)
+    return array if exercise.per_row or not array.ndim else tuple(array)
+
+
+def _result_edits(exercise: Exercise) -> list[Mistake]:
+    found = []
+    result = _split(exercise, exercise.model()(*exercise.cases[-1]))
+    for kind, where, edit in _edits_of(result, "your result", exercise.parts):
+
+        def wrong(model: Model, edit: Edit = edit) -> Model:
+            return lambda *args: edit(_split(exercise, model(*args)))
+
+        found.append(replace(_device(kind, where, "", wrong), of_result=True))
+    return found
+
+
+def _all_edits(exercise: Exercise) -> tuple[list[Mistake], list[Mistake], list[Mistake]]:
+    """Single edits of the result, of all else, and pairs within one step's source."""
     args, steps = exercise.cases[-1], exercise.steps
     seen: dict[str, tuple[tuple[Any, ...], Any]] = {}
 
@@ -540,18 +566,13 @@ def _all_edits(exercise: Exercise) -> tuple[list[Mistake], list[Mistake]]:
         seen[name] = values, steps[name](*values)
         return seen[name][1]
 
-    def split(result: Any) -> Any:  # of one case: its rows have columns, or it has a few parts
-        array = np.asarray(result)
-        return array if exercise.per_row or not array.ndim else tuple(array)
-
+    split = partial(_split, exercise)
     result = split(exercise.build({name: partial(watched, name) for name in steps})(*args))
     inputs = [f"`{name}`" for name in inspect.signature(exercise.model()).parameters]
-    found: list[tuple[str, str, str, Step]] = []
-    for kind, where, edit in _edits_of(result, "your result", exercise.parts):
-        found.append((kind, where, "", lambda f, e=edit: lambda *a: e(split(f(*a)))))
     rewritten = [(name, edit) for name, step in steps.items() for edit in _rewritten(step)]
+    found: list[tuple[str, str, str, Step]] = []
     found += [(kind, where, name, new) for name, (n, kind, where, new) in rewritten if n == 1]
-    for kind, where, edit in _edits_of(args, "your inputs", inputs):
+    for kind, where, edit in _edits_of(args, _listed(inputs), inputs):
         found.append((kind, where, "", lambda f, e=edit: lambda *a: f(*e(a))))
     for kind, where, by in _factors(args, inputs, result):
         found.append((kind, where, "", lambda f, by=by: lambda *a: by(a, split(f(*a)))))
@@ -561,13 +582,24 @@ def _all_edits(exercise: Exercise) -> tuple[list[Mistake], list[Mistake]]:
             found.append((kind, where, name, lambda *a, e=edit, f=step: f(*e(a))))
         for kind, where, edit in _edits_of(given, f"what is made of {_listed(own)}", deep=False):
             found.append((kind, where, name, lambda *a, e=edit, f=step: e(f(*a))))
-    pairs = [(kind, where, name, new) for name, (n, kind, where, new) in rewritten if n == 2]
-    return [_device(*edit) for edit in found], [_device(*edit, FOUND["more"]) for edit in pairs]
+    pairs = [
+        _device(kind, where, name, new, FOUND["more"])
+        for name, (n, kind, where, new) in rewritten
+        if n == 2
+    ]
+    return _result_edits(exercise), [_device(*edit) for edit in found], pairs
 
 
 def _device(kind: str, where: str, step: str, wrong: Step, before: str = "") -> Mistake:
     says, ask = (" ".join(text.split()) for text in FOUND["kinds"][kind])
-    return Mistake(kind, before + says.replace("WHERE", where), ask, step, wrong, device=True)
+    return Mistake(
+        kind,
+        before + says.replace("WHERE", where or FOUND["unseen"]),
+        ask,
+        step,
+        wrong,
+        device=True,
+    )
 
 
 def _listed(names: Iterable[str]) -> str:

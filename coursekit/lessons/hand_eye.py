@@ -92,6 +92,20 @@ def _places_subtracted(motion: Step, sign: int) -> Step:
     return wrong
 
 
+for _step in ("A", "B"):
+    _motion = MOTION_PAIR.steps[_step]
+    MOTION_PAIR.add_mistakes(
+        (_step, "one_pose_only", lambda i, j, inverse: np.eye(4)),
+        (_step, "product_inverted", lambda i, j, inverse: inverse(j @ i)),
+        (_step, "product_inverted", lambda i, j, inverse: inverse(i @ j)),
+        (_step, "elementwise", lambda i, j, inverse: inverse(j) * i),
+        (_step, "elementwise", lambda i, j, inverse: j * inverse(i)),
+        (_step, "elementwise", lambda i, j, inverse: j * i),
+        (_step, "subtracted", lambda i, j, inverse: j - i),
+        (_step, "subtracted", lambda i, j, inverse: i - j),
+        (_step, "places_subtracted", _places_subtracted(_motion, 1)),
+        (_step, "places_subtracted", _places_subtracted(_motion, -1)),
+    )
 MOTION_PAIR.add_mistakes(
     ("read", "gripper_twice", lambda gi, gj, bi, bj: (gi, gj, gi, gj)),
     ("read", "board_twice", lambda gi, gj, bi, bj: (bi, bj, bi, bj)),
@@ -108,20 +122,6 @@ MOTION_PAIR.add_mistakes(
     ("A", "other_order", lambda i, j, inverse: i @ inverse(j)),
     ("B", "other_order", lambda i, j, inverse: inverse(i) @ j),
 )
-for _step in ("A", "B"):
-    _motion = MOTION_PAIR.steps[_step]
-    MOTION_PAIR.add_mistakes(
-        (_step, "one_pose_only", lambda i, j, inverse: np.eye(4)),
-        (_step, "product_inverted", lambda i, j, inverse: inverse(j @ i)),
-        (_step, "product_inverted", lambda i, j, inverse: inverse(i @ j)),
-        (_step, "elementwise", lambda i, j, inverse: inverse(j) * i),
-        (_step, "elementwise", lambda i, j, inverse: j * inverse(i)),
-        (_step, "elementwise", lambda i, j, inverse: j * i),
-        (_step, "subtracted", lambda i, j, inverse: j - i),
-        (_step, "subtracted", lambda i, j, inverse: i - j),
-        (_step, "places_subtracted", _places_subtracted(_motion, 1)),
-        (_step, "places_subtracted", _places_subtracted(_motion, -1)),
-    )
 
 
 # --- rotation_half ---

@@ -99,11 +99,9 @@ REPROJECTION_RMS.add_mistakes(
     ("both", "mean_distance", lambda e, axes: float(np.mean(np.linalg.norm(e, axis=1)))),
     ("both", "added", lambda residuals, axes: float(np.sum(axes))),
     ("both", "mean_of_axes", lambda residuals, axes: float(np.mean(axes))),
-    ("both", "both_without_root", lambda residuals, axes: float(np.sum(axes**2))),
     ("both", "norm_of_everything", lambda residuals, axes: float(np.linalg.norm(residuals))),
     ("whole", "squares_everywhere", lambda residuals, result: result**2),
     ("whole", "mean_distances", lambda e, result: np.mean(np.abs(_with_lengths(e)), axis=0)),
-    ("order", "v_before_u", lambda axes, both: np.array([axes[1], axes[0], both])),
     ("order", "both_first", lambda axes, both: np.array([both, *axes])),
 )
 
@@ -181,6 +179,5 @@ FOCAL_SIGMA.add_mistakes(
     ("first", "whole_row", lambda information: abs(np.sum(np.linalg.inv(information)[0]))),
     ("information", "rows_for_columns", lambda J: np.linalg.pinv(np.linalg.pinv(J @ J.T)[:1, :1])),
     ("scale", "divided_by_noise", lambda noise, first: first / noise),
-    ("root", "variance", lambda value: value),
     ("root", "ninety_five", lambda value: 1.96 * math.sqrt(value)),
 )

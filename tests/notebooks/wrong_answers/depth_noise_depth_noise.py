@@ -15,8 +15,8 @@ changed(
     vectorised,
     {
         "Z**2 -> 2 * Z": "linear_in_Z",
-        "(fx * baseline) -> (fx * 1000 * baseline)": "millimetres",
-        "* sigma_d -> * sigma_d * 1e3": "millimetres",
+        "(fx * baseline) -> (fx * 1000 * baseline)": "thousandth",
+        "* sigma_d -> * sigma_d * 1e3": "thousand",
         "(fx * baseline) -> baseline": "fx_forgotten",
         "/ (fx * baseline) -> * 1": "constant_forgotten",
         "(fx * baseline) -> (fx * B)": "other_baseline",
@@ -29,8 +29,8 @@ changed(
             "focal_length_behind_the_fraction"
         ),
         "* sigma_d -> / sigma_d": "noise_divided",
-        "Z**2 / (fx * baseline) * sigma_d -> (Z**2 / (fx * baseline) * sigma_d) ** 2": "variance",
-        "Z**2 / (fx * baseline) * sigma_d -> np.sqrt(Z**2 / (fx * baseline) * sigma_d)": "root",
+        "Z**2 / (fx * baseline) * sigma_d -> (Z**2 / (fx * baseline) * sigma_d) ** 2": "squared",
+        "Z**2 / (fx * baseline) * sigma_d -> np.sqrt(Z**2 / (fx * baseline) * sigma_d)": "rooted",
         "* sigma_d -> * sigma_d * math.sqrt(2)": "root_of_two",
         "return Z**2 -> Z *= Z\n    return Z": "in_place",
         "Z**2 -> 1000 * Z": "several, first linear_in_Z",

@@ -25,7 +25,7 @@ changed(
         "np.sqrt(stays + moves) -> stays**0.5 + moves**0.5": "errors_added",
         "h * w / 64 -> h * w": "pixels_independent",
         "h * w / 64 -> h * w / 144": "patch_of_the_mean",
-        "(2 * (n -> ((n": "two_forgotten",
+        "(2 * (n -> ((n": "root_of_two",
         "* h * w / 64)) -> ))": "one_pixel_only",
         "np.nanmean(z, axis=0) -> z.mean(axis=0)": None,
     },

@@ -26,11 +26,11 @@ changed(
         "bias = -> z = z[:, (counts > 0).all(axis=0)]\n    bias =": "steady_only",
         "np.nanmean(z) -> z.mean()": "nan_spreads",
         "np.nanmean(z) -> np.nanmedian(z)": "bias_of_the_median",
-        "np.nanmean(z) - distance * 1000 -> distance * 1000 - np.nanmean(z)": "bias_sign",
-        "np.nanmean(z) - distance * 1000 -> abs(np.nanmean(z) - distance * 1000)": "bias_size",
+        "np.nanmean(z) - distance * 1000 -> distance * 1000 - np.nanmean(z)": "negative",
+        "np.nanmean(z) - distance * 1000 -> abs(np.nanmean(z) - distance * 1000)": "absolute",
         " - distance * 1000 -> ": "bias_is_depth",
         "- distance * 1000 -> / distance / 10 - 100": "bias_percent",
-        "- distance * 1000 -> - distance": "bias_against_metres",
+        "- distance * 1000 -> - distance": "thousandth",
         f"{STD} -> np.nanmean(np.nanstd(z, axis=0, ddof=1))": "stds_averaged",
         f"{STD} -> np.nanmedian(np.nanstd(z, axis=0, ddof=1))": "stds_averaged",
         ", ddof=1 -> ": "divided_by_n",
@@ -38,12 +38,12 @@ changed(
         f"{STD} -> np.nanstd(np.nanmean(z, axis=0))": "over_space",
         f"{STD} -> np.nanstd(z)": "over_everything",
         f"{STD} -> np.nanstd(np.nanmean(z, axis=(1, 2)), ddof=1)": "of_the_windows_mean",
-        "np.sqrt(np.nanmean( -> (np.nanmean(": "variance_reported",
+        "np.sqrt(np.nanmean( -> (np.nanmean(": "squared",
         "bias, std, -> bias, std / len(counts) ** 0.5,": "error_of_the_mean",
-        "scale * 1000.0 -> scale and - distance * 1000 -> - distance": "row_in_metres",
+        "scale * 1000.0 -> scale and - distance * 1000 -> - distance": "thousandth",
         "bias, std, -> bias, std / 1000 / scale,": "row_in_counts",
-        "bias, std, -> std, bias,": "row_order",
-        "np.mean(counts == 0) -> 100 * np.mean(counts == 0)": "invalid_percent",
+        "bias, std, -> std, bias,": "exchanged",
+        "np.mean(counts == 0) -> 100 * np.mean(counts == 0)": "hundred",
         "np.mean(counts == 0) -> np.mean(counts != 0)": "valid_part",
         "np.mean(counts == 0) -> np.sum(counts == 0)": "invalid_number",
         "np.mean(counts == 0) -> np.mean((counts == 0).any(axis=0))": "ever_invalid",
@@ -66,7 +66,7 @@ def pixel_by_pixel(counts, scale, distance):
     return sum(levels) / len(levels) - 1000 * distance, (squares / dof) ** 0.5, holes
 
 
-@wrong("several, first bias_sign")
+@wrong("several, first negative")
 def two_mistakes(counts, scale, distance):
     bias, std, invalid = whole_arrays(counts, scale, distance)
     return -bias, std, 100 * invalid

@@ -31,8 +31,8 @@ changed(
         "abs(toward[0]) -> abs(toward[1])": "other_axis",
         "1.0 if toward is None -> 1 / math.sqrt(3) if toward is None": "third_of_the_worst",
         "noise2 += (high * c) ** 2 -> noise2 += high * c": "squares_forgotten",
-        "math.sqrt(noise2), worst -> noise2, worst": "noise_squared",
-        "math.sqrt(quad2), p -> quad2, p": "quadrature_squared",
+        "math.sqrt(noise2), worst -> noise2, worst": "squared",
+        "math.sqrt(quad2), p -> quad2, p": "squared",
         "worst += high * c -> worst += low * c": None,
         "worst += high * c -> worst += low * c and quad2 += (high * c) -> quad2 += (low * c)": (
             "least_for_most"
@@ -51,12 +51,12 @@ changed(
         "sigma = math.sqrt(mean2) -> sigma = worst": "worst_for_sigma",
         "p = math.erfc -> p = 0.5 * math.erfc": "one_sided",
         "p = math.erfc -> p = 1 - math.erfc": "within_for_beyond",
-        "p = math.erfc -> p = 100 * math.erfc": "share_in_percent",
+        "p = math.erfc -> p = 100 * math.erfc": "hundred",
         " / math.sqrt(2)) -> )": "root_two_lost",
         "worst, math.sqrt(quad2), p -> math.sqrt(quad2), worst, p": "sums_exchanged",
         'kind == "noise" -> kind == "bias"': "kinds_exchanged",
         "p = math.erfc -> p = 0.5 * math.erfc and math.sqrt(noise2), worst -> noise2, worst": (
-            "several, first noise_squared"
+            "several, first one_sided"
         ),
         ", math.sqrt(quad2), p -> , p": None,
     },

@@ -13,8 +13,8 @@ changed(
     one_line,
     {
         "* depth_error -> * 0 + Z / fx * depth_error": "wrong_price",
-        "(u - cx) / fx * depth_error -> abs((u - cx) / fx * depth_error)": "sign_lost",
-        "depth_error\n -> depth_error * 1e3\n": "millimetres",
+        "(u - cx) / fx * depth_error -> abs((u - cx) / fx * depth_error)": "absolute",
+        "depth_error\n -> depth_error * 1e3\n": "thousand",
         "Z / fx, (u - cx) / fx, -> (u - cx) / fx, Z / fx,": "exchanged",
         "Z / fx, -> 1 / fx, and (u - cx) / fx * depth_error -> abs((u - cx) / fx * depth_error)": (
             "several, first distance_forgotten"
@@ -35,17 +35,17 @@ changed(
     {
         "Z / fx -> 1 / fx": "distance_forgotten",
         "u - cx -> u": "centre_forgotten",
-        "u - cx -> cx - u": "other_way",
+        "u - cx -> cx - u": "negative",
         "(u - cx) / fx -> (u - cx) / fx * Z": "not_differentiated",
         "(u - cx) / fx -> math.atan((u - cx) / fx)": "angle",
         "(u - cx) / fx -> math.sin(math.atan((u - cx) / fx))": "sine",
         "slope * depth_error -> slope * (Z + depth_error)": "landing_place",
-        "Z / fx, slope, slope -> 1000 * Z / fx, slope, 1000 * slope": "all_millimetres",
+        "Z / fx, slope, slope -> 1000 * Z / fx, slope, 1000 * slope": "thousand",
     },
 )
 
 
-@wrong("upside_down")
+@wrong("reciprocal")
 def pixels_per_metre(u, Z, fx, cx, depth_error):
     X = (u - cx) * Z / fx
     du = (fx * (X + 1e-3) / Z + cx - u) / 1e-3

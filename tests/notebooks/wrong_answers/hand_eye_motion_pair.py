@@ -43,7 +43,7 @@ changed(
         "board_j @ undo(board_i) -> board_i @ undo(board_j)": "b_exchanged",
         "board_j @ undo(board_i) -> undo(board_j) @ board_i": "motion_in_board",
         "undo(gripper_j) @ gripper_i, board_j @ undo(board_i) "
-        "-> board_j @ undo(board_i), undo(gripper_j) @ gripper_i": "b_first",
+        "-> board_j @ undo(board_i), undo(gripper_j) @ gripper_i": "exchanged",
         "undo(gripper_j) @ gripper_i, board_j @ undo(board_i) "
         "-> undo(gripper_i) @ gripper_j, undo(board_j) @ board_i": "several, first a_exchanged",
         "undo(gripper_j) @ -> undo(gripper_j) * and board_j @ -> board_j *": "elementwise",

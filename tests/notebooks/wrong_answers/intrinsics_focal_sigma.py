@@ -26,7 +26,7 @@ changed(
         "np.linalg.inv(J.T @ J) -> J.T @ J": "not_inverted",
         "C[0, 0] -> C[-1, -1]": "last_parameter",
         "s2 * np -> 1 / s2 * np": "divided_by_noise",
-        "np.sqrt(C[0, 0]) -> C[0, 0]": "variance",
+        "np.sqrt(C[0, 0]) -> C[0, 0]": "squared",
         "np.sqrt(C[0, 0]) -> 1.96 * np.sqrt(C[0, 0])": "ninety_five",
         "(M - P) -> M and np.sqrt(C[0, 0]) -> C[0, 0]": "several, first nothing_fitted",
         "C[0, 0] -> np.diag(C)": None,

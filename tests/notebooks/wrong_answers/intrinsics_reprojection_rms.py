@@ -31,11 +31,11 @@ changed(
         "np.hypot(u, v) -> np.sqrt(np.mean(d**2))": "both_over_2n",
         "np.hypot(u, v) -> u + v": "added",
         "np.hypot(u, v) -> (u + v) / 2": "mean_of_axes",
-        "np.hypot(u, v) -> u**2 + v**2": "both_without_root",
+        "np.hypot(u, v) -> u**2 + v**2": "squared",
         "np.hypot(u, v) -> np.linalg.norm(d)": "norm_of_everything",
         # what is returned
         "[u, v, both] -> [u**2, v**2, both**2]": "squares_everywhere",
-        "[u, v, both] -> [v, u, both]": "v_before_u",
+        "[u, v, both] -> [v, u, both]": "exchanged",
         "[u, v, both] -> [both, u, v]": "both_first",
         "d = observed - predicted -> observed -= predicted\n    d = observed": "in_place",
         "np.sqrt(np.mean(d**2, axis=0)) -> np.std(d, axis=0) and np.hypot(u, v) -> u + v": (
@@ -63,8 +63,6 @@ changed(
         "math.hypot(u, v) -> sum(math.hypot(*one) for one in d) / n": "mean_distance",
         "math.sqrt(sum(a * a for a, _ in d) / n) -> sum(abs(a) for a, _ in d) / n "
         "and math.sqrt(sum(b * b for _, b in d) / n) -> sum(abs(b) for _, b in d) / n "
-        "and math.hypot(u, v) -> sum(math.hypot(*one) for one in d) / n": (
-            "mean_distances"
-        ),
+        "and math.hypot(u, v) -> sum(math.hypot(*one) for one in d) / n": ("mean_distances"),
     },
 )

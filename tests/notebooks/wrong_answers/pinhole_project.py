@@ -152,9 +152,9 @@ changed(
         "K, dist) -> K * [[1, 1, -1], [1, 1, -1], [1, 1, 1]], dist)": "principal_point_subtracted",
         "pixels[:, 0] -> pixels[:, 0] + 0.5": "half_pixel",
         "K, dist) -> K, None if dist is None else dist[:4])": "r6_missing",
-        "pixels[:, 0] -> np.flip(pixels[:, 0], axis=1)": "output_swapped",
+        "pixels[:, 0] -> np.flip(pixels[:, 0], axis=1)": "exchanged",
         "pixels[:, 0] -> np.round(pixels[:, 0]).astype(int)": "rounded",
-        "pixels[:, 0] -> [(int(u), int(v)) for u, v in pixels[:, 0]]": "rounded",
+        "pixels[:, 0] -> [(int(u), int(v)) for u, v in pixels[:, 0]]": "truncated",
         "K, dist) -> K, None if dist is None else dist[[0, 1, 3, 2, 4]]) "
         "and (points, np -> (points * [1, -1, 1], np": "several, first y_up",
     },
