@@ -56,6 +56,7 @@ SENSITIVITIES.add_mistakes(
     ("pixel", "distance_forgotten", lambda u, Z, fx, cx: 1 / fx),
     ("pixel", "not_differentiated", lambda u, Z, fx, cx: (u - cx) * Z / fx),
     ("depth", "not_differentiated", lambda u, Z, fx, cx: (u - cx) * Z / fx),
+    ("depth", "other_way", lambda u, Z, fx, cx: (cx - u) / fx),
     ("depth", "centre_forgotten", lambda u, Z, fx, cx: u / fx),
     ("leak", "leak_is_the_error", lambda dX_du, dX_dZ, depth_error, Z: depth_error),
     ("", "at_the_wrong_depth", lambda f: lambda u, Z, fx, cx, off: f(u, Z + off, fx, cx, off)),

@@ -534,7 +534,7 @@ ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh")
 NUMERIC = (int, float, np.generic, np.ndarray)
 _ONE = r"(the \w+ (part|number|column) of )?(what is made of )?`\w+`"
 _NAMED = re.compile(rf"(each of )?{_ONE}((, | and | of ){_ONE})*")
-MOST_ALIKE = 5  # of more parts no two are edited alike
+MOST_PARTS = 5  # of more parts no two are edited alike
 MOST_NAMES = 3  # of more of them no learner finds the place
 MOST_SITES = 55  # of more of them in one step no two are tried together
 
@@ -628,8 +628,8 @@ def _edits_of(
         for kind, where, edit in _edits_of(part, label, deep=deep):
             yield kind, where, partial(_put, [(i, i)], edit)
     numbers = [part for part in parts if isinstance(part[2], NUMERIC)]
-    groups = [g for n in range(2, MOST_ALIKE) for g in itertools.combinations(numbers, n)]
-    for group in groups if len(numbers) < MOST_ALIKE else ():
+    groups = [g for n in range(2, MOST_PARTS) for g in itertools.combinations(numbers, n)]
+    for group in groups if len(numbers) < MOST_PARTS else ():
         where = whole if len(group) == len(parts) else f"each of {_listed(n for n, _, _ in group)}"
         if len({np.shape(part) for _, _, part in group}) == 1:
             for kind, label, edit in _edits_of(group[0][2], where, deep=deep):

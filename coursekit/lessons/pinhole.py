@@ -343,6 +343,7 @@ DEPROJECT.add_mistakes(
     ("lens", "times_focal_length", lambda fx, fy, cx, cy: (1 / fx, 1 / fy, cx, cy)),
     *_CAMERA,
     ("scale", "depth_along_ray", _along_the_ray),
+    ("scale", "not_scaled", lambda x, y, w, depth: (x, y, w * depth)),
     ("scale", "divided_by_depth", lambda x, y, w, depth: (x / depth, y / depth, w * depth)),
     ("unbend", "distorted_again", lambda x, y, bend, *dist: bend(x, y)),
     ("unbend", "one_step", _iterate(1)),

@@ -84,7 +84,7 @@ changed(
         f"(x, y, dist) -> (x, -y, dist) and {_NORMALISED}": "several, first y_up",
         "rays * depth[:, None] -> rays * depth[:, None] * 1000": "thousand",
         "rays * depth[:, None] -> rays * depth[:, None] * 1e-3": "thousandth",
-        "rays * depth[:, None] -> np.column_stack([rays[:, :2], depth])": "factor_missing",
+        "rays * depth[:, None] -> np.column_stack([rays[:, :2], depth])": "not_scaled",
         "rays * depth[:, None] -> rays": "one",
         "rays * depth[:, None] -> (rays * depth[:, None]).T": "transposed",
         "rays * depth[:, None] -> rays * depth": "raised",
