@@ -49,12 +49,7 @@ def makers_table(q: np.ndarray) -> np.ndarray:
     for d, theta, a, alpha in table:
         c, s, ca, sa = np.cos(theta), np.sin(theta), np.cos(alpha), np.sin(alpha)
         T = T @ np.array(
-            [
-                [c, -s * ca, s * sa, a * c],
-                [s, c * ca, -c * sa, a * s],
-                [0, sa, ca, d],
-                [0, 0, 0, 1],
-            ]
+            [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1]]
         )
     return T
 

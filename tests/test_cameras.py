@@ -16,13 +16,7 @@ import coursekit as ck
 from coursekit.boards import Board, detect
 from coursekit.cameras import Camera, CameraError, Frame, Frames, open_camera
 from coursekit.cameras.simulated import SimulatedCamera
-from coursekit.geometry import (
-    Intrinsics,
-    deproject,
-    make_transform,
-    project,
-    transform_points,
-)
+from coursekit.geometry import Intrinsics, deproject, make_transform, project, transform_points
 from coursekit.simulation import wall_scene
 
 CALIBRATION_TOLERANCE = 1e-6  # the recorder writes extrinsics with six decimals
