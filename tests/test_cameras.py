@@ -361,7 +361,8 @@ def test_every_device_sees_the_block(device):
 
 
 def test_simulated_depth_beyond_16_bits_is_invalid():
-    with SimulatedCamera(scene=wall_scene(9.0, tilt_deg=0.0)) as camera:
+    with SimulatedCamera() as camera:
+        camera.scene = wall_scene(9.0, tilt_deg=0.0)
         assert np.nanmedian(middle_mm(camera.frames(1))) == pytest.approx(9000, rel=0.1)
         camera.set(depth_scale_m=1e-4)
         assert np.isnan(middle_mm(camera.frames(1))).mean() > 0.95
