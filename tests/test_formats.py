@@ -692,7 +692,7 @@ def test_images_in_a_subfolder(few) -> None:
 def test_a_lens_of_another_size_is_refused_with_what_to_do(few) -> None:
     place, lines = few
     lens = replace(usable(place, lines).intrinsics, width=1920, height=1080)
-    with pytest.raises(ValueError, match=r"a lens of 1920 x 1080 px, want .* or scale K"):
+    with pytest.raises(ValueError, match=r"a lens of 1920 x 1080 px', want .* or scale K"):
         usable(place, lines, intrinsics=lens)
 
 
