@@ -153,100 +153,17 @@ def test_lens_comes_back_the_same(tmp_path, to) -> None:
 
 # --- lenses in, as their tools write them ---
 
-ROS = """# camera_calibration
-image_width: 640
-image_height: 480
-camera_name: narrow_stereo
-camera_matrix:
-  rows: 3
-  cols: 3
-  data: [600., 0., 320., 0., 601., 240., 0., 0., 1.]
-distortion_model: plumb_bob
-distortion_coefficients: {rows: 1, cols: 5, data: [0.1, -0.2, 1e-05, 0.0, 0.0]}
-"""
-TOPIC_2 = """header:
-  stamp: {sec: 1, nanosec: 2}
-  frame_id: camera_color_optical_frame
-height: 480
-width: 640
-distortion_model: plumb_bob
-d:
-- 0.1
-- -0.2
-- 1.0e-05
-- 0.0
-- 0.0
-k: [600.0, 0.0, 320.0, 0.0, 601.0, 240.0, 0.0, 0.0, 1.0]
-r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
-p: [600.0, 0.0, 320.0, 0.0, 0.0, 601.0, 240.0, 0.0, 0.0, 0.0, 1.0, 0.0]
-binning_x: 0
-binning_y: 0
-roi: {x_offset: 0, y_offset: 0, height: 0, width: 0, do_rectify: false}
----
-"""
+NAMES = (
+    "ros.yaml", "ros2_topic_echo.yaml", "opencv.yml", "opencv.xml", "opencv.json", "kalibr.yaml",
+    "colmap.txt", "open3d.json",
+)  # fmt: skip
+ROS, TOPIC_2, OPENCV, OPENCV_XML, OPENCV_JSON, KALIBR, COLMAP, OPEN3D = (
+    Path(__file__).with_name("lenses").joinpath(name).read_text("utf-8") for name in NAMES
+)
+
 TOPIC_1 = (
     TOPIC_2.replace("\nd:", "\nD:").replace("\nk:", "\nK:").replace("plumb_bob", '"plumb_bob"')
 )
-OPENCV = """%YAML:1.0
----
-calibration_time: "Tue 01 Jan 2030 10:00:00 AM UTC"
-nr_of_frames: 20
-image_width: 640
-image_height: 480
-board_width: 9
-flags: 0
-camera_matrix: !!opencv-matrix
-   rows: 3
-   cols: 3
-   dt: d
-   data: [ 600., 0., 320., 0., 601., 240., 0., 0., 1. ]
-distortion_coefficients: !!opencv-matrix
-   rows: 5
-   cols: 1
-   dt: d
-   data: [ 1.0000000000000001e-01, -2.0000000000000001e-01,
-       1.0000000000000001e-05, 0., 0. ]
-avg_reprojection_error: 2.1e-01
-"""
-OPENCV_XML = """<?xml version="1.0"?>
-<opencv_storage>
-<!-- a comment -->
-<image_Width>640</image_Width>
-<image_Height>480</image_Height>
-<Camera_Matrix type_id="opencv-matrix"><rows>3</rows><cols>3</cols><dt>d</dt>
-  <data>600. 0. 320. 0. 601. 240. 0. 0. 1.</data></Camera_Matrix>
-<Distortion_Coefficients type_id="opencv-matrix"><rows>5</rows><cols>1</cols><dt>d</dt>
-  <data>1e-01 -2e-01 1e-05 0. 0.</data></Distortion_Coefficients>
-</opencv_storage>
-"""
-OPENCV_JSON = """{
-\t"image_width": 640, "image_height": 480,
-\t"cameraMatrix": {"type_id": "opencv-matrix", "rows": 3, "cols": 3, "dt": "d",
-\t\t"data": [600.0, 0.0, 320.0, 0.0, 601.0, 240.0, 0.0, 0.0, 1.0]},
-\t"distCoeffs": {"type_id": "opencv-matrix", "rows": 1, "cols": 5, "dt": "d",
-\t\t"data": [0.1, -0.2, 1e-05, 0, 0]}
-}
-"""
-KALIBR = """cam0:
-  cam_overlaps: []
-  camera_model: pinhole
-  distortion_coeffs: [0.1, -0.2, 1.0e-05, 0.0]
-  distortion_model: radtan
-  intrinsics: [600.0, 601.0, 320.0, 240.0]
-  resolution: [640, 480]
-  rostopic: /cam0/image_raw
-"""
-COLMAP = """# Camera list with one line of data per camera:
-#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]
-# Number of cameras: 1
-1 OPENCV 640 480 600 601 320.5 240.5 0.1 -0.2 1e-05 0
-"""
-OPEN3D = """{
-\t"height" : 480,
-\t"intrinsic_matrix" : [600.0, 0, 0, 0, 601.0, 0, 320.0, 240.0, 1],
-\t"width" : 640
-}
-"""
 OPEN3D_VIEW = json.dumps(
     {"class_name": "PinholeCameraParameters", "extrinsic": [1, 0], "intrinsic": json.loads(OPEN3D)}
 )
