@@ -33,14 +33,19 @@ def test_as_they_are_nothing_is_found(moveit_poses) -> None:
     assert diagnose(*moveit_poses).names == ()
 
 
-def test_millimetres(moveit_poses) -> None:
-    arm, seen = moveit_poses
-    for given in (
-        (larger(arm, 1e3), seen),
-        (arm, larger(seen, 1e3)),
-        (larger(arm, 1e3), larger(seen, 1e3)),
-    ):
-        assert diagnose(*given).names == ("millimetres",)
+MISTAKES = {
+    "arm in mm": ("millimetres", lambda arm, seen: (larger(arm, 1e3), seen)),
+    "board in mm": ("millimetres", lambda arm, seen: (arm, larger(seen, 1e3))),
+    "both in mm": ("millimetres", lambda arm, seen: (larger(arm, 1e3), larger(seen, 1e3))),
+    "later": ("off_by_one", lambda arm, seen: (arm[1:], seen[:-1])),
+    "earlier": ("off_by_one", lambda arm, seen: (arm[:-1], seen[1:])),
+    "rolled": ("off_by_one", lambda arm, seen: (np.roll(arm, 1, axis=0), seen)),
+}
+
+
+@pytest.mark.parametrize(("name", "mistake"), MISTAKES.values(), ids=MISTAKES)
+def test_a_mistake_is_named(moveit_poses, name: str, mistake) -> None:
+    assert diagnose(*mistake(*moveit_poses)).names == (name,)
 
 
 @pytest.mark.parametrize(
@@ -59,12 +64,6 @@ def test_degrees(moveit_poses, kind: str) -> None:
     [finding] = diagnose(given, seen)
     assert finding.name == "degrees"
     assert "4.1 mm" in finding.evidence
-
-
-def test_shifted_by_one(moveit_poses) -> None:
-    arm, seen = moveit_poses
-    for given in ((arm[1:], seen[:-1]), (arm[:-1], seen[1:]), (np.roll(arm, 1, axis=0), seen)):
-        assert diagnose(*given).names == ("off_by_one",)
 
 
 @pytest.mark.parametrize("factor", [1.05, 0.95])
