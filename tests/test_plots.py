@@ -158,7 +158,7 @@ def test_drag_draws_its_start_and_follows_a_slider(monkeypatch) -> None:
     drag = plots.drag(
         pinhole.similar_triangles, focal_length_mm=(1, 4, 1.93), depth_m=(0.35, 1.2, 0.45)
     )
-    focal, depth, image = drag.widget().children
+    focal, depth, image, _ = drag.widget().children
     assert (focal.description, depth.description) == ("focal length (mm)", "depth (m)")
     assert (focal.value, depth.value) == (1.93, 0.45)
     assert (focal.step, depth.step) == (0.01, 0.01)

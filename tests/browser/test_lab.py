@@ -54,7 +54,7 @@ def server_at(browser, tmp_path_factory):
         (served / "notebooks" / f"{name}.ipynb").write_text(copy, encoding="utf-8")
     copies.make(served)
     token, port = secrets.token_hex(16), free_port()
-    command = [sys.executable, "-m", "jupyterlab", "--no-browser", "--allow-root"]
+    command = [sys.executable, "-m", "tools.lab", "--no-browser", "--allow-root"]
     command += [f"--port={port}", "--ServerApp.port_retries=0", "--log-level=ERROR"]
     command += [f"--ServerApp.root_dir={served}", f"--LabApp.app_settings_dir={home}"]
     command += [f"--config={build_notebooks.ROOT / 'tools' / 'jupyter_server_config.py'}"]
@@ -62,7 +62,8 @@ def server_at(browser, tmp_path_factory):
     environment |= {"HOME": str(home), "JUPYTER_TOKEN": token, "JUPYTER_CONFIG_DIR": f"{home}/c"}
     environment |= {"JUPYTER_DATA_DIR": f"{home}/d", "JUPYTER_RUNTIME_DIR": f"{home}/r"}
     with (home / "log").open("w", encoding="utf-8") as log:
-        server = subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.STDOUT)
+        streams = {"stdout": log, "stderr": subprocess.STDOUT}
+        server = subprocess.Popen(command, cwd=build_notebooks.ROOT, env=environment, **streams)
     try:
         wait_for(f"http://127.0.0.1:{port}/api", server, home / "log")
         yield f"http://127.0.0.1:{port}/lab/workspaces/{{1}}/tree/{{0}}.ipynb?token={token}"
