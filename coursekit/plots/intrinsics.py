@@ -13,7 +13,7 @@ from matplotlib.patches import Polygon
 from matplotlib.patheffects import withStroke
 
 from coursekit.arrays import Floats
-from coursekit.boards import Board, Detection
+from coursekit.boards import Detection
 from coursekit.geometry import project, transform_points
 from coursekit.intrinsics import Comparison, IntrinsicsResult
 from coursekit.intrinsics.fit import tilts
@@ -80,29 +80,6 @@ def _best_rms(X: Floats, Y: Floats, seen: Floats) -> Floats:
 
 
 # --- board and views ---
-
-
-def board(board: Board) -> LessonFigure:
-    """The board's pattern with its frame and the numbers of a few corners."""
-    fig, ax = single(6.4, 4.4)
-    width, height = (1000 * s for s in board.size_m)
-    left, top = (1000 * (c - board.square_m) for c in board.points[0, :2])
-    ax.imshow(board.image(60), cmap="gray", vmin=0, vmax=255,
-              extent=(left, left + width, top + height, top))  # fmt: skip
-    points = 1000 * board.points
-    ax.plot(points[:, 0], points[:, 1], "o", ms=4, color=COLORS["measured"])
-    for name, tip, color in (("x", (1, 0), "measured"), ("y", (0, 1), "truth")):
-        arrow = {"arrowstyle": "-|>", "color": COLORS[color], "lw": 2.5}
-        ax.annotate("", (60 * tip[0], 60 * tip[1]), (0, 0), arrowprops=arrow)
-        ax.text(68 * tip[0], 68 * tip[1], name, color=COLORS[color], fontweight="bold",
-                ha="center", va="center", bbox={"fc": "white", "ec": "none", "pad": 1})  # fmt: skip
-    ax.set(xlabel="x (mm)", ylabel="y (mm)")
-    columns, rows = board.corners
-    return fig.saying(
-        f"The board: {board.squares[0]} x {board.squares[1]} squares of "
-        f"{1000 * board.square_m:g} mm, {columns} x {rows} inner corners marked, and its frame: "
-        "x to the right, y down, z into the board."
-    )
 
 
 def views(folder: str | Path, detections: Sequence[Detection]) -> LessonFigure:
