@@ -86,7 +86,7 @@ def test_there_is_a_figure_of_every_function(figures) -> None:
         if function.__annotations__["return"] == "LessonFigure"
     }
     assert drawing == {name.partition(" ")[0] for name in figures}
-    assert len(drawing) == 34
+    assert len(drawing) == 33
 
 
 def test_similar_triangles_shows_f_x_over_z() -> None:
@@ -367,7 +367,6 @@ def error_budget_figures() -> dict[str, plots.LessonFigure]:
     others = rigs.along_m[:20] * 1000
     return {
         "bars": error_budget.bars(budget.lesson_budget()),
-        "biases": error_budget.biases(rigs, 0.007),
         "between_fingers": error_budget.between_fingers(
             budget.LESSON_GRIPPER, budget.CUBE, table.noise_covariance, (1.0, 2.0, 0.5), others
         ),

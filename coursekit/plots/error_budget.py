@@ -9,7 +9,7 @@ from matplotlib.patches import Ellipse, Rectangle
 
 from coursekit.arrays import ArrayLike
 from coursekit.attribution import SimulatedMisses
-from coursekit.budget import Draws, ErrorBudget, Gripper, Target
+from coursekit.budget import ErrorBudget, Gripper, Target
 from coursekit.plots.style import COLORS, LessonFigure, panels, single
 
 KINDS = {"bias": "measured", "noise": "depth"}
@@ -46,28 +46,6 @@ def bars(budget: ErrorBudget) -> LessonFigure:
     ax.set(xlabel="at the object (mm)", xlim=(0, right), ylim=(len(rows) - 0.5, -1.0))
     ax.set_ylabel(" ")
     return fig.saying("The budget's rows at the object: " + "; ".join(said))
-
-
-def biases(draws: Draws, tolerance_m: float) -> LessonFigure:
-    """Many rigs of one budget: how long their bias is, and how much of it lies along closing."""
-    fig, (length, along) = panels(2, 2, 9.0, 3.6)
-    norm, closing = 1000 * draws.norm_m, 1000 * draws.along_m[:, 0]
-    length.hist(norm, 60, color=COLORS["measured"], density=True)
-    along.hist(closing, 60, color=COLORS["measured"], density=True)
-    for ax, places in ((length, (1,)), (along, (-1, 1))):
-        for sign in places:
-            ax.axvline(1000 * sign * tolerance_m, color=COLORS["ink"], ls="--")
-        ax.set_yticks([])
-    over = 100 * np.mean(norm > 1000 * tolerance_m)
-    out = 100 * np.mean(np.abs(closing) > 1000 * tolerance_m)
-    length.set(xlabel="length of the bias (mm)", ylabel="share of rigs")
-    along.set(xlabel="bias along the closing axis (mm)")
-    length.set_title(f"{over:.1f} % beyond ±{1000 * tolerance_m:g} mm")
-    along.set_title(f"{out:.1f} % beyond ±{1000 * tolerance_m:g} mm")
-    return fig.saying(
-        f"Bias of many rigs: mean length {norm.mean():.1f} mm, {over:.1f} % longer than "
-        f"{1000 * tolerance_m:g} mm; along the closing axis {out:.1f} % beyond it."
-    )
 
 
 def between_fingers(
@@ -114,7 +92,7 @@ def misses(sets: Mapping[str, SimulatedMisses], times: float = 15.0) -> LessonFi
     fig, axes = panels(len(sets), 2, 9.6, 3.0, sharex=True, sharey=True)
     ends = [one.T_base_gripper[:, :2, 3] + times * one.misses[:, :2] for one in sets.values()]
     forward, left = np.concatenate(ends).T
-    wide = 1.05 * np.abs(left).max()
+    wide, texts = 1.05 * np.abs(left).max(), []
     for ax, (name, one) in zip(axes, sets.items(), strict=True):
         (x, y), (right, up) = one.T_base_gripper[:, :2, 3].T, times * one.misses[:, 1::-1].T
         ax.quiver(y, x, right, up, angles="xy", scale_units="xy", scale=1, width=0.006,
@@ -124,11 +102,8 @@ def misses(sets: Mapping[str, SimulatedMisses], times: float = 15.0) -> LessonFi
                aspect="equal", title=f"{name}, {len(one.misses)} trials",
                xlabel="y of the base, to the left (m)", ylabel="x, forward (m)")  # fmt: skip
         ax.label_outer()
+        mean_mm = 1000 * np.linalg.norm(one.misses.mean(axis=0))
+        texts.append(f"{name}, {len(one.misses)} trials, mean {mean_mm:.1f} mm")
     return fig.saying(
-        f"Misses from above, {times:g} times as long, where they happened: "
-        + "; ".join(
-            f"{name}, {len(one.misses)} trials, mean "
-            f"{1000 * np.linalg.norm(one.misses.mean(axis=0)):.1f} mm"
-            for name, one in sets.items()
-        )
+        f"Misses from above, {times:g} times as long, where they happened: {'; '.join(texts)}"
     )

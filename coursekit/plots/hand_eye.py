@@ -223,9 +223,7 @@ def touched(gap_mm: ArrayLike) -> LessonFigure:
     ax.set_xticks(places, [f"{n + 1}" for n in places])
     ax.set(xlabel="corner, look after look (number)", ylabel="camera - fingertip (mm)")
     ax.legend(ncols=3)
+    rows = (", ".join(map("{} {:+.1f}".format, "xyz", row)) for row in gap)
     return fig.saying(
-        "Camera minus fingertip, corner by corner and look by look, mm: "
-        + "; ".join(
-            ", ".join(f"{a} {v:+.1f}" for a, v in zip("xyz", row, strict=True)) for row in gap
-        )
+        f"Camera minus fingertip, corner by corner and look by look, mm: {'; '.join(rows)}"
     )
