@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from simulated_corners import dense_jacobian
 
 import coursekit as ck
 from coursekit.geometry import Intrinsics, make_transform
@@ -87,14 +88,7 @@ def test_the_exercises_give_opencvs_numbers() -> None:
     assert numbers[2] == pytest.approx(rms, abs=1e-5)
 
     result = ck.intrinsics.calibrate(found, CHECKERBOARD)
-    J, blocks = result.jacobian
-    whole = np.zeros((len(J), J.shape[1] + 6 * len(blocks)))
-    whole[:, : J.shape[1]] = J
-    row = 0
-    for i, block in enumerate(blocks):
-        column = J.shape[1] + 6 * i
-        whole[row : row + len(block), column : column + 6] = block
-        row += len(block)
+    whole = dense_jacobian(result)
     scale = np.linalg.norm(whole, axis=0)  # k3 and metres differ by powers of ten
     sigma = lesson.FOCAL_SIGMA.model()(whole / scale, np.concatenate(result.residuals).ravel())
     assert sigma / scale[0] == pytest.approx(float(sigmas[0, 0]), rel=0.01)
