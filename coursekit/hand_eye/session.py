@@ -33,7 +33,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coursekit.arm import Arm, FkErrors, fk_covariance, widowx
+from coursekit.arm import Arm, FkErrors, fk_covariance, upright_errors, widowx
 from coursekit.arrays import ArrayLike, Floats, Integers
 from coursekit.boards import Board, Detection, Detections, detect_all
 from coursekit.boards.board import Skipped
@@ -149,6 +149,17 @@ class HandEyeSession:
             return False
         off = np.abs(self.arm.forward(self.q) - self.T_base_gripper).max(axis=(1, 2))
         return float(np.median(off)) < BELONGS
+
+    def usual_errors(self, T_base_gripper: Floats, q: Floats | None) -> FkErrors:
+        """What this arm may be wrong by in all poses (n, 4, 4) alike; q (n, 6): their joints.
+
+        Of the session's joints where they are its own and known, else those of any upright arm.
+        What each pose has for itself is not in it: that is estimated.
+        """
+        if q is None or not self.has_its_joints:
+            return upright_errors(T_base_gripper)
+        errors = fk_covariance(q, arm=self.arm)
+        return replace(errors, each=np.zeros_like(errors.each))
 
     @property
     def corner_sigma_px(self) -> float:
@@ -470,8 +481,9 @@ def solve(
     the board is than it says; free_offsets also estimates the offsets of the session's joint
     angles. fk: what the arm errs by in all poses alike: errors whose sizes are known
     (`arm.fk_covariance` at the session's q), None for none, or "usual": those of `ArmErrors`, as
-    large as the session shows them to be, where the arm poses are those of its joint angles. guess
-    (4, 4): an X to start from, in place of the closed form.
+    large as the session shows them to be; where the arm poses are not those of its joint angles,
+    what any upright arm has of them (`arm.upright_errors`). guess (4, 4): an X to start from, in
+    place of the closed form.
 
     Raises ValueError that names the argument for fewer than three poses and for images without a
     pose; NotDetermined where the arm did not turn about two axes; SolverFailed where a solver's
@@ -506,10 +518,12 @@ def solve(
     seen: views.Views = views.PoseViews(measured, np.zeros((n, 6, 6)))
     if session.detections is not None:
         seen = session.corners(session.corner_sigma_px)
-    usual = fk == "usual" and not free_offsets and session.has_its_joints
+    determined = (
+        session.has_its_joints or not observability(session.T_base_gripper, session.mount).free
+    )
+    usual = fk == "usual" and not free_offsets and determined
     if usual:
-        stated = fk_covariance(session.q, arm=session.arm)  # type: ignore[arg-type]
-        stated = replace(stated, each=np.zeros_like(stated.each))  # estimated
+        stated = session.usual_errors(session.T_base_gripper, session.q)
     given = session.T_base_gripper, session.mount, seen
     problem = refinement.Problem(*given, free_scale, arm, q, stated, usual)
     best = refinement.refine(problem, X, Y, measured)
