@@ -41,7 +41,7 @@ def test_the_minimum_is_that_of_scipy(mount):
         return (project(at, LENS.K, LENS.dist) - pixels).ravel()
 
     fit = least_squares(residuals, np.zeros(12), xtol=1e-14, ftol=1e-14, gtol=1e-14)
-    result = known.solve(fk=None)
+    result = known.solve()
     np.testing.assert_allclose(pose_difference(known.X, result.X), fit.x[:6], atol=2e-7)
     np.testing.assert_allclose(pose_difference(known.Y, result.Y), fit.x[6:], atol=2e-7)
     covariance = 2 * fit.cost / (pixels.size - 12) * np.linalg.inv(fit.jac.T @ fit.jac)

@@ -100,7 +100,7 @@ def held_out(
     offsets = fit is not None and fit.problem.arm is not None and other.q is not None
     known = other.q is not None or not given.has_its_joints
     if fit is not None and fit.problem.guessed and fk is None and known:
-        fk = given.usual_errors(poses, other.q)
+        fk = given.shared_errors(poses, other.q)
     if fit is not None and (fk is not None or offsets):
         poses = arm_poses_with(fit, replace(fit.problem, T_base_gripper=poses, q=other.q, fk=fk))
     expected = camera_board(poses, result.X, result.Y, result.mount)
