@@ -388,10 +388,8 @@ class Exercise:
     def _combinations(self) -> Iterator[tuple[Mistake, ...]]:
         """Each mistake alone, and in one part of the result; each pair of different steps, earlier
         step first; the device's edits; a mistake and an edit of the result, or two of those."""
-        if not self._edits:
-            self._edits += _all_edits(self)
+        yield from ((m,) for m in self.single_mistakes())
         of_result, single, double = self._edits
-        yield from ((m,) for m in (*self.mistakes, *of_result, *self._partial))
         order = list(self.steps)
         listed = [m for m in self.mistakes if not m.alone]
         for a, b in itertools.combinations(listed, 2):
@@ -401,6 +399,12 @@ class Exercise:
         common = [m for m in of_result if m.name in FOUND["common"] and "each of" not in m.says]
         yield from itertools.product(self.mistakes, common)
         yield from itertools.combinations(common, 2)
+
+    def single_mistakes(self) -> list[Mistake]:
+        """Those listed, the device's edits of the result, and those in one part of it."""
+        if not self._edits:
+            self._edits += _all_edits(self)
+        return [*self.mistakes, *self._edits[0], *self._partial]
 
     @cached_property
     def _partial(self) -> list[Mistake]:
