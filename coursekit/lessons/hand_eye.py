@@ -96,7 +96,6 @@ for _step in ("A", "B"):
     _motion = MOTION_PAIR.steps[_step]
     MOTION_PAIR.add_mistakes(
         (_step, "one_not_inverted", lambda i, j, inverse: j @ i),
-        (_step, "one_not_inverted", lambda i, j, inverse: i @ j),
         (_step, "one_pose_only", lambda i, j, inverse: np.eye(4)),
         (_step, "product_inverted", lambda i, j, inverse: inverse(j @ i)),
         (_step, "product_inverted", lambda i, j, inverse: inverse(i @ j)),
@@ -220,7 +219,6 @@ ROTATION_HALF.add_mistakes(
     ("result", "inverse_of_x", lambda R: R.T),
     ("turn", "not_a_rotation", lambda a, b: np.linalg.lstsq(b, a, rcond=None)[0].T),
     ("used", "first_motion_only", lambda a, b: (a[:1], b[:1])),
-    ("turn", "not_a_rotation", lambda a, b: a.T @ b),
     ("result", "negative", lambda R: -R),
     ("used", "mean_taken_off", lambda a, b: (a - a.mean(axis=0), b - b.mean(axis=0))),
     ("used", "b_turned_round", lambda a, b: (a, -b)),
