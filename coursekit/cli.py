@@ -127,7 +127,7 @@ def _add_grade(command: Callable[..., Any]) -> None:
     the.add_argument("--late-after", type=datetime.fromisoformat, metavar="MOMENT", help=late)
     the.add_argument("--separator", choices=(",", ";"), default=",", help="of the tables' cells")
     the.add_argument("--workers", type=int, metavar="N", help="processes, default: one a core")
-    timeout = "seconds a bundle, default: 10"
+    timeout = "seconds of computing a bundle, default: 10"
     the.add_argument("--timeout", type=float, default=10.0, metavar="S", help=timeout)
     finished = "replace a finished report; only what has changed is graded"
     the.add_argument("--overwrite", action="store_true", help=finished)

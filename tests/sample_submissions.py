@@ -56,7 +56,9 @@ def depths(random, facts, z, frames=100, size=40, sigma_d=0.065, holes=0.01, err
     shape = (frames, wide, wide)
     noise = uniform_filter(random.standard_normal(shape, np.float32), (1, MATCHING_PX, MATCHING_PX))
     pattern = uniform_filter(random.standard_normal(shape[1:]), MATCHING_PX) * MATCHING_PX
-    noise = noise[:, inner, inner] * MATCHING_PX * sigma_d
+    other_dots = uniform_filter(random.spawn(1)[0].standard_normal((size, size)), MATCHING_PX)
+    uneven = np.exp(0.3 * MATCHING_PX * other_dots)  # as the dots are that a window sees
+    noise = noise[:, inner, inner] * MATCHING_PX * sigma_d * uneven / np.sqrt((uneven**2).mean())
     pattern = pattern[inner, inner] * 1.1 * sigma_d
     drift = np.zeros(frames)
     for i, kick in enumerate(random.standard_normal(frames)):

@@ -18,8 +18,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from functools import lru_cache
+from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -40,6 +41,7 @@ COMPARED, MOST_FRAMES = 150_000, 40_000  # pairs of stacks in all, and frames fo
 FRAMES_ASKED = 12  # frames of a stack that are looked for in others
 FRAMES_FOUND = 9  # of these, for the stacks to be the same measurement
 STRANGERS, STANDS_OUT = 0.55, 0.3  # second look: a likeness worth it, and the lead (atanh) it asks
+LEAST_FRAMES, LEAST_COUNTS = 30, 0.5  # to tell even noise from uneven
 PERFECT_CLOCK_S = 1e-8  # no real clock keeps step so well
 WORDS_IN_A_ROW = 3  # words in a row, by which paragraphs are compared
 MOODLE = re.compile(
@@ -75,7 +77,7 @@ def data_flags(submission: Submission, found: Recomputed, prints: Fingerprint) -
     return (
         *_too_clean(submission.camera, found, limits),
         *_flat(found, limits),
-        *_random_numbers(found, limits),
+        *_invented(found, limits),
         *_simulated(submission),
         *_times(submission, limits),
         *_one_stack_twice(prints.stacks),
@@ -110,30 +112,54 @@ def _flat(found: Recomputed, limits: dict[str, float]) -> Iterator[Flag]:
         yield _flag("not_distance_dependent", exponent=free.exponent, most=most)
 
 
-def _random_numbers(found: Recomputed, limits: dict[str, float]) -> Iterator[Flag]:
-    """Noise that neighbouring pixels do not share, and a mean without a pattern.
+def _invented(found: Recomputed, limits: dict[str, float]) -> Iterator[Flag]:
+    """Noise that lacks what matching windows of a real pattern of dots leaves in it.
 
-    A stereo camera matches windows, so neighbours share their noise, and its error of a place stays
-    in every frame. Stacks whose noise is rounded away, or of a few frames, are not looked at.
+    Neighbours share their window, so they share noise; the error of a place stays in every frame;
+    each place sees other dots, so some are noisier than others; and at another distance the dots
+    are others, and so is what stays. Stacks whose noise is rounded away, or of a few frames, are
+    not looked at. FORMAT.md says how often invented and honest data are flagged.
     """
-    pairs = [
-        _space(m.stack.counts)
+    looks = [
+        (m.distance_m, look)
         for m in found.at
         if m.std is not None
         and m.std.value >= 0.35e3 * m.scale_m  # else rounded away
         and m.stats.n_frames >= 8
+        and (look := _look(m.stack.counts)) is not None
     ]
-    likeness = max((pair[0] for pair in pairs if pair), default=math.inf)
-    pattern = max((pair[1] for pair in pairs if pair), default=math.inf)
+    likeness = max((look.likeness for _, look in looks), default=math.inf)
+    pattern = max((look.pattern for _, look in looks), default=math.inf)
+    uneven = max((look.uneven for _, look in looks if look.uneven), default=math.inf)
     if likeness < limits["white"]:
         yield _flag("white_in_space", likeness=likeness)
     if pattern < limits["pattern"]:
         yield _flag("no_pattern", times=pattern)
+    if uneven < limits["uneven"]:
+        yield _flag("even_noise", times=uneven)
+    for (one, first), (two, second) in combinations(looks, 2):
+        likeness = _correlation(first.stays, second.stays)
+        if likeness > limits["same_pattern"]:
+            yield _flag("same_pattern", one=one, two=two, likeness=likeness)
 
 
-def _space(counts: NDArray[np.uint16]) -> tuple[float, float] | None:
-    """Correlation of neighbours' noise in time, and the pattern in the mean, in units of what
-    averaging leaves of noise; None where too few pixels are valid."""
+class _Look(NamedTuple):
+    """What the noise of a stack is like.
+
+    likeness: correlation of neighbours over time. pattern: what stays in the mean, in units of what
+    averaging leaves of noise. uneven: how much the logarithms of the pixels' variances differ, in
+    units of what chance gives; 0 where frames are too few or counts too coarse to tell. stays
+    (h, w): what stays in the mean, less a twisted plane, NaN where pixels are not always valid.
+    """
+
+    likeness: float
+    pattern: float
+    uneven: float
+    stays: Floats
+
+
+def _look(counts: NDArray[np.uint16]) -> _Look | None:
+    """See `_Look`; None where too few pixels are valid."""
     n, height, width = counts.shape
     good = (counts > 0).all(axis=0)
     if good.sum() < 25 or height < 4 or width < 4:
@@ -141,8 +167,7 @@ def _space(counts: NDArray[np.uint16]) -> tuple[float, float] | None:
     mean = counts.mean(axis=0)
     deviation = (counts - mean).astype(np.float32)
     typical = float(np.sqrt(np.square(deviation[:, good]).mean()))
-    wild = np.abs(deviation).max(axis=0) > 8 * max(typical, 1.0)
-    good &= ~wild
+    good &= np.abs(deviation).max(axis=0) <= 8 * max(typical, 1.0)
     if good.sum() < 25 or typical == 0:
         return None
     deviation *= good
@@ -154,12 +179,32 @@ def _space(counts: NDArray[np.uint16]) -> tuple[float, float] | None:
     ):
         if ok.any():
             rho.append(float(np.einsum("nij,nij->", one, two)) / int(ok.sum()) / float(power))
+    uneven = 0.0
+    if n >= LEAST_FRAMES and typical >= LEAST_COUNTS:
+        apart = deviation[:, good] - deviation[:, good].mean(axis=1, keepdims=True)
+        uneven = float(np.log(apart.var(axis=0)).var()) / (2 / (n - 1))
     rows, columns = np.nonzero(good)
     design = np.stack([np.ones(len(rows)), columns, rows, columns * rows], axis=-1)
-    values = mean[good]
-    residual = values - design @ np.linalg.lstsq(design, values, rcond=None)[0]
+    stays = np.full((height, width), np.nan)
+    stays[good] = mean[good] - design @ np.linalg.lstsq(design, mean[good], rcond=None)[0]
     left = math.sqrt(float(power) / n / max(n - 1, 1))
-    return max(rho, default=1.0), float(residual.std()) / left
+    return _Look(max(rho, default=1.0), float(stays[good].std()) / left, uneven, stays)
+
+
+def _correlation(one: Floats, two: Floats) -> float:
+    """Correlation of two maps laid corner on corner or middle on middle; of these the larger."""
+    shape = np.minimum(one.shape, two.shape)
+    found = [0.0]
+    for part in (0, 0.5):
+        maps = []
+        for values in (one, two):
+            top, left = (part * (values.shape - shape)).astype(int)
+            maps.append(values[top : top + shape[0], left : left + shape[1]])
+        ok = np.isfinite(maps[0]) & np.isfinite(maps[1])
+        a, b = (values[ok] - values[ok].mean() for values in maps) if ok.sum() > 25 else (0, 0)
+        size = float(np.sqrt(np.vdot(a, a) * np.vdot(b, b)))
+        found.append(float(np.vdot(a, b)) / size if size else 0.0)
+    return max(found)
 
 
 def _simulated(submission: Submission) -> Iterator[Flag]:
