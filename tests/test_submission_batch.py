@@ -27,7 +27,7 @@ from coursekit import cli
 from coursekit.specifications import DATA
 from coursekit.submission import batch
 from coursekit.submission.batch import Bundle, Limits
-from coursekit.submission.format import Claims, bundle_bytes
+from coursekit.submission.format import Claims, bundle_bytes, zip_bytes
 from coursekit.submission.recompute import grading_rules
 from coursekit.submission.report import ReportLine, grade_file, not_graded
 from coursekit.submission.rubric import grade
@@ -383,6 +383,24 @@ def test_what_is_no_file_is_refused_and_nothing_waits_for_it(in_process, tmp_pat
     (folder / "gone.zip").symlink_to(tmp_path / "nowhere")
     summary = graded(folder, tmp_path / "out", timeout_s=5)
     assert (summary.graded, summary.refused, summary.failed) == (1, 2, 0)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="such paths cannot be made there")
+def test_a_folder_in_a_folder_a_thousand_times(in_process, tmp_path, capsys):
+    folder = quick(tmp_path / "in", ["a"])
+    below = [*["d"] * 1100, "deep.zip"]
+    (tmp_path / "lms.zip").write_bytes(zip_bytes({"/".join(below): bundle_bytes(ZOE)}))
+    with contextlib.chdir(folder):
+        for part in below[:-1]:
+            os.mkdir(part)
+            os.chdir(part)
+        Path("deep.zip").write_bytes(bundle_bytes(ZOE))
+    try:
+        assert graded(folder, tmp_path / "out").graded == 2
+    finally:  # which pytest could not
+        subprocess.run(["rm", "-rf", str(folder)], check=True)
+    assert cli.main(["grade", str(tmp_path / "lms.zip"), "--out", str(tmp_path / "two")]) == 1
+    assert "got 1101, want at most 100 folders in each other" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="such names cannot be made elsewhere")

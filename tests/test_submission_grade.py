@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 from dataclasses import replace
 from functools import cache
@@ -12,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import sample_submissions as samples
+from common import NIGHTLY
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sample_submissions import DISTANCES, honest, with_part, with_row
@@ -25,7 +25,7 @@ from coursekit.submission.recompute import MISTAKES, RULES, WHY, grading_rules, 
 from coursekit.submission.report import student_page
 from coursekit.submission.rubric import JUDGES, Item, grade, shortcomings
 
-MANY = 8 if os.environ.get("COURSEKIT_NIGHTLY") == "1" else 1
+MANY = 8 if NIGHTLY else 1
 FIELDS = {topic: field for topic, (field, _) in JUDGES.items()}
 GOOD = honest(0)
 EXACT = samples.exact(GOOD)  # every claim in the middle of its tolerance
@@ -390,6 +390,18 @@ def test_made_up_data_are_flagged_without_taking_points(kind):
     assert all(flag.says.endswith(".") for flag in result.flags)
     if kind not in ("too clean", "flat noise"):  # claims nobody could make honestly
         assert result.points > 90
+
+
+@pytest.mark.parametrize("how", samples.INVENTIONS)
+def test_invented_noise_is_flagged_however_much_care_it_took(how):
+    """50 of 50 at night, and none of 50 honest ones; FORMAT.md says what cannot be known."""
+    made = samples.INVENTIONS[how]
+    for seed in range(50 if NIGHTLY else 2):
+        flags = {flag.code for flag in grade(samples.made_up(made, seed)).flags}
+        assert "even_noise" in flags
+        assert ("same_pattern" in flags) == (how == "disparity")
+        assert ("no_pattern" in flags) == (how != "disparity")
+        assert grade(honest(seed)).flags == ()
 
 
 def test_a_recorded_clock_without_jitter_is_no_flag():

@@ -23,6 +23,7 @@ from coursekit.submission.recompute import LABELS, MISTAKES
 VOID = {"meta", "br", "img", "hr", "input", "link"}
 GOOD = honest(0)
 WRONG = samples.mistaken(0)
+INVENTED = samples.made_up(samples.INVENTIONS["a pixel"], 2)
 
 
 class Page(HTMLParser):
@@ -106,7 +107,7 @@ def lines():
         GOOD,
         samples.weak(1),
         own_words(samples.copied(GOOD, "few_values"), 1),
-        own_words(samples.random_numbers(2), 2),
+        own_words(INVENTED, 2),
         samples.injecting('=HYPERLINK("http://x")<script>alert(1)</script>', 4),
         own_words(replace(WRONG["sign"][1], student="Student 3"), 3),
     ]
@@ -134,9 +135,9 @@ def test_what_cost_points_comes_first():
 
 
 def test_flags_are_not_on_the_students_page():
-    flags = samples.graded(samples.random_numbers(2)).flags
+    flags = samples.graded(INVENTED).flags
     assert flags
-    text = page_of(samples.random_numbers(2))
+    text = page_of(INVENTED)
     assert not any(escape(flag.says) in text or flag.code in text for flag in flags)
     assert "flag" not in text.casefold()
 
@@ -385,7 +386,7 @@ def test_the_table_has_a_row_a_bundle_and_points_that_add_up(lines):
     assert rows[0]["lost"] == ""
     assert ": sign of the bias turned (-" in rows[5]["lost"]
     assert (rows[-1]["status"], rows[-1]["points"]) == ("not graded: zip_bomb", "")
-    assert rows[3]["flags"] == "no_pattern white_in_space"
+    assert rows[3]["flags"] == "even_noise no_pattern white_in_space"
 
 
 FORMULAS = ["=1+1", "+1", "-1", "@A1", "\t=1", "\r=1", "\n=1", " =1", "＝1", "=cmd|' /C calc'!A0"]

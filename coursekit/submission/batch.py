@@ -57,6 +57,7 @@ MAX_TASKS = 40  # bundles, then a process is replaced
 SLOWER = 6.0  # by the wall's clock a bundle may take so many times its limit: others compute, too
 PATIENCE_S = 60.0  # beyond that; a pool from which nothing comes so long is replaced
 AHEAD = 3  # bundles a worker that wait in the pool
+MAX_LEVELS = 100  # of folders in an LMS's zip
 HASHED_BYTES = 6 * 2**20  # of a file; larger ones are refused anyway
 
 FAILED = ("timeout", "died", "memory", "error", "lost")  # tried anew by the next run
@@ -374,6 +375,8 @@ def _unpack(archive: Path, into: Path) -> None:
                 target = into.joinpath(*parts)
                 if member.is_dir() or is_junk(member.filename):
                     continue
+                deep = f"at most {MAX_LEVELS} folders in each other"
+                want(len(parts) <= MAX_LEVELS, archive.name, len(parts), deep)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 with packed.open(member) as file:
                     target.write_bytes(file.read(HASHED_BYTES))

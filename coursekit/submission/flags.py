@@ -14,10 +14,12 @@ import json
 import math
 import re
 import unicodedata
+import zlib
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,6 +42,7 @@ FRAME_LIKENESS = (
 COMPARED, MOST_FRAMES = 150_000, 40_000  # pairs of stacks in all, and frames for each, at most
 FRAMES_ASKED = 12  # frames of a stack that are looked for in others
 FRAMES_FOUND = 9  # of these, for the stacks to be the same measurement
+DIFFERENT = 5  # steps between values of a frame that is told by its values alone
 STRANGERS, STANDS_OUT = 0.55, 0.3  # second look: a likeness worth it, and the lead (atanh) it asks
 LEAST_FRAMES, LEAST_COUNTS = 30, 0.5  # to tell even noise from uneven
 PERFECT_CLOCK_S = 1e-8  # no real clock keeps step so well
@@ -182,7 +185,8 @@ def _look(counts: NDArray[np.uint16]) -> _Look | None:
     uneven = 0.0
     if n >= LEAST_FRAMES and typical >= LEAST_COUNTS:
         apart = deviation[:, good] - deviation[:, good].mean(axis=1, keepdims=True)
-        uneven = float(np.log(apart.var(axis=0)).var()) / (2 / (n - 1))
+        variances = np.maximum(apart.var(axis=0), 1e-6 * typical**2)
+        uneven = float(np.log(variances).var()) / (2 / (n - 1))
     rows, columns = np.nonzero(good)
     design = np.stack([np.ones(len(rows)), columns, rows, columns * rows], axis=-1)
     stays = np.full((height, width), np.nan)
@@ -289,17 +293,19 @@ class StackPrint:
 
     digest: of its bytes. level (27,): the mean spectrum. frames (N, 27): of each frame what
     is not in that, scaled to a largest value of 127. The order of frames does not matter.
+    values: a hash of each frame's values, whatever place they are moved to, if they differ enough.
     """
 
     distance_m: float
     digest: str
     level: tuple[float, ...]
     frames: NDArray[np.int8]
+    values: tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Fingerprint:
-    """What is remembered of a bundle's raw data to tell whether another one shares it: some 12 kB.
+    """What is remembered of a bundle's raw data to tell whether another one shares it: some 15 kB.
 
     `as_json` and `from_dict` take it through JSON.
     """
@@ -317,7 +323,7 @@ class Fingerprint:
             return np.frombuffer(base64.b64decode(text), np.int8).reshape(-1, N_WAVES)
 
         stacks = tuple(
-            StackPrint(s["distance_m"], s["digest"], tuple(s["level"]), rows(s["frames"]))
+            StackPrint(**{**s, "level": tuple(s["level"]), "frames": rows(s["frames"])})
             for s in data["stacks"]
         )
         return cls(**{**data, "stacks": stacks})
@@ -360,8 +366,14 @@ def _stack_print(stack: Stack) -> StackPrint:
     counts = np.ascontiguousarray(stack.counts)
     _, height, width = counts.shape
     digest = hashlib.blake2b(repr(counts.shape).encode() + counts.tobytes(), digest_size=16)
+    values = tuple(
+        zlib.crc32(values.tobytes())
+        for values in np.sort(counts.reshape(len(counts), -1), axis=1)
+        if np.count_nonzero(np.diff(values)) >= DIFFERENT  # else strangers may have the same
+    )
+    named = partial(StackPrint, stack.distance_m, digest.hexdigest(), values=values)
     if min(height, width) <= 2 * LARGEST_WAVE:
-        return StackPrint(stack.distance_m, digest.hexdigest(), (), np.zeros((0, N_WAVES), np.int8))
+        return named((), np.zeros((0, N_WAVES), np.int8))
     valid = counts > 0
     mean = counts.sum(axis=0) / np.maximum(valid.sum(axis=0), 1)
     off = (counts - mean.astype(np.float32)) * valid
@@ -376,7 +388,7 @@ def _stack_print(stack: Stack) -> StackPrint:
     spectra = power[:, LARGEST_WAVE + down[1:], LARGEST_WAVE + across[1:]] ** 0.25
     level = spectra.mean(axis=0)
     rounded = tuple(round(float(value), 3) for value in level)
-    return StackPrint(stack.distance_m, digest.hexdigest(), rounded, _bytes(spectra - level))
+    return named(rounded, _bytes(spectra - level))
 
 
 def _bytes(values: NDArray[Any]) -> NDArray[np.int8]:
@@ -436,7 +448,10 @@ def copies(prints: Mapping[str, Fingerprint]) -> list[Copy]:
         digests = tuple(sorted(stack.digest for stack in fingerprint_of.stacks))
         if digests and first.setdefault(digests, key) != key:
             pairs[first[digests], key] = {s.distance_m: True for s in fingerprint_of.stacks}
-    alone = {*first.values()}
+    alone = dict.fromkeys(first.values())
+    for (one, other, z), n in _same_values({key: prints[key] for key in alone}).items():
+        if n >= FRAMES_FOUND:
+            pairs.setdefault((min(one, other), max(one, other)), {})[z] = False
     for i, (key, stack) in enumerate(stacks):
         if key not in alone:
             continue
@@ -451,6 +466,19 @@ def copies(prints: Mapping[str, Fingerprint]) -> list[Copy]:
                 part = pairs.setdefault((min(key, other), max(key, other)), {})
                 part[stack.distance_m] = exact or part.get(stack.distance_m, False)
     return [_copy(keys, pairs, prints) for keys in _groups(list(prints), list(pairs))]
+
+
+def _same_values(prints: Mapping[str, Fingerprint]) -> Counter[tuple[str, str, float]]:
+    """How many frames with values of the first bundle that has them are in another one, and at
+    which distance."""
+    first: dict[int, str] = {}
+    shared: Counter[tuple[str, str, float]] = Counter()
+    for key, its in prints.items():
+        for stack in its.stacks:
+            for value in {*stack.values}:
+                if first.setdefault(value, key) != key:
+                    shared[first[value], key, stack.distance_m] += 1
+    return shared
 
 
 def _groups(keys: Sequence[Any], pairs: Sequence[tuple[Any, Any]]) -> list[list[Any]]:
