@@ -83,8 +83,10 @@ MARKER = VENV / "made-by-course"  # written first: this .venv may be deleted
 STATE = VENV / "course-state.json"  # written last: this .venv is complete
 LOG = ROOT / "build" / "setup.log"
 LOCK = ROOT / "build" / "setup.lock"
+ENDING = threading.Event()  # what is still set up beside JupyterLab ends with it
 COMPILING = ROOT / "build" / "compiling"  # there while the fast parts are compiled
 CONFIGURATION = ROOT / "tools" / "jupyter_server_config.py"
+BEGUN = "begun"  # in place of the fingerprint of a step that has not ended
 SPACE_BYTES = 1_500_000_000
 HASHED = ("--require-hashes", "--only-binary", ":all:", "-r")
 EDITABLE = ("--no-deps", "--no-build-isolation", "-e", ".")
@@ -250,6 +252,10 @@ def run_logged(says: str, command: list[str], live: bool | None = None) -> tuple
     try:
         while reader.is_alive():
             reader.join(0.2)
+            if ENDING.is_set():
+                child.terminate()
+                stop(child)
+                sys.exit()  # of a thread: it says nothing
             if live:
                 show(f"{says}: {time.monotonic() - started:.0f} s  {lines[-1].strip()}")
     except KeyboardInterrupt:
@@ -269,11 +275,16 @@ def must(says: str, command: list[str]) -> None:
 
 
 def perform(step: Step, done: dict[str, str], live: bool | None = None) -> None:
-    """Run a step; the state file is away while it changes the environment."""
-    done.pop(step.name, None)
-    if step.pip:
-        STATE.unlink(missing_ok=True)
-    code, output = run_logged(step.says, [*command_of(step)], live)
+    """Run a step; if it is interrupted, what was finished before stays, and it begins again."""
+    interrupted = done.pop(step.name, "") == BEGUN
+    if step.pip and "course" not in done:
+        STATE.unlink(missing_ok=True)  # nothing can stay: .venv is made anew
+    elif step.pip:
+        write_state({**done, step.name: BEGUN})
+    command = [*command_of(step)]
+    if interrupted:
+        command.append("--force-reinstall")  # a package may be there by half
+    code, output = run_logged(step.says, command, live)
     if code and step.pip and has_uv() and re.search(CERTIFICATE, output):
         print("uv does not trust this network; pip may have been told of it: once more with pip.")
         run_logged("pip", [str(PYTHON), *PIP])
@@ -384,7 +395,8 @@ def locked() -> Iterator[None]:
         if not try_lock(file):
             print("Another set-up of this folder is under way: waiting for it to end.")
             while not try_lock(file):
-                time.sleep(0.3)
+                if ENDING.wait(0.3):
+                    sys.exit()
         yield
 
 
@@ -450,7 +462,7 @@ def jupyter_command(page: str, arguments: list[str]) -> list[str]:
     options += ["--ServerApp.answer_yes=True"]  # to "Shut down this server?" after Ctrl-C
     if hasattr(os, "geteuid") and os.geteuid() == 0:
         options.append("--allow-root")
-    return [str(PYTHON), "-m", "jupyterlab", *options, *arguments]
+    return [str(PYTHON), "-m", "tools.lab", *options, *arguments]
 
 
 def open_browser(address: str) -> None:
@@ -478,7 +490,7 @@ def lab(arguments: list[str]) -> int:
         child = subprocess.Popen(command, cwd=ROOT, env={**environment(), **own})
         try:
             if pending(read_state() or {}, ("test",)):
-                threading.Thread(target=finish_set_up, daemon=True).start()
+                threading.Thread(target=finish_set_up).start()
             address = address_when_ready(child, Path(runtime), page)
             if address:
                 print(f"\nThe course is at\n\n    {address}\n\nCtrl-C here ends it.")
@@ -490,7 +502,7 @@ def lab(arguments: list[str]) -> int:
             print("\nJupyterLab has ended.")
             return 0
         finally:
-            COMPILING.unlink(missing_ok=True)
+            ENDING.set()
 
 
 def test(arguments: list[str]) -> int:

@@ -8,7 +8,8 @@ import textwrap
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Self, TypeVar, overload
+from pathlib import Path
+from typing import Any, Self, TypeVar, overload
 
 from coursekit.arrays import Interval
 from coursekit.checks import is_number, want
@@ -59,6 +60,15 @@ def counting(things: Iterable[Thing], total: int, thing: str, shown: bool) -> It
             said = time.monotonic()
             line.update({"text/plain": f"{done} of {counted(total, thing)}"}, raw=True)
     line.update({"text/plain": ""}, raw=True)
+
+
+def stacked(*widgets: Any) -> Any:
+    """Widgets one below the other, for a keyboard and a screen reader, too."""
+    import ipywidgets
+
+    script = Path(__file__).with_name("keyboard.html").read_text("utf-8")
+    unseen = ipywidgets.HTML(script, layout={"display": "none"})
+    return ipywidgets.VBox([*widgets, unseen])
 
 
 def p_text(p_value: float) -> str:

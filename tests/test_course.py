@@ -206,6 +206,58 @@ def test_interrupted_set_up_is_made_anew(project: Path, end: signal.Signals) -> 
 
 
 @posix
+def test_an_interrupted_step_throws_no_finished_one_away(project: Path) -> None:
+    child = start(project, WAIT="requirements-camera.txt")
+    os.kill(pip_waiting(project, child), signal.SIGINT)  # a terminal's Ctrl-C reaches both
+    os.kill(child.pid, signal.SIGINT)
+    assert "Interrupted" in child.communicate()[0]
+    assert calls(project) == ["requirements.txt", "requirements-camera.txt"]
+
+    code, output = run(project)
+    assert (code, calls(project)) == (0, ["--force-reinstall", "."]), output
+    assert "Replacing .venv" not in output
+
+
+COPIES = """
+def make():
+    return []
+
+def older_ones(copies):
+    return ""
+
+def unfinished():
+    return "01_pinhole.ipynb"
+"""
+LAB = """
+import os, pathlib, time
+server = pathlib.Path(os.environ["JUPYTER_RUNTIME_DIR"], "jpserver-1.json")
+server.write_text('{"secure": true, "url": "https://here/", "token": "1"}')
+while not pathlib.Path("end").exists():
+    time.sleep(0.02)
+"""
+WARM_UP = """
+import os, pathlib, time
+pathlib.Path("pid").write_text(f"{os.getpid()}.")
+time.sleep(3600)
+"""
+
+
+@posix
+def test_what_is_set_up_beside_jupyterlab_ends_with_it(project: Path) -> None:
+    for name, program in (("copies", COPIES), ("lab", LAB), ("warm_up", WARM_UP)):
+        (project / f"tools/{name}.py").write_text(program, encoding="utf-8")
+    child = start(project, "lab", CI="true")
+    compiling = pip_waiting(project, child)
+    child.terminate()
+    (project / "end").touch()
+    output, _ = child.communicate()
+    assert (child.returncode, "Traceback" in output) == (0, False), output
+    assert not (project / "build/compiling").exists()
+    with pytest.raises(ProcessLookupError):
+        os.kill(compiling, 0)
+
+
+@posix
 def test_second_set_up_waits_even_for_the_orphan_of_a_killed_one(project: Path) -> None:
     first = start(project, WAIT="requirements.txt")
     pip = pip_waiting(project, first)

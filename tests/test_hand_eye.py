@@ -279,7 +279,7 @@ def test_observability_predicts_the_scatter_of_the_refinement():
     sizes = np.repeat([np.radians(0.1), 0.5e-3], 3)
     predicted = he.observability(known.T, "eye_in_hand", known.X, known.Y)
     rng, found = np.random.default_rng(18), []
-    for _ in range(100):
+    for _ in range(50):
         seen = turned(known.exact, sizes * rng.normal(size=(12, 6)))
         found.append(pose_difference(known.X, he.solve(known.with_poses(seen)).X))
     unit = np.repeat([0.3, 1.0], 3)

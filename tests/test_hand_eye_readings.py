@@ -6,7 +6,6 @@ pose: nobody's kinematics, and no error that poses share. COURSEKIT_NIGHTLY=1 ru
 
 from __future__ import annotations
 
-import os
 import re
 from collections import Counter
 from collections.abc import Callable
@@ -15,6 +14,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from common import NIGHTLY
 from scipy.spatial.transform import Rotation
 from simulated_hand_eye import free_session
 
@@ -23,8 +23,7 @@ from coursekit.geometry import turned
 from coursekit.hand_eye import HandEyeSession
 from coursekit.hand_eye.diagnosis import diagnose
 
-NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
-SEEDS = range(200_000, 200_000 + (100 if NIGHTLY else 4))
+SEEDS = range(200_000, 200_000 + (100 if NIGHTLY else 2))
 TO_BODY = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
 
 
@@ -117,7 +116,7 @@ KINDS: dict[str, tuple[str, str, Mistake]] = {
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_misreading_is_named_with_what_fits(kind: str) -> None:
-    """At least 95 of 100 named (nightly); of 4 at least 3, which 50 % pass with 31 %."""
+    """At least 95 of 100 named (nightly); of 2, one of either mount, both: 50 % pass with 25 %."""
     name, says, mistake = KINDS[kind]
     named, found = 0, Counter()
     for seed in SEEDS:
@@ -126,13 +125,13 @@ def test_a_misreading_is_named_with_what_fits(kind: str) -> None:
         texts = [f"{one.says} {one.evidence}" for one in findings if one.name == name]
         named += any(re.search(says, text) for text in texts)
     print(kind, named, dict(found))
-    assert named >= (95 if NIGHTLY else 3)
+    assert named >= (95 if NIGHTLY else 2)
 
 
 def test_arms_that_err_at_each_pose_are_not_accused() -> None:
-    """At most 2 of 100 (nightly), of poses and of corners; of 8 none."""
+    """At most 2 of 100 (nightly), of poses and of corners; of 4 none."""
     found: Counter[tuple[str, ...]] = Counter()
-    for seed in range(300_000, 300_000 + (100 if NIGHTLY else 8)):
+    for seed in range(300_000, 300_000 + (100 if NIGHTLY else 4)):
         found[diagnose(session(seed, detections=seed // 2 % 2 == 1)).names] += 1
     print(dict(found))
     accused = sum(n for names, n in found.items() if set(names) - {"unexplained"})

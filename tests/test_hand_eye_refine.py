@@ -1,15 +1,15 @@
 """The joint refinement: its minimum, its derivatives, and whether its intervals are honest.
 
-COURSEKIT_NIGHTLY=1 repeats the statistics over 1,000 sessions in place of 8.
+COURSEKIT_NIGHTLY=1 repeats the statistics over 1,000 sessions in place of 5.
 """
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from common import NIGHTLY
 from scipy.optimize import least_squares
 from simulated_hand_eye import BOARD, LENS, arm_session, corners_at, free_session, holds
 
@@ -20,8 +20,7 @@ from coursekit.geometry import invert_transform, pose_difference, project, turne
 from coursekit.hand_eye.poses import by_arm_twist, by_X_and_Y, camera_board
 from coursekit.hand_eye.views import PixelViews, PoseViews, board_gap
 
-NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
-SESSIONS = 1000 if NIGHTLY else 8
+SESSIONS = 1000 if NIGHTLY else 5
 HELD = slice(25, 45)
 
 
@@ -300,7 +299,8 @@ def held_px(result, other):
     return np.sqrt(np.mean(np.sum(rows**2, axis=1)))
 
 
-SLACK = 0.0 if NIGHTLY else 0.06  # of a share over 8 sessions
+# Of a share over 5 sessions of six numbers: intervals half as wide pass with 5 %, a kind and mount.
+SLACK = 0.0 if NIGHTLY else 0.08
 
 
 @pytest.mark.parametrize("mount", he.MOUNTS)

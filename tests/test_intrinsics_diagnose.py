@@ -6,7 +6,6 @@ nothing was tuned on those. COURSEKIT_NIGHTLY=1 runs 100 sessions a cause and 20
 
 from __future__ import annotations
 
-import os
 import re
 from collections import Counter
 from dataclasses import replace
@@ -14,9 +13,11 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from common import NIGHTLY, check_named
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, kstest
+from simulated_corners import BOARDS, LENSES
 
 from coursekit.boards import Board, Detection, Detections, Skipped
 from coursekit.causes import CauseSearch
@@ -33,15 +34,7 @@ from coursekit.intrinsics.fit import calibrate
 from coursekit.simulation.corner_sessions import Effects, Truth, corner_session, ordinary
 from tools import make_data
 
-NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 FIRST_SEED = 100_000
-LENSES = [
-    Intrinsics(640, 480, 612, 610, 322, 238, "brown_conrady", (-0.12, 0.08, 1e-3, -8e-4, 0.02)),
-    Intrinsics(640, 480, 612, 610, 322, 238),
-    Intrinsics(848, 480, 425, 426, 424, 238, "brown_conrady", (-0.05, 0.06, 5e-4, 3e-4, -0.02)),
-    Intrinsics(1280, 720, 918, 917, 642, 362, "brown_conrady", (0.12, -0.25, 8e-4, 4e-4, 0.1)),
-]
-BOARDS = [Board("charuco", (9, 6), 0.025), Board("checkerboard", (10, 7), 0.025)]
 LENS, CHARUCO, CHECKERBOARD = LENSES[0], *BOARDS
 CLASSES = {
     "bow 1 mm": ("bowed_board", Effects(bow_m=1e-3)),
@@ -80,14 +73,11 @@ def test_a_cause_is_named(label: str) -> None:
     Of 2, all: what names 50 % passes that with a probability of 25 %.
     """
     name, effects = CLASSES[label]
-    count, least, most_wrong = (100, 95, 5) if NIGHTLY else (2, 2, 0)
     found: Counter[tuple[str, ...]] = Counter()
-    for seed in range(FIRST_SEED, FIRST_SEED + count):
+    for seed in range(FIRST_SEED, FIRST_SEED + (100 if NIGHTLY else 2)):
         detections, _, board = session(seed, effects)
         found[diagnose(detections, board).names] += 1
-    print(label, dict(found))
-    assert sum(n for names, n in found.items() if name in names) >= least
-    assert sum(n for names, n in found.items() if set(names) - {name}) <= most_wrong
+    check_named(found, name, label)
 
 
 def test_healthy_sessions_get_no_finding() -> None:
@@ -104,16 +94,18 @@ def test_healthy_sessions_get_no_finding() -> None:
 
 @pytest.mark.parametrize("cause", stored_power())
 def test_the_stored_power_is_what_is_measured(cause: str) -> None:
-    """Sessions of other seeds against the stored hundred, within 99.9 %."""
+    """Nightly, 20 sessions of other seeds against the stored hundred, within 99.9 %; a handful
+    would be within that whatever they were."""
     row = stored_power()[cause]
-    named, sizes, count = np.array(row["named"]), row["sizes"], 20 if NIGHTLY else 5
+    named, sizes, count = np.array(row["named"]), row["sizes"], 20
     assert row["sessions"] == 100
     assert (np.diff(named) >= -10).all()
     assert named[-1] >= 95
-    middle = int(np.argmin(np.abs(named - 50)))
-    found = make_data.times_named(cause, sizes[middle], range(200, 200 + count))
-    low, high = binom.interval(0.999, count, named[middle] / 100)
-    assert low - 3 <= found <= high + 3 if NIGHTLY else low <= found <= high
+    if NIGHTLY:
+        middle = int(np.argmin(np.abs(named - 50)))
+        found = make_data.times_named(cause, sizes[middle], range(200, 200 + count))
+        low, high = binom.interval(0.999, count, named[middle] / 100)
+        assert low - 3 <= found <= high + 3
 
 
 def searched(detections: Detections) -> CauseSearch[Calibration]:
@@ -308,11 +300,10 @@ def test_a_fisheye_is_a_wrong_lens_and_nothing_else(focal: float, seed: int) -> 
 
 def test_a_steady_drift_is_told_from_an_autofocus() -> None:
     """The lens grows by 1 % from the first view to the last."""
-    views = []
-    for number in range(28):
-        longer = 1 + 0.01 * number / 27
-        lens = replace(LENS, fx=LENS.fx * longer, fy=LENS.fy * longer)
-        views.append(corner_session(CHECKERBOARD, lens, FIRST_SEED, views=28)[0][number])
+    still, _ = corner_session(CHECKERBOARD, LENS, FIRST_SEED, views=28)
+    middle, longer = LENS.K[:2, 2], np.linspace(1, 1.01, 28)
+    grown = zip(still, longer, strict=True)
+    views = [replace(view, pixels=middle + k * (view.pixels - middle)) for view, k in grown]
     findings = diagnose(Detections(views), CHECKERBOARD)
     assert findings.names == ("steady_drift",)
     [longer] = re.findall(r"grows by ([+-][0-9.]+) %", findings[0].evidence)

@@ -236,35 +236,3 @@ def test_the_numbers_of_the_checkpoints() -> None:
     slips.append(447 * 0.05 / 126)
     classics = [c.value for c in CHECKPOINTS["depth_noise.minimum_range"].classics]
     assert classics == pytest.approx(slips, rel=0.01)
-
-
-def test_what_the_texts_state() -> None:
-    rng = np.random.default_rng(1)
-    # 100 frames of an AR(1) series with correlation 0.5 gain 5.8, independent ones 10
-    noise = rng.normal(size=(40_000, 160))
-    for n in range(1, 160):
-        noise[:, n] = 0.5 * noise[:, n - 1] + math.sqrt(0.75) * noise[:, n]
-    assert 1 / noise[:, 60:].mean(axis=1).std() == pytest.approx(5.8, abs=0.1)
-
-    # the width of a centred 60 mm block at 0.4 m: from one pixel's depth 0.09 mm, like Z; from
-    # the depths of both ends 0.06 mm, with a median of 25 0.015 mm; and 0.13 mm for its edges
-    for distance, want in ((0.4, 0.086), (0.8, 0.172)):
-        n = 447 * 0.06 / distance
-        one = rng.normal(distance, 0.573e-3 * (distance / 0.4) ** 2, 20_000)
-        assert 1000 * (n * one / 447).std() == pytest.approx(want, rel=0.03)
-    u = 447 * np.array([-0.03, 0.03]) / 0.4
-    depth = rng.normal(0.4, 0.573e-3, (20_000, 2, 25))
-
-    def width_mm(u, Z):
-        return 1000 * np.hypot(*((u * Z / 447)[:, 1] - (u * Z / 447)[:, 0], Z[:, 1] - Z[:, 0]))
-
-    assert width_mm(u, depth[:, :, 0]).std() == pytest.approx(0.061, abs=0.002)
-    assert width_mm(u, np.median(depth, axis=2)).std() == pytest.approx(0.015, abs=0.001)
-    jitter = u + rng.normal(0, 0.1, (20_000, 2))
-    assert width_mm(jitter, np.full((20_000, 2), 0.4)).std() == pytest.approx(0.13, abs=0.005)
-    farther = np.median(rng.normal(0.8, 4 * 0.573e-3, (20_000, 2, 25)), axis=2)
-    assert width_mm(u / 2, farther).std() == pytest.approx(2 * 0.015, abs=0.002)  # like Z
-
-    # a baseline that is 10 % too long
-    d = 447 * 0.05 / np.array([0.3, 0.45, 2.0])
-    np.testing.assert_allclose(447 * 0.055 / d, 1.1 * np.array([0.3, 0.45, 2.0]))

@@ -462,7 +462,7 @@ def test_the_numbers_of_the_checkpoints() -> None:
 
 def test_the_widget_commits() -> None:
     said: list[str] = []
-    field, button = panel(CHECKPOINTS["pinhole.half_size"], said.append).children
+    field, button, _ = panel(CHECKPOINTS["pinhole.half_size"], said.append).children
     button.click()
     assert "Choose or type" in said[-1]
     field.value = "A"
@@ -472,7 +472,7 @@ def test_the_widget_commits() -> None:
     button.click()
     assert "right" in said[-1]
     assert CHECKPOINTS["pinhole.half_size"]._before().startswith("<details><summary>You have")
-    field, _ = panel(PITCH, said.append).children
+    field, *_ = panel(PITCH, said.append).children
     field.value = "2000"
     field._handle_custom_msg({"event": "submit"}, [])  # the key Enter
     assert "right" in said[-1]

@@ -44,6 +44,7 @@ MINUTES = re.compile(r"Core: about (\d+) minutes")
 OBJECTIVES = re.compile(r"^\*\*Afterwards you can\*\*\n+(.+?)\s*\Z", re.MULTILINE | re.DOTALL)
 PLAIN = '<div class="highlight"><pre>{}</pre></div>\n'
 PUNCTUATED = re.compile(r'\(?<math[^>]* display="inline">(?:(?!</math>).)*</math>[.,;:)?]+')
+SCROLLS = b"<pre>", b'<pre tabindex="0">'  # a keyboard must reach what may scroll
 SLIDERS = '<figcaption class="aside">It has sliders in the running notebook.</figcaption>'
 
 
@@ -218,7 +219,7 @@ def output_html(page: Page, cell: Cell, output: dict[str, Any]) -> str:
         html = joined(data["text/html"])
         if not html or html.startswith(IN_WORDS):  # a figure's words are its alternative text here
             return ""
-        return f'<div class="output">{html}</div>\n'
+        return f'<div class="output" tabindex="0">{html}</div>\n'
     if "image/png" in data:
         return _figure(page, cell, output)
     if not text:
@@ -288,8 +289,8 @@ def site() -> dict[str, bytes]:
     files = {name: (PARTS / name).read_bytes() for name in COPIED}
     for page in (start, *notebooks, corrections, formats):
         files |= page.files
-    files |= {name: text.encode("utf-8") for name, text in rendered.items()}
-    return files | reference.files()
+    pages = {name: text.encode("utf-8") for name, text in rendered.items()} | reference.files()
+    return files | {name: html.replace(*SCROLLS) for name, html in pages.items()}
 
 
 # ---- the command line ---------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from coursekit import checks, results
+from coursekit import checks, results, words
 
 EXAMPLES = "0.37 or 150"  # of numbers, and no checkpoint's answer
 LENGTHS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
@@ -265,7 +265,7 @@ def panel(checkpoint: Checkpoint, say: Callable[[str], None]) -> Any:
 
     button.on_click(commit)
     field.on_msg(lambda _, told, __: commit() if told.get("event") == "submit" else None)  # Enter
-    return ipywidgets.VBox([field, button])
+    return words.stacked(field, button)
 
 
 @cache

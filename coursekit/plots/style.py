@@ -17,6 +17,7 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 
 from coursekit.checks import want
+from coursekit.words import stacked
 
 # Okabe-Ito, its two lightest darker for 3:1 on white: distinguishable with any colour vision; the
 # same thing has the same colour everywhere.
@@ -187,7 +188,7 @@ class Draggable:
 
         for field in fields.values():
             field.observe(redraw, names="value")
-        return ipywidgets.VBox([*fields.values(), image])
+        return stacked(*fields.values(), image)
 
     def __repr__(self) -> str:
         return self.start().alt

@@ -4,12 +4,10 @@ And a notebook runs for somebody who leaves out every section marked deeper or s
 COURSEKIT_NIGHTLY=1 runs the notebooks with all answers in them, the core alone and whole.
 """
 
-import ast
-
 import nbformat
 import numpy as np
 import pytest
-from common import nightly
+from common import names, nightly
 from wrong_answers import attempts
 
 import coursekit as ck
@@ -86,9 +84,9 @@ def test_every_mistake_that_a_check_names_has_a_wrong_answer(name):
 def test_the_core_uses_nothing_that_only_the_rest_defines(path):
     """So that it runs for somebody who skips the rest; at night it is run."""
     core, rest = split(nbformat.read(path, as_version=4).cells)
-    used, in_core, in_rest = (
-        set().union(*map(names, cells))
-        for names, cells in ((names_used, core), (names_bound, core), (names_bound, rest))
+    (used, in_core), (_, in_rest) = (
+        map(set().union, *(names(cell.source) for cell in cells if cell.cell_type == "code"))
+        for cells in (core, rest)
     )
     assert not (used & in_rest) - in_core
 
@@ -104,11 +102,11 @@ def test_a_notebook_with_all_answers_runs_and_finds_them_right(path, whole, tmp_
         if part == "stub":
             cell.source = injected({"answer": cells[exercise, "answer"].source}, exercise)
     if not whole:
-        names = {exercise for exercise, _ in cells if exercise}
+        own = {exercise for exercise, _ in cells if exercise}
         core, rest = split(notebook.cells)
         assert rest, "no section is marked deeper or studio"
         done = nbformat.v4.new_code_cell(f"assert ck.results.load({path.stem!r}).quantities")
-        left = [c for c in rest if build_notebooks.role(c)[0] or names & names_used(c)]
+        left = [c for c in build_notebooks.code_cells({"cells": rest}) if kept(c, own)]
         notebook.cells = [*core, done, *left]
     environment = build_notebooks.kernel_environment(tmp_path)
     build_notebooks.execute(notebook, path.stem, path.parent, environment)
@@ -121,6 +119,11 @@ def test_a_notebook_with_all_answers_runs_and_finds_them_right(path, whole, tmp_
     lesson = path.stem.partition("_")[2]
     assert {f"{lesson}.{name}" for name in said} == {n for n in SOURCES if n.startswith(lesson)}
     assert {text.partition(".")[0] for text in said.values()} == {f"{n}: right" for n in said}
+
+
+def kept(cell, exercises):
+    """Whether it is part of an exercise, or uses what one of them defines."""
+    return build_notebooks.role(cell)[0] or exercises & names(cell.source)[0]
 
 
 def split(cells):
@@ -140,19 +143,3 @@ def heading(cell):
     marks, _, title = cell.source.partition("\n")[0].partition(" ")
     is_one = cell.cell_type == "markdown" and marks and set(marks) == {"#"}
     return (len(marks), title) if is_one else (0, "")
-
-
-def names_used(cell):
-    return {node.id for node in nodes(cell) if isinstance(node, ast.Name)}
-
-
-def names_bound(cell):
-    """What a cell gives a name to, in functions, too."""
-    stored = {n.id for n in nodes(cell) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
-    named = (ast.FunctionDef, ast.ClassDef, ast.ExceptHandler)
-    stored |= {node.name for node in nodes(cell) if isinstance(node, named)}
-    return stored | {node.arg for node in nodes(cell) if isinstance(node, ast.arg)}
-
-
-def nodes(cell):
-    return list(ast.walk(ast.parse(cell.source))) if cell.cell_type == "code" else []

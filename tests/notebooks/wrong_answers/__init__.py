@@ -1,11 +1,12 @@
 """Wrong answers to the exercises, written as students write them: `<lesson>_<exercise>.py`.
 
 A solution stands there once in each style that turns up (vectorised, loops over lists, matrix
-products), below it a table of what is replaced in its text, and what must be said then. Attempts
-that are no solution with a mistake in it are functions of their own, below a `@wrong(...)`.
+products); by_change.toml has what is replaced in its text, and what must be said then. Attempts
+that are no solution with a mistake in it are functions of their own, below a `@wrong(...)`, or
+stand as text in by_text.toml.
 
-What must be said is the name of a misconception, or a kind of verdict, or None for an attempt that
-is wrong in a way that has no name. All are written without a look at coursekit's own wrong models.
+What must be said is the name of a misconception, or a kind of verdict, or "no name" for an attempt
+that is wrong in a way that has none. All are written without a look at coursekit's wrong models.
 """
 
 from __future__ import annotations
@@ -22,7 +23,10 @@ from typing import Any
 import numpy as np
 
 Attempt = Callable[..., Any]
-BY_TEXT = tomllib.loads(Path(__file__).with_name("by_text.toml").read_text(encoding="utf-8"))
+BY_TEXT, BY_CHANGE = (
+    tomllib.loads(Path(__file__).with_name(name).read_text(encoding="utf-8"))
+    for name in ("by_text.toml", "by_change.toml")
+)
 
 
 @dataclass(frozen=True)
@@ -34,12 +38,12 @@ class WrongAnswer:
     verdict: tuple[str, str | None]
 
 
-def expected(said: str | None) -> tuple[str, str | None]:
+def expected(said: str) -> tuple[str, str | None]:
     kinds = ("right", "core right", "raised", "not attempted")
-    return (said, None) if said in kinds else ("wrong", said or None)
+    return (said, None) if said in kinds else ("wrong", None if said == "no name" else said)
 
 
-def wrong(said: str | None) -> Callable[[Attempt], Attempt]:
+def wrong(said: str) -> Callable[[Attempt], Attempt]:
     """Mark a function as an attempt of its own style."""
 
     def mark(attempt: Attempt) -> Attempt:
@@ -49,29 +53,27 @@ def wrong(said: str | None) -> Callable[[Attempt], Attempt]:
     return mark
 
 
-def changed(solution: Attempt, changes: dict[str, str | None]) -> None:
-    """Make attempts of a right solution: {"old -> new and old -> new": what must be said}.
-
-    Each old expression must stand exactly once in the solution's text.
-    """
-    solution.wrong_answers = [WrongAnswer(solution.__name__, solution, ("right", None))]
-    for change, said in changes.items():
-        text = inspect.getsource(solution)
-        for one in change.split(" and "):
-            old, _, new = one.partition(" -> ")
-            assert text.count(old) == 1, f"{solution.__name__}: {old!r} of {change!r}"
-            text = text.replace(old, new)
-        namespace = {"math": math} | solution.__globals__
-        exec(text, namespace)
-        attempt = namespace[solution.__name__]
-        name = f"{solution.__name__}, {change}"
-        solution.wrong_answers.append(WrongAnswer(name, attempt, expected(said)))
+def changed(solution: Attempt, change: str, said: str) -> WrongAnswer:
+    """A right solution with a mistake in it. Each old expression must stand exactly once in it."""
+    text = inspect.getsource(solution)
+    for one in change.split(" and "):
+        old, _, new = one.partition(" -> ")
+        assert text.count(old) == 1, f"{solution.__name__}: {old!r} of {change!r}"
+        text = text.replace(old, new)
+    namespace = {"math": math} | solution.__globals__
+    exec(text, namespace)
+    attempt = namespace[solution.__name__]
+    return WrongAnswer(f"{solution.__name__}, {change}", attempt, expected(said))
 
 
 def attempts(exercise: str) -> list[WrongAnswer]:
     """The wrong answers to the exercise `lesson.function`, and the solutions they come from."""
     module = importlib.import_module(f"wrong_answers.{exercise.replace('.', '_')}")
     found = [one for f in vars(module).values() for one in getattr(f, "wrong_answers", ())]
+    for style, changes in BY_CHANGE.get(exercise, {}).items():
+        solution = getattr(module, style)
+        found.append(WrongAnswer(style, solution, expected("right")))
+        found += [changed(solution, one, said) for said, all_ in changes.items() for one in all_]
     for written in BY_TEXT.get(exercise, ()):
         namespace = {"np": np}
         exec(written["code"], namespace)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from wrong_answers import changed, wrong
+from wrong_answers import wrong
 
 
 def whole_arrays(counts, scale, distance):
@@ -14,43 +14,6 @@ def whole_arrays(counts, scale, distance):
 
 
 STD = "np.sqrt(np.nanmean(np.nanvar(z, axis=0, ddof=1)))"
-changed(
-    whole_arrays,
-    {
-        "return bias -> z = np.where(abs(z - np.nanmedian(z, axis=0)) > 40, np.nan, z)\n"
-        f"    bias, std = np.nanmean(z) - distance * 1000, {STD}\n    return bias": "right",
-        "return bias -> z = np.where(abs(z - np.nanmedian(z, axis=0)) > 40, np.nan, z)\n"
-        f"    std = {STD}\n    return bias": "mixed_treatment",
-        "z[counts == 0] = np.nan -> pass": "zeros_counted",
-        "np.nanmean(z) -> np.mean(counts * scale) * 1000": "zeros_counted",
-        "bias = -> z = z[:, (counts > 0).all(axis=0)]\n    bias =": "steady_only",
-        "np.nanmean(z) -> z.mean()": "nan_spreads",
-        "np.nanmean(z) -> np.nanmedian(z)": "bias_of_the_median",
-        "np.nanmean(z) - distance * 1000 -> distance * 1000 - np.nanmean(z)": "bias_sign",
-        "np.nanmean(z) - distance * 1000 -> abs(np.nanmean(z) - distance * 1000)": "bias_size",
-        " - distance * 1000 -> ": "bias_is_depth",
-        "- distance * 1000 -> / distance / 10 - 100": "bias_percent",
-        "- distance * 1000 -> - distance": "bias_against_metres",
-        f"{STD} -> np.nanmean(np.nanstd(z, axis=0, ddof=1))": "stds_averaged",
-        f"{STD} -> np.nanmedian(np.nanstd(z, axis=0, ddof=1))": "stds_averaged",
-        ", ddof=1 -> ": "divided_by_n",
-        "axis=0, ddof=1 -> axis=(1, 2), ddof=1": "over_space",
-        f"{STD} -> np.nanstd(np.nanmean(z, axis=0))": "over_space",
-        f"{STD} -> np.nanstd(z)": "over_everything",
-        f"{STD} -> np.nanstd(np.nanmean(z, axis=(1, 2)), ddof=1)": "of_the_windows_mean",
-        "np.sqrt(np.nanmean( -> (np.nanmean(": "variance_reported",
-        "bias, std, -> bias, std / len(counts) ** 0.5,": "error_of_the_mean",
-        "scale * 1000.0 -> scale and - distance * 1000 -> - distance": "row_in_metres",
-        "bias, std, -> bias, std / 1000 / scale,": "row_in_counts",
-        "bias, std, -> std, bias,": "row_order",
-        "np.mean(counts == 0) -> 100 * np.mean(counts == 0)": "invalid_percent",
-        "np.mean(counts == 0) -> np.mean(counts != 0)": "valid_part",
-        "np.mean(counts == 0) -> np.sum(counts == 0)": "invalid_number",
-        "np.mean(counts == 0) -> np.mean((counts == 0).any(axis=0))": "ever_invalid",
-        "distance * 1000 -> distance * 100": None,
-        "z = counts * scale * 1000.0 -> z = counts": "raised",
-    },
-)
 
 
 @wrong("right")
