@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hostile_bundles import ZOE, hostile
-from sample_submissions import canvas, class_names, class_zip, honest, moodle
+from sample_submissions import canvas, class_names, class_zip, moodle
 
 from coursekit import cli
 from coursekit.specifications import DATA
@@ -29,8 +29,7 @@ from coursekit.submission import batch
 from coursekit.submission.batch import Bundle, Limits
 from coursekit.submission.format import Claims, bundle_bytes, zip_bytes
 from coursekit.submission.recompute import grading_rules
-from coursekit.submission.report import ReportLine, grade_file, not_graded
-from coursekit.submission.rubric import grade
+from coursekit.submission.report import ReportLine, not_graded
 
 NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 USUAL = {"impossible_times", "not_distance_dependent"}  # of the small bundle
@@ -138,20 +137,6 @@ def test_the_same_bytes_come_out_however_many_processes_there_are(in_process, re
     for path in report.rglob("*.*"):
         if path.is_file():
             assert (tmp_path / "one" / path.relative_to(report)).read_bytes() == path.read_bytes()
-
-
-def test_a_batch_grades_as_the_rubric_does(tmp_path):
-    whole = honest(seed=5)
-    path = tmp_path / "a.zip"
-    path.write_bytes(bundle_bytes(whole))
-    line, page = grade_file(str(path), "a.zip", "students/a.html")
-    found = grade(whole)
-    brief = {"says": "", "tolerance": None}
-    assert (line.points, line.of) == (found.points, found.of)
-    assert line.items == tuple(replace(item, **brief) for item in found.items)
-    assert (line.made, line.paragraph) == (whole.made, whole.conclusion.paragraph)
-    assert line.page == "students/a.html"
-    assert page.startswith("<!doctype html>")
 
 
 def test_every_hostile_bundle_is_a_row_with_its_reason(tmp_path):
@@ -374,15 +359,6 @@ def test_what_is_kept_of_a_bundle_may_go_and_the_report_says_so(in_process, tmp_
     summary = graded(quick(tmp_path / "in", "ab"), out)
     assert (summary.graded, summary.failed) == (1, 1)
     assert [row["status"] for row in table(out)] == ["not graded: lost", "graded"]
-
-
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names")
-def test_what_is_no_file_is_refused_and_nothing_waits_for_it(in_process, tmp_path):
-    folder = quick(tmp_path / "in", ["a"])
-    os.mkfifo(folder / "pipe.zip")
-    (folder / "gone.zip").symlink_to(tmp_path / "nowhere")
-    summary = graded(folder, tmp_path / "out", timeout_s=5)
-    assert (summary.graded, summary.refused, summary.failed) == (1, 2, 0)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="such paths cannot be made there")

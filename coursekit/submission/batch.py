@@ -168,7 +168,6 @@ def grade_folder(
     out: str | os.PathLike[str] | None = None,
     workers: int | None = None,
     timeout_s: float = TIMEOUT_S,
-    memory_bytes: int = MEMORY_BYTES,
     progress: bool = True,
     overwrite: bool = False,
     choices: Choices = Choices(),
@@ -177,9 +176,9 @@ def grade_folder(
 
     folder: or the zip that an LMS makes of all that was handed in. out: a folder for the report:
     new, empty, or one that holds a report; default NAME_report, here. workers: processes,
-    default one a core. timeout_s: of computing, for a bundle. memory_bytes: for a process, above
-    its resting size. overwrite: replace a finished report; what was graded and has not changed is
-    not graded again, unless the grader has changed. An unfinished one is gone on with in any case.
+    default one a core. timeout_s: of computing, for a bundle. overwrite: replace a finished report;
+    what was graded and has not changed is not graded again, unless the grader has changed. An
+    unfinished one is gone on with in any case.
     Raises ValueError for a folder that will not do, before any work, Stopped on Ctrl-C, and
     ChildProcessError when no process can be started.
     """
@@ -189,12 +188,11 @@ def grade_folder(
     if workers is None:
         free = getattr(os, "sched_getaffinity", None)  # what this process may use
         workers = len(free(0)) if free else os.cpu_count() or 1
-    for name, value in (("workers", workers), ("timeout_s", timeout_s), ("memory", memory_bytes)):
-        positive(name, value)
+    positive("workers", workers)
+    limits = Limits(workers, positive("timeout_s", timeout_s))
     roster = Roster(class_table(Path(choices.roster)) if choices.roster else ())
     _own_points(out / OWN_POINTS)
     _check_out(out, overwrite)
-    limits = Limits(workers, timeout_s, memory_bytes)
     if not folder.is_file():
         return _grade(folder, out, limits, progress, roster, choices)
     with tempfile.TemporaryDirectory() as scratch:

@@ -30,7 +30,7 @@ from coursekit import specifications
 from coursekit.arrays import Floats, NDArray
 from coursekit.checks import want
 from coursekit.submission.format import CameraFacts, Stack, Submission
-from coursekit.submission.recompute import SEEN, Recomputed, grading_rules
+from coursekit.submission.recompute import COLUMNS, SEEN, Recomputed, grading_rules
 
 LARGEST_WAVE = 6  # so many of them across a window; finer ones hold what was added
 N_WAVES = (
@@ -51,12 +51,7 @@ MOODLE = re.compile(
     r"(?:^|/)(?P<at>(?P<name>[^/]+?)_(?P<id>\d+)_assignsubmission_(?:file|onlinetext)_?)"
 )
 CANVAS = re.compile(r"(?:^|/)(?P<name>[^/_]+)(?P<late>_LATE)?_(?P<id>\d{2,})_\d{2,}_[^/]+$")
-NAME_COLUMNS = ("name", "full name", "student", "student name")  # columns of a roster
-FIRST_AND_LAST = ("first name", "last name", "surname")
-IDS = (
-    *("id", "identifier", "student id", "id number", "number", "sis user id", "sis login id"),
-    *("login", "username", "email", "email address", "e-mail"),
-)
+NAME_COLUMNS, FIRST_AND_LAST, IDS = (COLUMNS[k] for k in ("names", "parts_of_names", "ids"))
 SHARED_RUNS = 0.7  # part of the runs of the shorter of two paragraphs that the other one has too
 
 
@@ -712,14 +707,9 @@ def _alike(texts: Sequence[tuple[str, ...]], least: int) -> list[list[tuple[str,
     has = csr_array((ones, (rows, columns)), shape=(len(texts), len(number)))
     several = np.flatnonzero(has.sum(axis=0) > 1)
     size = np.maximum(np.bincount(rows, minlength=len(texts)), least)
-    has = has[:, several]
-    pairs = []
-    for start in range(0, len(texts), 256):  # so that a class that says the same fits the memory
-        shared = coo_array(has[start : start + 256] @ has.T)
-        one, two = shared.row + start, shared.col
-        near = shared.data >= SHARED_RUNS * np.minimum(size[one], size[two])
-        pairs.append(np.stack([one[near], two[near]]))
-    one, two = np.concatenate(pairs, axis=1)
+    shared = coo_array(has[:, several] @ has[:, several].T)
+    near = shared.data >= SHARED_RUNS * np.minimum(size[shared.row], size[shared.col])
+    one, two = shared.row[near], shared.col[near]
     groups = _groups(range(len(texts)), list(zip(one.tolist(), two.tolist(), strict=True)))
     single = {*range(len(texts))} - {i for group in groups for i in group}
     return [[texts[i] for i in group] for group in [*groups, *([i] for i in single)]]

@@ -29,6 +29,7 @@ MISTAKES: dict[str, str] = WORDS["mistakes"]
 WHY: dict[str, str] = WORDS["why"]  # a number that a mistake explains is wrong, by its code
 SAYS: dict[str, str] = WORDS["says"]  # longer sentences of the rubric
 SEEN: dict[str, str] = WORDS["seen"]  # what a flag says, by its code
+COLUMNS: dict[str, list[str]] = WORDS["columns"]  # of tables that are read or written
 REPEAT: dict[str, str] = WORDS["repeat"]  # by topic: the section of notebook 02 to repeat
 EXERCISE = ("distances_m", "slack_m", "frames", "window_px", "words", "tape_at_most_m")
 TOLERANCES = ("standard_errors", "error_of_an_error", "prediction", "prediction_factor", "near")
