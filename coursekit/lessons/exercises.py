@@ -24,7 +24,7 @@ import itertools
 import re
 import traceback
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
@@ -46,7 +46,8 @@ class Mistake:
     """One wrong step: what it says to the learner, and a question that leads on.
 
     One that stands `alone` is not tried together with others (one of a long family, say). Without
-    a step, `wrong` is what is made of the whole function. One of the `device` is not listed.
+    a step, `wrong` is what is made of the whole function. One of the `device` is not listed;
+    one `of_result` needs nothing but what the function gives.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Mistake:
     wrong: Step = field(default=lambda: None)
     alone: bool = False
     device: bool = False
+    of_result: bool = False
 
 
 @dataclass(frozen=True)
@@ -71,14 +73,15 @@ class Core:
     rest: str
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Exercise:
     """A function the learner writes, and all that is known about getting it wrong.
 
     build(steps) returns the model that uses these steps. Cases go from small to large, and the
     first one that fails is shown: `describe(args)` and `show(row)` put it into words. Where a
     result has rows and the first `per_row` arguments have the same, one row of them is shown;
-    otherwise (a result that is one number, say) the whole case. Results agree within `tolerance`
+    otherwise (a result that is one number, say) the whole case. parts: what the columns of a
+    result, or its numbers, are called. Results agree within `tolerance`
     (in `unit`) or a millionth of their size, as float32 does, and NaN with NaN. Where
     `nan_answers`, NaN is an answer like any other; otherwise a wrong model that comes to NaN or
     infinity has overflowed. ways: other right answers, what each does and the steps that do it;
@@ -91,11 +94,12 @@ class Exercise:
     build: Callable[[Mapping[str, Step]], Model]
     steps: dict[str, Step]
     cases: list[tuple[Any, ...]]
-    per_row: int
     unit: str
-    tolerance: float
     describe: Callable[[tuple[Any, ...]], str]
     show: Callable[[Floats], str]
+    parts: tuple[str, ...] = ()
+    per_row: int = 0
+    tolerance: float = 1e-6
     nan_answers: bool = False
     way: str = ""
     ways: list[tuple[str, dict[str, Step]]] = field(default_factory=list)
@@ -149,10 +153,13 @@ class Exercise:
 
     @cached_property
     def _others(self) -> list[Exercise]:
-        """The exercise as those see it who answer it in another right way, without the device."""
+        """The exercise as those see it who answer it in another right way.
+
+        The device edits their results only.
+        """
         others = [replace(self, way=w, steps=self.steps | own, ways=[]) for w, own in self.ways]
         for other in others:
-            other._edits.extend(([], []))
+            other._edits.extend(([], _result_edits(other), []))
         return others
 
     def _verdict(self, function: Callable[..., Any]) -> Verdict:
@@ -372,13 +379,12 @@ class Exercise:
                 yield (a, b) if order.index(a.step) < order.index(b.step) else (b, a)
         if not self._edits:
             self._edits += _all_edits(self)
-        single, double = self._edits
-        yield from ((m,) for m in single)
-        yield from ((m,) for m in double)
+        yield from ((m,) for m in itertools.chain(*self._edits))
         common = [
-            m for m in single if not m.step and m.name in FOUND["common"] and "result" in m.says
+            m for m in self._edits[0] if m.name in FOUND["common"] and "each of" not in m.says
         ]
         yield from itertools.product(listed, common)
+        yield from itertools.combinations(common, 2)
 
     def _explains(self, mistakes: tuple[Mistake, ...], values: list[Floats]) -> bool:
         """Whether a wrong model gives exactly these values.
@@ -412,8 +418,12 @@ class Exercise:
         """
         key = (*map(id, mistakes), id(args))
         if key not in self._known:
+            model = self.model(*mistakes)
+            if mistakes and mistakes[-1].of_result:
+                given = self._answer(mistakes[:-1], args)
+                model = mistakes[-1].wrong(lambda *_: given)
             try:
-                value = _as_numbers(self.model(*mistakes)(*args))
+                value = _as_numbers(model(*args))
             except Exception:  # an edit of the device may come to nothing
                 value = None
             overflows = value is not None and not self.nan_answers and not np.isfinite(value).all()
@@ -522,13 +532,33 @@ EDITS: dict[str, Edit] = {
 }
 ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh")
 NUMERIC = (int, float, np.generic, np.ndarray)
-_NAMED = re.compile(r"(what is made of )?`\w+`((, | and | of )`\w+`)*")
+_ONE = r"(the \w+ (part|number|column) of )?(what is made of )?`\w+`"
+_NAMED = re.compile(rf"(each of )?{_ONE}((, | and | of ){_ONE})*")
+MOST_PARTS = 5  # of more parts no two are edited alike
 MOST_NAMES = 3  # of more of them no learner finds the place
 MOST_SITES = 55  # of more of them in one step no two are tried together
 
 
-def _all_edits(exercise: Exercise) -> tuple[list[Mistake], list[Mistake]]:
-    """Single edits of the whole function and of its steps, and pairs within one step's source."""
+def _split(exercise: Exercise, result: Any) -> Any:
+    """The result of one case: its rows have columns, or it has a few parts."""
+    array = np.asarray(result)
+    return array if exercise.per_row or not array.ndim else tuple(array)
+
+
+def _result_edits(exercise: Exercise) -> list[Mistake]:
+    found = []
+    result = _split(exercise, exercise.model()(*exercise.cases[-1]))
+    for kind, where, edit in _edits_of(result, "your result", exercise.parts):
+
+        def wrong(model: Model, edit: Edit = edit) -> Model:
+            return lambda *args: edit(_split(exercise, model(*args)))
+
+        found.append(replace(_device(kind, where, "", wrong), of_result=True))
+    return found
+
+
+def _all_edits(exercise: Exercise) -> tuple[list[Mistake], list[Mistake], list[Mistake]]:
+    """Single edits of the result, of all else, and pairs within one step's source."""
     args, steps = exercise.cases[-1], exercise.steps
     seen: dict[str, tuple[tuple[Any, ...], Any]] = {}
 
@@ -536,34 +566,40 @@ def _all_edits(exercise: Exercise) -> tuple[list[Mistake], list[Mistake]]:
         seen[name] = values, steps[name](*values)
         return seen[name][1]
 
-    def parts(result: Any) -> Any:  # of one case: its rows have columns, or it has a few parts
-        array = np.asarray(result)
-        return array if exercise.per_row or not array.ndim else tuple(array)
-
-    result = parts(exercise.build({name: partial(watched, name) for name in steps})(*args))
+    split = partial(_split, exercise)
+    result = split(exercise.build({name: partial(watched, name) for name in steps})(*args))
     inputs = [f"`{name}`" for name in inspect.signature(exercise.model()).parameters]
-    found: list[tuple[str, str, str, Step]] = []
-    for kind, where, edit in _edits_of(result, "your result"):
-        found.append((kind, where, "", lambda f, e=edit: lambda *a: e(parts(f(*a)))))
     rewritten = [(name, edit) for name, step in steps.items() for edit in _rewritten(step)]
+    found: list[tuple[str, str, str, Step]] = []
     found += [(kind, where, name, new) for name, (n, kind, where, new) in rewritten if n == 1]
-    for kind, where, edit in _edits_of(args, inputs):
+    for kind, where, edit in _edits_of(args, _listed(inputs), inputs):
         found.append((kind, where, "", lambda f, e=edit: lambda *a: f(*e(a))))
     for kind, where, by in _factors(args, inputs, result):
-        found.append((kind, where, "", lambda f, by=by: lambda *a: by(a, parts(f(*a)))))
+        found.append((kind, where, "", lambda f, by=by: lambda *a: by(a, split(f(*a)))))
     for name, (values, given) in seen.items():
         step, own = steps[name], _argument_names(steps[name], len(values))
+        for kind, where, edit in _edits_of(values, _listed(own), own, deep=False):
+            found.append((kind, where, name, lambda *a, e=edit, f=step: f(*e(a))))
         for kind, where, edit in _edits_of(given, f"what is made of {_listed(own)}", deep=False):
             found.append((kind, where, name, lambda *a, e=edit, f=step: e(f(*a))))
-        for kind, where, edit in _edits_of(values, own, deep=False):
-            found.append((kind, where, name, lambda *a, e=edit, f=step: f(*e(a))))
-    pairs = [(kind, where, name, new) for name, (n, kind, where, new) in rewritten if n == 2]
-    return [_device(*edit) for edit in found], [_device(*edit, FOUND["more"]) for edit in pairs]
+    pairs = [
+        _device(kind, where, name, new, FOUND["more"])
+        for name, (n, kind, where, new) in rewritten
+        if n == 2
+    ]
+    return _result_edits(exercise), [_device(*edit) for edit in found], pairs
 
 
 def _device(kind: str, where: str, step: str, wrong: Step, before: str = "") -> Mistake:
     says, ask = (" ".join(text.split()) for text in FOUND["kinds"][kind])
-    return Mistake(kind, before + says.replace("WHERE", where), ask, step, wrong, device=True)
+    return Mistake(
+        kind,
+        before + says.replace("WHERE", where or FOUND["unseen"]),
+        ask,
+        step,
+        wrong,
+        device=True,
+    )
 
 
 def _listed(names: Iterable[str]) -> str:
@@ -578,48 +614,50 @@ def _argument_names(step: Step, count: int) -> list[str]:
 
 
 def _edits_of(
-    value: Any, named: str | list[str], deep: bool = True
+    value: Any, whole: str, names: Sequence[str] = (), deep: bool = True
 ) -> Iterator[tuple[str, str, Edit]]:
     """Edits of all of a value and of its parts: a kind, where it is, and what it does.
 
-    named: what the value is called, or each part of a tuple; not deep: only tuples have parts.
+    whole: what the value is called; names: its parts, if they have names of their own; not deep:
+    only tuples have parts.
     """
-    whole = named if isinstance(named, str) else _listed(named)
     if isinstance(value, NUMERIC):
         yield from ((kind, whole, edit) for kind, edit in EDITS.items())
-    parts = _parts(value, named) if deep or isinstance(value, tuple) else []
-    arrays = [part for part in parts if isinstance(part[2], (np.generic, np.ndarray))]
-    like = len(arrays) > 1 and len({part[2].shape for part in arrays}) == 1
-    for label, indices, part in [
-        *((label, [i], part) for label, i, part in parts),
-        *([(whole, [i for _, i, _ in arrays], arrays[0][2])] if like else []),
-    ]:
-        for kind, where, edit in _edits_of(part, label, deep):
-            yield kind, where, partial(_put, [(i, i) for i in indices], edit)
-    for turn in (1, 2) if len(arrays) == len(parts) == 3 and like else ():
+    parts = _parts(value, whole, names) if deep or isinstance(value, tuple) else []
+    for label, i, part in parts:
+        for kind, where, edit in _edits_of(part, label, deep=deep):
+            yield kind, where, partial(_put, [(i, i)], edit)
+    numbers = [part for part in parts if isinstance(part[2], NUMERIC)]
+    groups = [g for n in range(2, MOST_PARTS) for g in itertools.combinations(numbers, n)]
+    for group in groups if len(numbers) < MOST_PARTS else ():
+        where = whole if len(group) == len(parts) else f"each of {_listed(n for n, _, _ in group)}"
+        if len({np.shape(part) for _, _, part in group}) == 1:
+            for kind, label, edit in _edits_of(group[0][2], where, deep=deep):
+                yield kind, label, partial(_put, [(i, i) for _, i, _ in group], edit)
+    for turn in (1, 2) if len(numbers) == len(parts) == 3 else ():
         new = [(parts[i][1], parts[i - turn][1]) for i in range(3)]
         yield "exchanged", f"the parts of {whole}", partial(_put, new, lambda v: v)
-    for (a, i, x), (b, j, y) in itertools.permutations(parts, 2):
-        if isinstance(x, NUMERIC) and isinstance(y, NUMERIC) and np.shape(x) == np.shape(y):
+    for (a, i, x), (b, j, y) in itertools.permutations(numbers, 2):
+        if np.shape(x) == np.shape(y):
             yield "copied", _listed((a, b)), partial(_put, [(i, j)], lambda v: v)
             yield "exchanged", _listed((a, b)), partial(_put, [(i, j), (j, i)], lambda v: v)
 
 
-def _parts(value: Any, named: str | list[str]) -> list[tuple[str, Any, Any]]:
+def _parts(value: Any, whole: str, names: Sequence[str]) -> list[tuple[str, Any, Any]]:
     """What each part is called, its index and itself: of a tuple, of columns, of a pose."""
-    labels = named if isinstance(named, list) else []
     indices: list[Any] = []
     array: tuple[int, ...] = value.shape if isinstance(value, np.ndarray) else ()
+    kinds: Sequence[str] = [f"{n} column" for n in ORDINALS]
     if isinstance(value, tuple):
         kind = "part" if any(isinstance(v, np.ndarray) and v.ndim for v in value) else "number"
-        labels = labels or [f"the {n} {kind} of {named}" for n in ORDINALS]
+        kinds = [f"{n} {kind}" for n in ORDINALS]
         indices = list(range(len(value)))
     elif array == (4, 4):
-        labels = [f"the {part} of {named}" for part in ("translation", "rotation", "last row")]
+        kinds = "translation", "rotation", "last row"
         indices = [(slice(3), 3), (slice(3), slice(3)), 3]
     elif len(array) == 2 and array[1] < min(4, array[0]):
-        labels = [f"the {n} column of {named}" for n in ORDINALS]
         indices = [(..., i) for i in range(array[1])]
+    labels = names or [f"the {kind} of {whole}" for kind in kinds]
     return [(label, i, value[i]) for label, i in zip(labels, indices, strict=False)]
 
 
@@ -635,7 +673,7 @@ def _factors(
     args: tuple[Any, ...], names: list[str], result: Any
 ) -> Iterator[tuple[str, str, Step]]:
     """Edits by which the result, or parts of it, are multiplied or divided by an input."""
-    every = [n for _, n, _ in _parts(result, "")] or [...]
+    every = [n for _, n, _ in _parts(result, "", ())] or [...]
     groups = [[n] for n in every] + [every, every[:-1]] * (len(every) > 2)
     for (i, given), group in itertools.product(enumerate(args), groups):
         if isinstance(given, (float, np.ndarray)) and np.ndim(given) < 2:

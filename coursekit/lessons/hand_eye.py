@@ -76,64 +76,51 @@ MOTION_PAIR = Exercise(
         "order": lambda A, B: np.stack([A, B]),
     },
     cases=[_session_pair(0, plain=True), *(_session_pair(seed) for seed in range(1, 5))],
-    per_row=0,
+    parts=("A", "B"),
     unit="m",
-    tolerance=1e-6,
     describe=_describe_pair,
     show=lambda row: f"translations of A and B {_vector(row[0])} and {_vector(row[1])}",
 )
 
 
+def _places_subtracted(motion: Step, sign: int) -> Step:
+    """The rotation of a motion, and the difference of the two places."""
+
+    def wrong(i: Floats, j: Floats, inverse: Step) -> Floats:
+        return make_transform(motion(i, j, inverse)[:3, :3], sign * (i - j)[:3, 3])
+
+    return wrong
+
+
+for _step in ("A", "B"):
+    _motion = MOTION_PAIR.steps[_step]
+    MOTION_PAIR.add_mistakes(
+        (_step, "one_pose_only", lambda i, j, inverse: np.eye(4)),
+        (_step, "product_inverted", lambda i, j, inverse: inverse(j @ i)),
+        (_step, "product_inverted", lambda i, j, inverse: inverse(i @ j)),
+        (_step, "elementwise", lambda i, j, inverse: inverse(j) * i),
+        (_step, "elementwise", lambda i, j, inverse: j * inverse(i)),
+        (_step, "elementwise", lambda i, j, inverse: j * i),
+        (_step, "subtracted", lambda i, j, inverse: j - i),
+        (_step, "subtracted", lambda i, j, inverse: i - j),
+        (_step, "places_subtracted", _places_subtracted(_motion, 1)),
+        (_step, "places_subtracted", _places_subtracted(_motion, -1)),
+    )
 MOTION_PAIR.add_mistakes(
     ("read", "gripper_twice", lambda gi, gj, bi, bj: (gi, gj, gi, gj)),
     ("read", "board_twice", lambda gi, gj, bi, bj: (bi, bj, bi, bj)),
     ("inverse", "transposed_pose", lambda T: T.T),
     ("inverse", "translation_not_turned", lambda T: make_transform(T[:3, :3].T, -T[:3, 3])),
     ("inverse", "turned_back", lambda T: make_transform(T[:3, :3].T, -T[:3, :3] @ T[:3, 3])),
-    ("A", "one_pose_only", lambda gripper_i, gripper_j, inverse: np.eye(4)),
-    ("B", "one_pose_only", lambda board_i, board_j, inverse: np.eye(4)),
-    ("A", "product_inverted", lambda i, j, inverse: inverse(j @ i)),
-    ("A", "product_inverted", lambda i, j, inverse: inverse(i @ j)),
-    ("B", "product_inverted", lambda i, j, inverse: inverse(j @ i)),
-    ("B", "product_inverted", lambda i, j, inverse: inverse(i @ j)),
     ("read", "mixed", lambda i, j, k, m: (k, i, np.linalg.inv(m), np.linalg.inv(j))),
     ("inverse", "not_inverted", lambda T: T),
-    ("A", "motion_in_base", lambda first, second, inverse: second @ inverse(first)),
+    ("A", "motion_in_base", lambda i, j, inverse: j @ inverse(i)),
     ("A pair", "a_exchanged", lambda i, j: (j, i)),
     ("B pair", "b_exchanged", lambda i, j: (j, i)),
-    ("B", "motion_in_board", lambda first, second, inverse: inverse(second) @ first),
+    ("B", "motion_in_board", lambda i, j, inverse: inverse(j) @ i),
     ("order", "both_exchanged", lambda A, B: np.stack([np.linalg.inv(A), np.linalg.inv(B)])),
-    ("order", "b_first", lambda A, B: np.stack([B, A])),
-    ("A", "elementwise", lambda gripper_i, gripper_j, inverse: inverse(gripper_j) * gripper_i),
-    ("A", "elementwise", lambda gripper_i, gripper_j, inverse: gripper_j * gripper_i),
-    ("B", "elementwise", lambda board_i, board_j, inverse: board_j * inverse(board_i)),
-    ("B", "elementwise", lambda board_i, board_j, inverse: board_j * board_i),
-    ("A", "subtracted", lambda gripper_i, gripper_j, inverse: gripper_j - gripper_i),
-    ("A", "subtracted", lambda gripper_i, gripper_j, inverse: gripper_i - gripper_j),
-    ("B", "subtracted", lambda board_i, board_j, inverse: board_j - board_i),
-    ("B", "subtracted", lambda board_i, board_j, inverse: board_i - board_j),
-    (
-        "A",
-        "places_subtracted",
-        lambda i, j, inverse: make_transform(j[:3, :3].T @ i[:3, :3], i[:3, 3] - j[:3, 3]),
-    ),
-    (
-        "A",
-        "places_subtracted",
-        lambda i, j, inverse: make_transform(j[:3, :3].T @ i[:3, :3], j[:3, 3] - i[:3, 3]),
-    ),
-    (
-        "B",
-        "places_subtracted",
-        lambda i, j, inverse: make_transform(j[:3, :3] @ i[:3, :3].T, i[:3, 3] - j[:3, 3]),
-    ),
-    (
-        "B",
-        "places_subtracted",
-        lambda i, j, inverse: make_transform(j[:3, :3] @ i[:3, :3].T, j[:3, 3] - i[:3, 3]),
-    ),
-    ("A", "other_order", lambda gripper_i, gripper_j, inverse: gripper_i @ inverse(gripper_j)),
-    ("B", "other_order", lambda board_i, board_j, inverse: inverse(board_i) @ board_j),
+    ("A", "other_order", lambda i, j, inverse: i @ inverse(j)),
+    ("B", "other_order", lambda i, j, inverse: inverse(i) @ j),
 )
 
 
@@ -194,9 +181,7 @@ ROTATION_HALF = Exercise(
         _motions(3, 6),
         _motions(4, 20),
     ],
-    per_row=0,
     unit="(rotation matrix)",
-    tolerance=1e-6,
     describe=lambda args: (
         "the arm turns by 60 degrees about x, then by 40 about y; X is a quarter turn about z"
         if np.array_equal(args[0], _quarter_turns()[0])
@@ -204,6 +189,16 @@ ROTATION_HALF = Exercise(
     ),
     show=lambda R: "; ".join(" ".join(f"{v:.3f}" for v in row) for row in np.atleast_2d(R)),
 )
+
+
+def _no_signs(*motions: Floats) -> list[Floats]:
+    """The axes as eigenvectors have them."""
+    eigen = [[np.linalg.eig(R) for R in motion] for motion in motions]
+    return [np.array([V[:, np.argmin(abs(w - 1))].real for w, V in found]) for found in eigen]
+
+
+def _same_frame(A: Floats, B: Floats) -> Floats:
+    return np.asarray((A @ np.swapaxes(B, 1, 2)).mean(axis=0))
 
 
 def _kabsch(product: Callable[[Floats, Floats, Floats], Floats]) -> Step:
@@ -233,21 +228,8 @@ ROTATION_HALF.add_mistakes(
     ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: Vt @ D @ U.T)),
     ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: U @ Vt.T)),
     ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: Vt @ U.T)),
-    (
-        "axes",
-        "axis_without_sign",
-        lambda *motions: [
-            np.array([np.real(V[:, np.argmin(abs(w - 1))]) for w, V in map(np.linalg.eig, R)])
-            for R in motions
-        ],
-    ),
+    ("axes", "axis_without_sign", _no_signs),
     ("", "same_frame", lambda _: lambda A, B: A[0] @ B[0].T),
-    ("", "same_frame", lambda _: lambda A, B: (A @ np.swapaxes(B, 1, 2)).mean(axis=0)),
-    (
-        "",
-        "same_frame",
-        lambda _: (
-            lambda A, B: Rotation.from_matrix((A @ np.swapaxes(B, 1, 2)).mean(axis=0)).as_matrix()
-        ),
-    ),
+    ("", "same_frame", lambda _: _same_frame),
+    ("", "same_frame", lambda _: lambda *AB: Rotation.from_matrix(_same_frame(*AB)).as_matrix()),
 )

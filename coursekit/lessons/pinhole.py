@@ -42,17 +42,16 @@ def _bent(
     tangential: float = 1,
     cross: float = 2,
     square: float = 2,
-    one: float = 1,
 ) -> Step:
     """The distortion; a mistake has other powers of r² in the radial and the tangential terms, or
     other factors.
 
-    cross: of p xy, square: of x² and y², one: what the radial polynomial begins with.
+    cross: of p xy, square: of x² and y².
     """
 
     def bend(x: Floats, y: Floats, k1: float, k2: float, p1: float, p2: float, k3: float) -> Any:
         r2 = x * x + y * y
-        radial = sum((k * r2**n for k, n in zip((k1, k2, k3), powers, strict=True)), one)
+        radial = sum((k * r2**n for k, n in zip((k1, k2, k3), powers, strict=True)), 1)
         return (
             x * radial + cross * p1 * x * y + p2 * (r2**tangential + square * x * x),
             y * radial + p1 * (r2**tangential + square * y * y) + cross * p2 * x * y,
@@ -76,7 +75,7 @@ def _build_project(steps: Mapping[str, Step]) -> Model:
             return (x, y) if dist is None else steps["bend"](x, y, *steps["read"](*dist))
 
         def to_pixels(x: Floats, y: Floats, w: Any) -> Any:
-            return steps["to_pixels"](x, y, w, *_lens(K))
+            return steps["to_pixels"](x, y, w, *steps["lens"](*_lens(K)))
 
         return steps["columns"](*steps["image"](points.T, steps["normalise"], bend, to_pixels))
 
@@ -102,8 +101,9 @@ PROJECT = Exercise(
     name="pinhole.project",
     build=_build_project,
     steps={
+        "lens": lambda fx, fy, cx, cy: (fx, fy, cx, cy),
         "normalise": lambda X, Y, Z: (X / Z, Y / Z, 1.0),
-        "read": lambda *dist: dist,
+        "read": lambda k1, k2, p1, p2, k3: (k1, k2, p1, p2, k3),
         "bend": _bend,
         "to_pixels": _to_pixels,
         "image": _image,
@@ -122,6 +122,7 @@ PROJECT = Exercise(
         (SEVERAL[::-1] * [-1, 1, 1], GENERIC_K, MIXED * [1, -2, 3, 2, -1]),
     ],
     per_row=1,
+    parts=("u", "v"),
     unit="px",
     tolerance=1e-3,
     describe=_describe_project,
@@ -135,61 +136,43 @@ def _tangential_after_radial(
 ) -> Any:
     """The tangential terms of the point that is bent already, as librealsense has them."""
     r2 = x**2 + y**2
-    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-    a, b = x * radial, y * radial
+    a, b = _bend(x, y, k1, k2, 0.0, 0.0, k3)
     return a + 2 * p1 * a * b + p2 * (r2 + 2 * a**2), b + p1 * (r2 + 2 * b**2) + 2 * p2 * a * b
 
 
-PROJECT.add_mistakes(
-    ("normalise", "no_division", lambda X, Y, Z: (X, Y, 1.0)),
-    ("normalise", "no_division", lambda X, Y, Z: (X, Y, Z)),
-    (
-        "normalise",
-        "divided_by_range",
-        lambda X, Y, Z: (*(np.stack([X, Y]) / np.linalg.norm([X, Y, Z], axis=0)), 1.0),
-    ),
-    ("normalise", "centre_divided", lambda X, Y, Z: (X / Z, Y / Z, 1.0 / Z)),
-    ("normalise", "upside_down", lambda X, Y, Z: (Z / X, Z / Y, 1.0)),
-    ("normalise", "y_up", lambda X, Y, Z: (X / Z, -Y / Z, 1.0)),
-    ("to_pixels", "y_up", lambda x, y, w, fx, fy, cx, cy: _to_pixels(x, y, w, fx, -fy, cx, cy)),
-    (
-        "to_pixels",
-        "fx_fy_swapped",
-        lambda x, y, w, fx, fy, cx, cy: _to_pixels(x, y, w, fy, fx, cx, cy),
-    ),
-    (
-        "to_pixels",
-        "fx_for_both",
-        lambda x, y, w, fx, fy, cx, cy: _to_pixels(x, y, w, fx, fx, cx, cy),
-    ),
-    (
-        "to_pixels",
-        "centre_before_scale",
-        lambda x, y, w, fx, fy, cx, cy: (fx * (x + cx * w), fy * (y + cy * w)),
-    ),
-    (
-        "to_pixels",
-        "K_transposed",
-        lambda x, y, w, fx, fy, cx, cy: (
-            fx * x / (cx * x + cy * y + w),
-            fy * y / (cx * x + cy * y + w),
-        ),
-    ),
-    (
-        "to_pixels",
-        "cx_cy_swapped",
-        lambda x, y, w, fx, fy, cx, cy: _to_pixels(x, y, w, fx, fy, cy, cx),
-    ),
-    (
-        "to_pixels",
-        "principal_point_forgotten",
-        lambda x, y, w, fx, fy, cx, cy: _to_pixels(x, y, w, fx, fy, 0.0, 0.0),
-    ),
-    (
-        "to_pixels",
-        "principal_point_subtracted",
-        lambda x, y, w, fx, fy, cx, cy: _to_pixels(x, y, w, fx, fy, -cx, -cy),
-    ),
+def _x_overwritten(x: Floats, y: Floats, *dist: float) -> Any:
+    new_x, new_y = _bend(x, y, *dist)
+    return new_x, new_y + 2 * dist[3] * (new_x - x) * y
+
+
+def _transposed(x: Floats, y: Floats, w: Any, fx: float, fy: float, cx: float, cy: float) -> Any:
+    return np.divide((fx * x, fy * y), cx * x + cy * y + w)
+
+
+def _bent_first(points: Floats, normalise: Step, bend: Step, to_pixels: Step) -> Any:
+    return to_pixels(*(np.stack(bend(*points[:2])) / points[2]), 1.0)
+
+
+def _bent_last(points: Floats, normalise: Step, bend: Step, to_pixels: Step) -> Any:
+    return bend(*to_pixels(*normalise(*points)))
+
+
+def _bent_last_about_the_centre(
+    points: Floats, normalise: Step, bend: Step, to_pixels: Step
+) -> Any:
+    centre = np.reshape(to_pixels(0.0, 0.0, 1.0), (2, 1))
+    return centre + bend(*np.subtract(to_pixels(*normalise(*points)), centre))
+
+
+# What goes wrong in this exercise and in the next.
+_CAMERA: list[tuple[str, str, Step]] = [
+    ("lens", "y_up", lambda fx, fy, cx, cy: (fx, -fy, cx, cy)),
+    ("lens", "fx_fy_swapped", lambda fx, fy, cx, cy: (fy, fx, cx, cy)),
+    ("lens", "fx_for_both", lambda fx, fy, cx, cy: (fx, fx, cx, cy)),
+    ("lens", "cx_cy_swapped", lambda fx, fy, cx, cy: (fx, fy, cy, cx)),
+    ("lens", "principal_point_forgotten", lambda fx, fy, cx, cy: (fx, fy, 0.0, 0.0)),
+    ("lens", "half_pixel", lambda fx, fy, cx, cy: (fx, fy, cx + 0.5, cy + 0.5)),
+    ("lens", "half_pixel", lambda fx, fy, cx, cy: (fx, fy, cx - 0.5, cy - 0.5)),
     ("read", "p1_p2_swapped", lambda k1, k2, p1, p2, k3: (k1, k2, p2, p1, k3)),
     ("read", "k3_before_p1", lambda k1, k2, p1, p2, k3: (k1, k2, p2, k3, p1)),
     ("read", "r6_missing", lambda k1, k2, p1, p2, k3: (k1, k2, p1, p2, 0.0)),
@@ -197,54 +180,29 @@ PROJECT.add_mistakes(
     ("bend", "factor_2_missing", _bent(cross=1)),
     ("bend", "factor_2_missing", _bent(square=1)),
     ("bend", "factor_2_missing", _bent(cross=1, square=1)),
-    (
-        "bend",
-        "x_overwritten",
-        lambda x, y, *dist: (
-            _bend(x, y, *dist)[0],
-            _bend(x, y, *dist)[1] + 2 * dist[3] * (_bend(x, y, *dist)[0] - x) * y,
-        ),
-    ),
-    (
-        "bend",
-        "tangential_after_radial",
-        _tangential_after_radial,
-    ),
-    ("bend", "one_missing", _bent(one=0)),
+    ("bend", "x_overwritten", _x_overwritten),
+    ("bend", "tangential_after_radial", _tangential_after_radial),
     ("bend", "r_for_r2", _bent((0.5, 1, 1.5))),
     ("bend", "r_for_r2", _bent((0.5, 1, 1.5), tangential=0.5)),
     ("bend", "r2_for_r", _bent((2, 4, 6))),
     ("bend", "r2_for_r", _bent((2, 4, 6), tangential=2)),
     ("bend", "r2_for_r", _bent((1, 4, 6))),
-    (
-        "image",
-        "bent_before_division",
-        lambda points, normalise, bend, to_pixels: to_pixels(
-            *(np.stack(bend(*points[:2])) / points[2]), 1.0
-        ),
-    ),
-    (
-        "image",
-        "distortion_in_pixels",
-        lambda points, normalise, bend, to_pixels: bend(*to_pixels(*normalise(*points))),
-    ),
-    (
-        "image",
-        "distortion_in_pixels",
-        lambda points, normalise, bend, to_pixels: np.add(
-            np.reshape(to_pixels(0.0, 0.0, 1.0), (2, 1)),
-            bend(
-                *np.subtract(
-                    to_pixels(*normalise(*points)), np.reshape(to_pixels(0.0, 0.0, 1.0), (2, 1))
-                )
-            ),
-        ),
-    ),
-    ("columns", "output_swapped", lambda u, v: np.stack([v, u], axis=1)),
-    ("columns", "rounded", lambda u, v: np.rint(np.stack([u, v], axis=1))),
-    ("columns", "rounded", lambda u, v: np.trunc(np.stack([u, v], axis=1))),
-    ("columns", "half_pixel", lambda u, v: np.stack([u, v], axis=1) + 0.5),
-    ("columns", "half_pixel", lambda u, v: np.stack([u, v], axis=1) - 0.5),
+]
+PROJECT.add_mistakes(
+    ("normalise", "no_division", lambda X, Y, Z: (X, Y, 1.0)),
+    ("normalise", "no_division", lambda X, Y, Z: (X, Y, Z)),
+    ("normalise", "divided_by_range", lambda *P: (*(P[:2] / np.linalg.norm(P, axis=0)), 1.0)),
+    ("normalise", "centre_divided", lambda X, Y, Z: (X / Z, Y / Z, 1.0 / Z)),
+    ("normalise", "upside_down", lambda X, Y, Z: (Z / X, Z / Y, 1.0)),
+    ("normalise", "y_up", lambda X, Y, Z: (X / Z, -Y / Z, 1.0)),
+    ("lens", "centre_before_scale", lambda fx, fy, cx, cy: (fx, fy, fx * cx, fy * cy)),
+    ("lens", "principal_point_subtracted", lambda fx, fy, cx, cy: (fx, fy, -cx, -cy)),
+    ("to_pixels", "K_transposed", _transposed),
+    *_CAMERA,
+    ("bend", "one_missing", lambda x, y, *dist: np.subtract(_bend(x, y, *dist), (x, y))),
+    ("image", "bent_before_division", _bent_first),
+    ("image", "distortion_in_pixels", _bent_last),
+    ("image", "distortion_in_pixels", _bent_last_about_the_centre),
 )
 
 
@@ -278,7 +236,7 @@ def _scale(x: Floats, y: Floats, w: Any, depth: Floats) -> Any:
 
 def _build_deproject(steps: Mapping[str, Step]) -> Model:
     def deproject(pixels: Floats, depth: Floats, K: Floats, dist: Floats | None = None) -> Any:
-        x, y, w = steps["rays"](*pixels.T, *_lens(K))
+        x, y, w = steps["rays"](*pixels.T, *steps["lens"](*_lens(K)))
         if dist is not None:
             read = steps["read"](*dist)
             x, y = steps["unbend"](x, y, lambda x, y: steps["bend"](x, y, *read), *read)
@@ -307,8 +265,9 @@ DEPROJECT = Exercise(
     name="pinhole.deproject",
     build=_build_deproject,
     steps={
+        "lens": PROJECT.steps["lens"],
         "rays": _to_normalised,
-        "read": lambda *dist: dist,
+        "read": PROJECT.steps["read"],
         "bend": _bend,
         "unbend": _iterate(40),
         "scale": _scale,
@@ -325,22 +284,13 @@ DEPROJECT = Exercise(
         (_PIXELS, _DEPTHS, GENERIC_K, MIXED),
     ],
     per_row=2,
+    parts=("X", "Y", "Z"),
     unit="m",
     tolerance=1e-5,
     describe=_describe_deproject,
     show=lambda row: _tuple(row, ".4f"),
     core=Core(of=lambda args: args[:3], which="without distortion", rest="`dist`"),
 )
-
-
-# The coefficients and the equation: what goes wrong in the first exercise does so in this one. But
-# without its 1 the radial factor has no inverse that an iteration would find.
-
-DEPROJECT.mistakes += [
-    m for m in PROJECT.mistakes if m.step in ("read", "bend") and m.name != "one_missing"
-]
-
-# The inversion.
 
 
 def _divide(rounds: int) -> Step:
@@ -352,8 +302,8 @@ def _divide(rounds: int) -> Step:
         for _ in range(rounds):
             r2 = x * x + y * y
             radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-            dx, dy = _bent(one=0)(x, y, 0.0, 0.0, p1, p2, 0.0)
-            x, y = (xd - dx) / radial, (yd - dy) / radial
+            tangential = np.subtract(_bend(x, y, 0.0, 0.0, p1, p2, 0.0), (x, y))
+            x, y = np.subtract((xd, yd), tangential) / radial
         return x, y
 
     return unbend
@@ -371,54 +321,30 @@ def _overwritten(rounds: int) -> Step:
     return unbend
 
 
+def _from_the_wrong_side(u: Floats, v: Floats, fx: float, fy: float, cx: float, cy: float) -> Any:
+    return u / fx, v / fy, 1 - cx / fx * u - cy / fy * v
+
+
+def _from_the_wrong_side_scaled(u: Floats, v: Floats, *lens: float) -> Any:
+    x, y, w = _from_the_wrong_side(u, v, *lens)
+    return x / w, y / w, 1.0
+
+
+def _along_the_ray(x: Floats, y: Floats, w: Any, depth: Floats) -> Any:
+    return _scale(x, y, w, depth / np.sqrt(x**2 + y**2 + w**2))
+
+
 DEPROJECT.add_mistakes(
     ("rays", "inverse_missing", lambda u, v, *lens: (*_to_pixels(u, v, 1.0, *lens), 1.0)),
-    (
-        "rays",
-        "inverse_transposed",
-        lambda u, v, fx, fy, cx, cy: (u / fx, v / fy, 1 - cx / fx * u - cy / fy * v),
-    ),
-    (
-        "rays",
-        "inverse_transposed",
-        lambda u, v, fx, fy, cx, cy: (
-            *(np.stack([u / fx, v / fy]) / (1 - cx / fx * u - cy / fy * v)),
-            1.0,
-        ),
-    ),
-    (
-        "rays",
-        "principal_point_forgotten",
-        lambda u, v, fx, fy, cx, cy: _to_normalised(u, v, fx, fy, 0.0, 0.0),
-    ),
-    (
-        "rays",
-        "principal_point_added",
-        lambda u, v, fx, fy, cx, cy: _to_normalised(u, v, fx, fy, -cx, -cy),
-    ),
-    ("rays", "brackets_missing", lambda u, v, fx, fy, cx, cy: (u - cx / fx, v - cy / fy, 1.0)),
-    (
-        "rays",
-        "times_focal_length",
-        lambda u, v, fx, fy, cx, cy: _to_normalised(u, v, 1 / fx, 1 / fy, cx, cy),
-    ),
-    ("rays", "fx_fy_swapped", lambda u, v, fx, fy, cx, cy: _to_normalised(u, v, fy, fx, cx, cy)),
-    ("rays", "fx_for_both", lambda u, v, fx, fy, cx, cy: _to_normalised(u, v, fx, fx, cx, cy)),
-    ("rays", "cx_cy_swapped", lambda u, v, fx, fy, cx, cy: _to_normalised(u, v, fx, fy, cy, cx)),
-    ("rays", "input_swapped", lambda u, v, *lens: _to_normalised(v, u, *lens)),
-    ("rays", "y_up", lambda u, v, fx, fy, cx, cy: _to_normalised(u, v, fx, -fy, cx, cy)),
-    ("rays", "half_pixel", lambda u, v, *lens: _to_normalised(u + 0.5, v + 0.5, *lens)),
-    ("rays", "half_pixel", lambda u, v, *lens: _to_normalised(u - 0.5, v - 0.5, *lens)),
-    (
-        "scale",
-        "depth_along_ray",
-        lambda x, y, w, depth: _scale(x, y, w, depth / np.hypot(w, np.hypot(x, y))),
-    ),
-    ("scale", "millimetres", lambda x, y, w, depth: _scale(x, y, w, 1000 * depth)),
-    ("scale", "millimetres", lambda x, y, w, depth: _scale(x, y, w, depth / 1000)),
+    ("rays", "inverse_transposed", _from_the_wrong_side),
+    ("rays", "inverse_transposed", _from_the_wrong_side_scaled),
+    ("lens", "principal_point_added", lambda fx, fy, cx, cy: (fx, fy, -cx, -cy)),
+    ("lens", "brackets_missing", lambda fx, fy, cx, cy: (1.0, 1.0, cx / fx, cy / fy)),
+    ("lens", "times_focal_length", lambda fx, fy, cx, cy: (1 / fx, 1 / fy, cx, cy)),
+    *_CAMERA,
+    ("scale", "depth_along_ray", _along_the_ray),
     ("scale", "not_scaled", lambda x, y, w, depth: (x, y, w * depth)),
     ("scale", "divided_by_depth", lambda x, y, w, depth: (x / depth, y / depth, w * depth)),
-    ("scale", "depth_forgotten", lambda x, y, w, depth: (x, y, w * np.ones_like(depth))),
     ("unbend", "distorted_again", lambda x, y, bend, *dist: bend(x, y)),
     ("unbend", "one_step", _iterate(1)),
     ("unbend", "one_step", _divide(1)),

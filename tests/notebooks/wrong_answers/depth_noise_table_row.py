@@ -29,7 +29,7 @@ def pixel_by_pixel(counts, scale, distance):
     return sum(levels) / len(levels) - 1000 * distance, (squares / dof) ** 0.5, holes
 
 
-@wrong("several, first bias_sign")
+@wrong("several, first negative")
 def two_mistakes(counts, scale, distance):
     bias, std, invalid = whole_arrays(counts, scale, distance)
     return -bias, std, 100 * invalid

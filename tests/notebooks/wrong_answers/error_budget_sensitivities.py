@@ -14,7 +14,7 @@ def with_the_slope(u, Z, fx, cx, depth_error):
     return np.array([Z / fx, slope, slope * depth_error])
 
 
-@wrong("upside_down")
+@wrong("reciprocal")
 def pixels_per_metre(u, Z, fx, cx, depth_error):
     X = (u - cx) * Z / fx
     du = (fx * (X + 1e-3) / Z + cx - u) / 1e-3
