@@ -114,7 +114,8 @@ def _add_grade(command: Callable[..., Any]) -> None:
     lines = """the three commonest lines:
   coursekit grade submissions.zip
   coursekit grade submissions.zip --roster class.csv --late-after 2026-03-02T23:59
-  coursekit grade submissions.zip --overwrite       (after your own points, or more hand-ins)
+  the same again with --overwrite       (after your own points, or more hand-ins)
+then: index.html is to read, own_points.csv is yours, moodle.csv or canvas.csv to import
 """
     raw = argparse.RawDescriptionHelpFormatter
     shape = {"description": more, "epilog": lines, "formatter_class": raw}
