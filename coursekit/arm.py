@@ -40,6 +40,7 @@ from coursekit.arrays import ArrayLike, Floats, Mask
 from coursekit.checks import array, choice, number, transforms, want, whole
 from coursekit.geometry import cross_matrix, invert_transform, make_transform, pose_difference
 from coursekit.specifications import DATA
+from coursekit.words import say
 
 Tool = Literal["gripper", "flange"]
 
@@ -131,12 +132,10 @@ class Arm:
         if outside.size:
             *index, j = outside[0].tolist()
             where = f"q[{', '.join(map(str, index))}]" if index else "q"
-            degrees = np.abs(q).max() > 2 * np.pi
-            raise ValueError(
-                f"{where}: {self.joints[j]} is at {q[(*index, j)]:.4f} rad, want "
-                f"{self.limits[j, 0]:.4f} to {self.limits[j, 1]:.4f} rad"
-                + (" (are these degrees?)" if degrees else "")
-            )
+            joint, (low, high) = self.joints[j], self.limits[j].tolist()
+            degrees = " (are these degrees?)" * bool(np.abs(q).max() > 2 * np.pi)
+            at = {"joint": joint, "at": q[(*index, j)], "low": low, "high": high}
+            raise ValueError(say("others.outside", where=where, degrees=degrees, **at))
         return q
 
     def within_limits(self, q: ArrayLike) -> Mask:
@@ -253,13 +252,7 @@ def _damped_step(J: Floats, miss: Floats) -> Floats:
 @cache
 def widowx() -> Arm:
     """The WidowX AI follower arm with its wrist camera, from data/wxai.json; arrays read-only."""
-    path = DATA / "wxai.json"
-    if not path.is_file():
-        raise ValueError(
-            f"{path} is missing: coursekit reads it from the course's folder, "
-            "so install the course with `python3 course.py lab`"
-        )
-    table = json.loads(path.read_text("utf-8"))
+    table = json.loads((DATA / "wxai.json").read_text("utf-8"))
     joints = table["joints"]
     T_flange_gripper = _chain(table["gripper"])
     arm = Arm(

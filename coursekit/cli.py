@@ -1,7 +1,7 @@
 """The command `coursekit`.
 
 It calls what a notebook would, by the same names: `ck` loads a room when it is first used, so that
-`coursekit --help` does not wait for all of them.
+`coursekit --help` does not wait for all of them. The options stand in cli.toml.
 """
 
 from __future__ import annotations
@@ -9,19 +9,19 @@ from __future__ import annotations
 import argparse
 import io
 import sys
+import tomllib
 from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 import coursekit as ck
 from coursekit import doctor
+from coursekit.words import say
 
 OPTIONS = {"path": "--out", "n": "--frames", "which": "--camera", "distance_m": "--distance"}
 OPTIONS |= {f"{name}_m": f"--{name}-mm (here in m)" for name in ("square", "marker")}
 OPTIONS |= {name: f"--{name}" for name in ("squares", "paper", "dictionary", "workers", "timeout")}
 INSTEAD = {"overwrite=True": "--overwrite", "run this cell again": "run this again"}
-CAMERAS = "auto (default), simulated, a serial number or a recording"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -60,107 +60,19 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="coursekit", description="The course's tools.")
     parser.add_argument("--version", action="store_true", help="say which course this is, and end")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-
-    def command(name: str, run: Callable[..., Any], says: str, **more: Any) -> Any:
-        added = commands.add_parser(name, help=says, **more)
-        added.set_defaults(run=run)
-        return added
-
-    the = command("record", _record, "record a camera to a .db3 file")
-    the.add_argument("--out", required=True, metavar="FILE", help="the .db3 file to write")
-    the.add_argument("--frames", required=True, type=int, metavar="N", help="how many frames")
-    the.add_argument("--camera", default="auto", metavar="WHICH", help=CAMERAS)
-    the.add_argument("--overwrite", action="store_true", help="replace an existing file")
-
-    the = command("board", _board, "print a calibration board to true scale")
-    kinds = "charuco (default): chessboard with markers, may be seen in part"
-    the.add_argument("--kind", choices=("checkerboard", "charuco"), default="charuco", help=kinds)
-    squares = "columns x rows of squares (inner corners are one fewer each way)"
-    the.add_argument("--squares", required=True, type=_squares, metavar="9x6", help=squares)
-    side = "the side of a square"
-    the.add_argument("--square-mm", required=True, type=float, metavar="MM", help=side)
-    the.add_argument("--marker-mm", type=float, metavar="MM", help="default: 0.75 of a square")
-    the.add_argument("--dictionary", metavar="NAME", help="of a ChArUco board's markers")
-    the.add_argument("--paper", default="A4", metavar="NAME", help="A4 (default) to A0, Letter")
-    the.add_argument("--out", required=True, metavar="FILE", help="a .pdf or .png file to write")
-    the.add_argument("--overwrite", action="store_true", help="replace an existing file")
-
-    the = command("submit", _submit, "pack the studio exercise to hand it in")
-    the.add_argument("--student", required=True, metavar="NAME", help="as your course knows it")
-    the.add_argument("--distance", type=float, metavar="M", help="where the camera will be, m")
-    the.add_argument("--frames", type=int, default=1, metavar="N", help="averaged there")
-    choices = ("bias", "noise")
-    the.add_argument("--dominates", type=str.lower, choices=choices, help="which error, there")
-    says = "what your own table does with samples far from all others of their pixel"
-    the.add_argument("--mismatches", choices=("kept", "left out"), help=says)
-    words = the.add_mutually_exclusive_group()
-    words.add_argument("--paragraph", default="", metavar="TEXT", help="three sentences: why")
-    words.add_argument("--paragraph-file", metavar="FILE", help="a text file that holds them")
-    the.add_argument("--folder", metavar="DIR", help="where to write, default: results/")
-    the.add_argument("--overwrite", action="store_true", help="replace an existing bundle")
-
-    _add_grade(command)
-    _add_export(command)
-    _add_doctor(command)
+    table = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
+    table["export"]["options"]["--to"]["help"] = "/".join(ck.results.EXPORTS)
+    for name, about in table.items():
+        options, either = about.pop("options"), about.pop("either", [])
+        if "epilog" in about:  # whose lines stay as they are
+            about["formatter_class"] = argparse.RawDescriptionHelpFormatter
+        command = commands.add_parser(name, **about)
+        command.set_defaults(run=RUN[name])
+        group = command.add_mutually_exclusive_group() if either else command
+        for option, how in options.items():
+            types = {"type": TYPES[how["type"]]} if "type" in how else {}
+            (group if option in either else command).add_argument(option, **how | types)
     return parser
-
-
-def _add_grade(command: Callable[..., Any]) -> None:
-    more = (
-        "Grade every bundle (.zip) in a folder and below it, or in the zip that Moodle or Canvas "
-        "makes. Stopped with Ctrl-C, the same command goes on from there. Nothing that a student "
-        "wrote is run."
-    )
-    lines = """the three commonest lines:
-  coursekit grade submissions.zip
-  coursekit grade submissions.zip --roster class.csv --late-after 2026-03-02T23:59
-  the same again with --overwrite       (after your own points, or more hand-ins)
-then: index.html is to read, own_points.csv is yours, moodle.csv or canvas.csv to import
-"""
-    raw = argparse.RawDescriptionHelpFormatter
-    shape = {"description": more, "epilog": lines, "formatter_class": raw}
-    the = command("grade", _grade, "grade a folder of bundles", **shape)
-    the.add_argument("folder", metavar="FOLDER", help="what students handed in, or a .zip of it")
-    the.add_argument("--out", metavar="DIR", help="the report: a new folder, default NAME_report")
-    roster = "a table (CSV) of the class: names, any ids, any more columns"
-    the.add_argument("--roster", metavar="FILE", help=roster)
-    late = "the last moment that is not late, of this computer's zone"
-    the.add_argument("--late-after", type=datetime.fromisoformat, metavar="MOMENT", help=late)
-    the.add_argument("--separator", choices=(",", ";"), default=",", help="of the tables' cells")
-    the.add_argument("--workers", type=int, metavar="N", help="processes, default: one a core")
-    timeout = "seconds of computing a bundle, default: 10"
-    the.add_argument("--timeout", type=float, default=10.0, metavar="S", help=timeout)
-    finished = "replace a finished report; only what has changed is graded"
-    the.add_argument("--overwrite", action="store_true", help=finished)
-
-
-def _add_doctor(command: Callable[..., Any]) -> None:
-    says = "say what works here, and what to do about the rest"
-    more = "A line for each thing that must work: Python, packages, browser, camera and its link."
-    the = command("doctor", lambda o: doctor.run(o.camera, o.json), says, description=more)
-    the.add_argument("--camera", default="auto", metavar="WHICH", help=CAMERAS)
-    the.add_argument("--json", action="store_true", help="the same for programs, and for a report")
-
-
-def _export(options: argparse.Namespace) -> None:
-    names = ("parent", "optical", "link", "T_link_optical", "overwrite")
-    frames = {name: getattr(options, name) for name in names}
-    print(ck.export(options.what, options.to, options.out, **frames))
-
-
-def _add_export(command: Callable[..., Any]) -> None:
-    more = "A lens, or where the camera is, as other programs read it (the README has a table)."
-    the = command("export", _export, "write a result for ROS, OpenCV and others", description=more)
-    what = "03_intrinsics, 04_hand_eye, or a file of a lens"
-    the.add_argument("what", metavar="WHAT", help=what)
-    the.add_argument("--to", required=True, metavar="FORMAT", help="/".join(ck.results.EXPORTS))
-    the.add_argument("--out", metavar="FILE", help="default: print it")
-    the.add_argument("--parent", metavar="FRAME", help="what X is given in, default: the gripper")
-    the.add_argument("--optical", metavar="FRAME", default=ck.results.OPTICAL)
-    the.add_argument("--link", metavar="FRAME", help="of the driver, above the optical frame")
-    pose = "where optical is in link, m: 'turn', or 'x y z qx qy qz qw' as tf2_echo says"
-    the.add_argument("--link-to-optical", dest="T_link_optical", metavar="POSE", help=pose)
-    the.add_argument("--overwrite", action="store_true", help="replace an existing file")
 
 
 def _squares(text: str) -> tuple[int, int]:
@@ -195,10 +107,7 @@ def _submit(options: argparse.Namespace) -> None:
         try:
             paragraph = Path(options.paragraph_file).read_text(encoding="utf-8-sig")
         except UnicodeDecodeError:
-            raise ValueError(
-                f"{options.paragraph_file}: is no plain text in UTF-8; save it as that (in Word or "
-                "Notepad: plain text, encoding UTF-8) and try again"
-            ) from None
+            raise ValueError(say("others.not_text", file=options.paragraph_file)) from None
     claims = options.distance, options.dominates, paragraph, options.frames
     where = options.folder, options.overwrite, options.mismatches
     handed = ck.submit(options.student, *claims, *where)
@@ -214,6 +123,34 @@ def _grade(options: argparse.Namespace) -> None:
     how = options.folder, options.out, options.workers, options.timeout
     choices = Choices(options.roster, options.late_after, options.separator)
     print(grade_folder(*how, overwrite=options.overwrite, choices=choices))
+
+
+def _export(options: argparse.Namespace) -> None:
+    names = ("parent", "optical", "link", "T_link_optical", "overwrite")
+    frames = {name: getattr(options, name) for name in names}
+    given = {name: value for name, value in frames.items() if value is not None}
+    print(ck.export(options.what, options.to, options.out, **given))
+
+
+def _doctor(options: argparse.Namespace) -> int:
+    return doctor.run(options.camera, options.json)
+
+
+TYPES = {
+    "int": int,
+    "float": float,
+    "lower": str.lower,
+    "moment": datetime.fromisoformat,
+    "squares": _squares,
+}
+RUN: dict[str, Callable[[argparse.Namespace], int | None]] = {
+    "record": _record,
+    "board": _board,
+    "submit": _submit,
+    "grade": _grade,
+    "export": _export,
+    "doctor": _doctor,
+}
 
 
 if __name__ == "__main__":

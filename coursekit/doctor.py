@@ -5,7 +5,8 @@ so that a broken installation gets its line too: where `coursekit` itself does n
 `python -m coursekit.doctor` does.
 
 A check is a function that yields what it found: a verdict, a sentence, and a remedy. The tables
-COMPUTER and FIGURES, at the end of their sections, give each its name and its turn.
+COMPUTER and FIGURES, at the end of their sections, give each its name and its turn; the sentences
+stand in doctor.toml.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ import sys
 import tempfile
 import textwrap
 import time
+import tomllib
 import webbrowser
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -52,18 +54,8 @@ LEAST_FRAMES_FOR_NOISE = 5
 USUAL_VALID, HARDLY_VALID = 0.60, 0.05
 USUAL_NOISE_PX = (0.03, 0.20)  # one pixel's disparity over time: data/published_depth_noise.json
 
-INSTALL = (
-    "run `python3 course.py lab` again, which mends `.venv`; in an environment of your own, "
-    "`pip install -r requirements.txt`"
-)
-FACTORY = (
-    "the factory calibration looks damaged: restore it with the vendor's tools (RealSense Viewer, "
-    "On-Chip Calibration, or Dynamic Calibrator), and measure it yourself in notebook 3"
-)
-LIGHTEN = (
-    "point the camera at something with texture, 0.3 to 2 m away, neither shiny nor black; clean "
-    "the front glass and take its film off; leave the projector on"
-)
+DOCTOR_TEXTS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
+MOST_PACKAGES = 5  # that a line lists
 
 
 @dataclass(frozen=True)
@@ -92,6 +84,16 @@ class CheckUp:
 Check = Callable[..., CheckUp | Iterable[CheckUp] | None]
 
 
+def found(what: str, good: bool = False, check: str = "", **facts: Any) -> CheckUp:
+    """What doctor.toml has under this name: verdict, sentence and remedy, with the facts in them.
+
+    good: whether all is well, so that the sentence alone is said. check: see `CheckUp`.
+    """
+    verdict, *texts = DOCTOR_TEXTS["findings"][what]
+    says, remedy = (text.format(**DOCTOR_TEXTS["shared"], **facts) for text in [*texts, ""][:2])
+    return CheckUp("ok", says, "", check) if good else CheckUp(verdict, says, remedy, check)
+
+
 def run(camera: str = "auto", as_json: bool = False) -> int:
     """Print a line for each check as it is made; 0 when nothing is a problem, 1 otherwise.
 
@@ -104,11 +106,11 @@ def run(camera: str = "auto", as_json: bool = False) -> int:
         return int(any(line.verdict == "problem" for line in lines))
     if isinstance(sys.stdout, io.TextIOWrapper):  # a pipe on Windows cannot show every letter
         sys.stdout.reconfigure(errors="replace")
-    found = Counter[Condition]()
+    verdicts = Counter[Condition]()
     for line in checks(camera):
         print(line, flush=True)
-        found[line.verdict] += 1
-    if problems := found["problem"]:
+        verdicts[line.verdict] += 1
+    if problems := verdicts["problem"]:
         print(f"\n{problems} problem{'s' * (problems > 1)}: do what stands there, and ask again.")
         return 1
     print("\nNothing is in the way. `python3 course.py lab` opens the notebooks.")
@@ -125,41 +127,31 @@ def checks(camera: str = "auto") -> Iterator[CheckUp]:
 def _named(name: str, check: Check, *about: Any) -> Iterator[CheckUp]:
     """What a check finds, under its name, and one more line when it fails on the way."""
     try:
-        found = check(*about)
-        for line in [found] if isinstance(found, CheckUp) else found or ():
+        lines = check(*about)
+        for line in [lines] if isinstance(lines, CheckUp) else lines or ():
             yield replace(line, check=line.check or name)
     except Exception as error:  # whatever a broken environment makes it raise
-        says = f"could not be checked ({type(error).__name__}: {error})"
-        remedy = f"mend the problems above first, if there are any; else {INSTALL}"
-        yield CheckUp("problem", says, remedy, name)
-
-
-def _ok_if(good: bool, says: str, remedy: str, otherwise: Condition = "note") -> CheckUp:
-    return CheckUp("ok", says) if good else CheckUp(otherwise, says, remedy)
+        yield found("not_checked", check=name, error=f"{type(error).__name__}: {error}")
 
 
 # ---- the computer -------------------------------------------------------------------------------
 
 
 def _python() -> CheckUp:
-    version = ".".join(map(str, sys.version_info[:3]))
-    says = f"{version} on {platform.system()} {platform.machine()}, in {sys.prefix}"
-    install = f"install Python {'.'.join(map(str, NEWEST_TESTED))} for 64 bits and begin again"
-    if sys.version_info < OLDEST:
-        wanted = ".".join(map(str, OLDEST))
-        return CheckUp("problem", f"{says}: too old, want {wanted} or newer", install)
-    elif sys.maxsize < 2**32:
-        return CheckUp("problem", f"{says}: a 32-bit Python, it lacks the packages", install)
-    elif sys.version_info[:2] >= TOO_NEW:
-        return CheckUp("problem", f"{says}: too new, some packages do not exist for it", install)
-    elif (computer := (sys.platform, platform.machine())) in WITHOUT_PACKAGES:
-        lacks, runs = WITHOUT_PACKAGES[computer]
-        remedy = f"install {runs}; or use another computer, or a hub"
-        return CheckUp("problem", f"{says}: some packages do not exist for {lacks}", remedy)
-    elif sys.version_info[:2] > NEWEST_TESTED:
-        return CheckUp("note", f"{says}: newer than what the course was tested with", install)
-    else:
-        return CheckUp("ok", says)
+    computer, running = (sys.platform, platform.machine()), sys.version_info
+    lacks, runs = WITHOUT_PACKAGES.get(computer, ("", ""))
+    faults = {
+        "python_old": running < OLDEST,
+        "python_32": sys.maxsize < 2**32,
+        "python_new": running[:2] >= TOO_NEW,
+        "python_lacks": lacks,
+        "python_untested": running[:2] > NEWEST_TESTED,
+    }
+    what = next((fault for fault, there in faults.items() if there), "python")
+    oldest, newest, version = (".".join(map(str, v)) for v in (OLDEST, NEWEST_TESTED, running[:3]))
+    python = f"{version} on {platform.system()} {platform.machine()}, in {sys.prefix}"
+    another = f"install Python {newest} for 64 bits and begin again"
+    return found(what, python=python, oldest=oldest, another=another, lacks=lacks, runs=runs)
 
 
 def edition() -> str:
@@ -190,25 +182,23 @@ def _packages() -> Iterator[CheckUp]:
     from packaging.markers import Marker
 
     if not PINS.exists():
-        yield CheckUp("note", f"no {PINS.name} beside the course: nothing to compare with")
+        yield found("no_pins", file=PINS.name)
         return
     wanted = [pin for pin in pins(PINS) if not pin.marker or Marker(pin.marker).evaluate()]
-    found = {pin.name: _version(pin.name) for pin in wanted}
-    missing = [pin.name for pin in wanted if not found[pin.name]]
+    there = {pin.name: _version(pin.name) for pin in wanted}
     others = [
-        f"{pin.name} {found[pin.name]} (tested with {pin.version})"
+        f"{pin.name} {there[pin.name]} (tested with {pin.version})"
         for pin in wanted
-        if found[pin.name] not in (pin.version, "")
+        if there[pin.name] not in (pin.version, "")
     ]
-    broken = _out_of_range()
-    if missing:
-        yield CheckUp("problem", f"not installed: {_some(missing)}", INSTALL)
-    if broken:
-        yield CheckUp("problem", f"do not suit the course: {_some(broken)}", INSTALL)
-    if others:
-        yield CheckUp("note", f"other versions than the tested ones: {_some(others)}", INSTALL)
-    if not missing and not broken and not others:
-        yield CheckUp("ok", f"all {len(wanted)} as pinned in {PINS.name}")
+    missing = [name for name, version in there.items() if not version]
+    faults = {"missing": missing, "unsuited": _out_of_range(), "others": others}
+    for what, names in faults.items():
+        if names:
+            more = f" and {len(names) - MOST_PACKAGES} more" if len(names) > MOST_PACKAGES else ""
+            yield found(what, names=", ".join(names[:MOST_PACKAGES]) + more)
+    if not any(faults.values()):
+        yield found("pinned", count=len(wanted), file=PINS.name)
 
 
 def _version(name: str) -> str:
@@ -216,12 +206,6 @@ def _version(name: str) -> str:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
         return ""
-
-
-def _some(names: list[str], most: int = 5) -> str:
-    """The first of a list in words."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
 
 
 def _out_of_range() -> list[str]:
@@ -248,19 +232,20 @@ def _loading() -> CheckUp:
         except Exception as error:
             why = str(error).splitlines()[0] if str(error) else type(error).__name__
             failed.append(f"{name} does not load ({why})")
-    says = "; ".join(failed) or f"{', '.join(LOADED)} load"
-    return _ok_if(not failed, says, INSTALL, "problem")
+    return found("loading", not failed, says="; ".join(failed) or f"{', '.join(LOADED)} load")
 
 
 def _opencv() -> CheckUp:
     """Whether one package brings cv2, and it is what was loaded: of two the last one wins."""
     import cv2
 
-    brings = sorted(set(metadata.packages_distributions().get("cv2", ())))
-    says = f"cv2 {cv2.__version__} comes from {' and '.join(brings) or 'no package'}"
-    good = len(brings) == 1 and _version(brings[0]).startswith(cv2.__version__)
-    away = f"`pip uninstall {' '.join(brings)}`, then {INSTALL}"
-    return _ok_if(good and hasattr(cv2, "calibrateHandEye"), says, away, "problem")
+    packages = sorted(set(metadata.packages_distributions().get("cv2", ())))
+    good = len(packages) == 1 and _version(packages[0]).startswith(cv2.__version__)
+    good &= hasattr(cv2, "calibrateHandEye")
+    brings = " and ".join(packages) or "no package"
+    return found(
+        "opencv", good, version=cv2.__version__, brings=brings, packages=" ".join(packages)
+    )
 
 
 def _kernel() -> CheckUp:
@@ -270,35 +255,25 @@ def _kernel() -> CheckUp:
     try:
         spec = KernelSpecManager().get_kernel_spec("python3")
     except NoSuchKernel:
-        return CheckUp("problem", "there is no kernel python3 for the notebooks", INSTALL)
+        return found("no_kernel")
     command = Path(spec.argv[0])
     if command.name == spec.argv[0] and command.stem.startswith("python"):
-        return CheckUp("ok", "python3 is the Python that JupyterLab runs with")
+        return found("kernel_of_lab")
     with contextlib.suppress(OSError):  # in one folder: a resolved link would lead out of a .venv
         if command.parent.samefile(Path(sys.executable).parent):
-            return CheckUp("ok", "python3 is this environment's Python")
-    return CheckUp(
-        "problem",
-        f"the kernel python3 in {spec.resource_dir} starts another Python, {command}",
-        "`jupyter kernelspec remove python3` takes it away; or open the notebooks with "
-        "`python3 course.py lab`, which takes its own first",
-    )
+            return found("kernel")
+    return found("other_kernel", folder=spec.resource_dir, command=command)
 
 
 def _browser() -> CheckUp:
-    elsewhere = (
-        "`python3 course.py lab` prints an address: open it in a browser on this computer, or from "
-        "another one through `ssh -L PORT:localhost:PORT ...`, PORT being the number in it"
-    )
     if "JUPYTERHUB_SERVICE_PREFIX" in os.environ:
-        return CheckUp("ok", "a hub serves the notebooks to the browser that you have open")
+        return found("hub")
     if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
-        return CheckUp("note", "this computer has no screen to show one on", elsewhere)
+        return found("no_browser", why="this computer has no screen to show one on")
     try:
-        name = getattr(webbrowser.get(), "name", "") or "the system's own"
+        return found("browser", name=getattr(webbrowser.get(), "name", "") or "the system's own")
     except webbrowser.Error:
-        return CheckUp("note", "none was found", elsewhere)
-    return CheckUp("ok", f"{name} opens the notebooks")
+        return found("no_browser", why="none was found")
 
 
 def _results() -> CheckUp:
@@ -311,16 +286,9 @@ def _results() -> CheckUp:
         with tempfile.TemporaryFile(dir=there):
             free = shutil.disk_usage(there).free
     except OSError as error:
-        return CheckUp(
-            "problem",
-            f"nothing can be saved in {folder} ({error.strerror or error})",
-            "make the folder writable, copy the course into your home folder, or let the "
-            "environment variable COURSEKIT_RESULTS name a folder of your own",
-        )
-    if free < LEAST_FREE_BYTES:
-        says = f"only {free / 1e6:.0f} MB are free on the disk of {folder}"
-        return CheckUp("problem", says, "delete something")
-    return CheckUp("ok", f"{folder} can be written, {free / 1e9:.1f} GB free")
+        return found("not_writable", folder=folder, why=error.strerror or error)
+    what = "disk_full" if free < LEAST_FREE_BYTES else "results"
+    return found(what, folder=folder, free_mb=free / 1e6, free_gb=free / 1e9)
 
 
 COMPUTER: tuple[tuple[str, Check], ...] = (
@@ -344,7 +312,7 @@ def _cameras(which: str) -> Iterator[CheckUp]:
 
     named = os.environ.get(VARIABLE, "auto") if which == "auto" else which
     if named != which:
-        yield CheckUp("ok", f"{VARIABLE} names {named!r}, so nothing else is looked for")
+        yield found("variable", variable=VARIABLE, named=named)
     if named == "simulated" or Path(named).is_dir():  # a set opens its files, and says so
         yield from _tested(named)
         return
@@ -357,8 +325,7 @@ def _cameras(which: str) -> Iterator[CheckUp]:
         if named == "auto":
             yield from _stand_in()
         return
-    version = getattr(rs, "__version__", "")
-    yield CheckUp("ok", f"pyrealsense2 {version} loads", check="Driver")
+    yield found("driver", check="Driver", version=getattr(rs, "__version__", ""))
     live = named == "auto" or named.isdecimal()
     yield from _live(rs, named) if live else _tested(named)
 
@@ -380,16 +347,14 @@ def _live(rs: Any, named: str) -> Iterator[CheckUp]:
             yield from _named("USB", _device, rs, device)
         yield from _tested(min(serials) if named == "auto" else named)
     else:
-        remedy = "to use one: plug it into a USB 3 port with its own cable, and wait a few seconds"
-        yield CheckUp("note", "no RealSense is plugged in", remedy, "USB")
+        yield found("not_plugged_in", check="USB")
         if sys.platform == "linux":
             yield from _named("udev rules", _udev)
         yield from _stand_in()
 
 
 def _stand_in() -> Iterator[CheckUp]:
-    says = "the simulated camera stands in, which is fine: all of the course works with it"
-    yield CheckUp("note", says)
+    yield found("stand_in")
     yield from _tested("simulated")
 
 
@@ -400,8 +365,7 @@ def _udev() -> CheckUp:
     for folder in UDEV_FOLDERS:
         for rules in folder.glob("*realsense*.rules"):
             return CheckUp("ok", f"{rules}")
-    says = "none for a RealSense: without them only root may use a real camera"
-    return CheckUp("note", says, f"before you plug one in: {UDEV_ADVICE}")
+    return found("no_rules", advice=UDEV_ADVICE)
 
 
 def _device(rs: Any, device: Any) -> Iterator[CheckUp]:
@@ -412,30 +376,13 @@ def _device(rs: Any, device: Any) -> Iterator[CheckUp]:
         return device_info(rs, device, name)
 
     yield CheckUp("ok", f"{told('name') or 'RealSense'}, serial {told('serial_number')}")
-    yield from _named("USB link", _link, told("usb_type_descriptor"))
-    versions = told("firmware_version"), told("recommended_firmware_version")
-    yield from _named("Firmware", _firmware, *versions)
-
-
-def _link(usb: str) -> CheckUp | None:
-    if not usb or usb.startswith("3"):
-        return CheckUp("ok", f"USB {usb}") if usb else None
-    return CheckUp(
-        "problem",
-        f"USB {usb}: too slow for depth and colour together at 30 frames a second",
-        "use a USB 3 port (blue, or marked SS) of the computer itself, not of a hub, and a USB "
-        "3 cable, best its own; push the plug in fast, or turn a USB-C plug over",
-    )
-
-
-def _firmware(own: str, recommended: str) -> CheckUp | None:
-    if not own or not recommended:
-        return None
-    numbers, wanted = (tuple(map(int, re.findall(r"\d+", v))) for v in (own, recommended))
-    if numbers < wanted:
-        says = f"{own}, older than {recommended}, which this version of librealsense wants"
-        return CheckUp("note", says, "update it in the RealSense Viewer (More, Update)")
-    return CheckUp("ok", f"{own}, recommended is {recommended}")
+    if usb := told("usb_type_descriptor"):
+        yield found("link" if usb.startswith("3") else "slow_link", check="USB link", usb=usb)
+    own, recommended = told("firmware_version"), told("recommended_firmware_version")
+    if own and recommended:
+        numbers, wanted = (tuple(map(int, re.findall(r"\d+", v))) for v in (own, recommended))
+        what = "old_firmware" if numbers < wanted else "firmware"
+        yield found(what, check="Firmware", own=own, recommended=recommended)
 
 
 # ---- what a camera reports ----------------------------------------------------------------------
@@ -460,43 +407,32 @@ def _tested(which: str) -> Iterator[CheckUp]:
 def _depth_unit(camera: Any) -> CheckUp:
     from coursekit.cameras.realsense import specified
 
-    says, device = f"{1e3 * camera.depth_scale_m:g} mm a count", specified(camera.name)
+    scale_m, device = camera.depth_scale_m, specified(camera.name)
     if device is None:
-        return CheckUp("ok", f"{says} (usual: 1 mm, of a D405 0.1 mm)")
+        return found("unknown_depth_unit", mm=1e3 * scale_m)
     usual = device.nominal.depth_scale_m
-    good = abs(camera.depth_scale_m / usual - 1) < 1e-3
-    remedy = f"if nobody meant it: camera.set(depth_scale_m={usual:g})"
-    return _ok_if(good, f"{says} (usual: {1e3 * usual:g} mm)", remedy)
+    good = abs(scale_m / usual - 1) < 1e-3
+    return found("depth_unit", good, mm=1e3 * scale_m, usual_mm=1e3 * usual, usual=usual)
 
 
 def _baseline(camera: Any) -> CheckUp:
     from coursekit.cameras.realsense import specified
 
     if camera.baseline_m is None:
-        says = "none: no stereo camera, or a recording without its baseline"
-        remedy = (
-            "sections on disparity use the D435's 50 mm; your noise is fitted as std over distance"
-        )
-        return CheckUp("note", says, remedy)
-    says, device = f"{1e3 * camera.baseline_m:.2f} mm", specified(camera.name)
+        return found("no_baseline")
+    mm, device = 1e3 * camera.baseline_m, specified(camera.name)
     if device is None:
-        return CheckUp("ok", f"{says} (usual: 18 to 95 mm)")
-    nominal = device.nominal.baseline_m
-    good = abs(camera.baseline_m / nominal - 1) < 0.02
-    return _ok_if(good, f"{says} (usual: {1e3 * nominal:g} mm to 2 %)", FACTORY)
+        return found("unknown_baseline", mm=mm)
+    usual_mm = 1e3 * device.nominal.baseline_m
+    return found("baseline", abs(mm / usual_mm - 1) < 0.02, mm=mm, usual_mm=usual_mm)
 
 
 def _matrix(k: Any) -> CheckUp:
     """The factory's K, of an `Intrinsics`, beside what is usual: square pixels, a centred axis."""
     if k is None:
-        says = "there is no colour stream: notebooks 3 and 4 need it"
-        return CheckUp("note", says, "record depth and colour together")
-    says = (
-        f"fx {k.fx:.2f}, fy {k.fy:.2f}, cx {k.cx:.2f}, cy {k.cy:.2f} px at {k.width}x{k.height}, "
-        f"{k.model} (usual: fx = fy to 1 %, the centre within 5 % of the width)"
-    )
+        return found("no_colour")
     off = max(abs(k.cx - (k.width - 1) / 2), abs(k.cy - (k.height - 1) / 2))
-    return _ok_if(abs(k.fx / k.fy - 1) < 0.01 and off < 0.05 * k.width, says, FACTORY)
+    return found("matrix", abs(k.fx / k.fy - 1) < 0.01 and off < 0.05 * k.width, k=k)
 
 
 FIGURES: tuple[tuple[str, Check], ...] = (
@@ -529,35 +465,22 @@ def _depth_test(camera: Any) -> Iterator[CheckUp]:
     if camera.source == "live":
         yield from _named("Frames", _arrival, taken)
     else:
-        says = f"{len(taken)} read in {time.monotonic() - started:.1f} s"
-        yield CheckUp("ok", says, check="Frames")
+        seconds = time.monotonic() - started
+        yield found("frames_read", check="Frames", count=len(taken), seconds=seconds)
     frames = Frames(taken)
-    yield from _named("Filled", _filled, float((frames.depth > 0).mean()))
+    valid = float((frames.depth > 0).mean())
+    what = "filled" if valid > HARDLY_VALID else "hardly_filled"
+    yield found(what, valid >= USUAL_VALID, "Filled", valid=valid, usual=USUAL_VALID)
     yield from _named("Noise", _noise, frames, camera)
 
 
 def _arrival(frames: Sequence[Any]) -> CheckUp:
     """Whether a live camera's frames come in time, on its own clock, so that none is missing."""
-    count = len(frames)
+    count, usual = len(frames), USUAL_FRAMES_PER_S
     seconds = frames[-1].time_s - frames[0].time_s
     lost = frames[-1].number - frames[0].number + 1 - count
-    says = (
-        f"{count} in {seconds:.2f} s, {lost} lost between them "
-        f"(usual: {USUAL_FRAMES_PER_S} a second, none lost)"
-    )
-    rate = (count - 1) / max(seconds, 1e-3)
-    return _ok_if(
-        rate >= 0.8 * USUAL_FRAMES_PER_S and lost <= 0.1 * count,
-        says,
-        "close what keeps the computer or its USB busy, plug the camera in directly, and do not "
-        "run it beside another camera on one hub",
-    )
-
-
-def _filled(valid: float) -> CheckUp:
-    says = f"{valid:.0%} of the pixels have depth (usual: more than {USUAL_VALID:.0%} indoors)"
-    otherwise: Condition = "note" if valid > HARDLY_VALID else "problem"
-    return _ok_if(valid >= USUAL_VALID, says, LIGHTEN, otherwise)
+    good = (count - 1) / max(seconds, 1e-3) >= 0.8 * usual and lost <= 0.1 * count
+    return found("arrival", good, count=count, seconds=seconds, lost=lost, usual=usual)
 
 
 def _noise(frames: Any, camera: Any) -> CheckUp:
@@ -568,19 +491,17 @@ def _noise(frames: Any, camera: Any) -> CheckUp:
     side = min(WINDOW_PX, height, width)
     stats = window_stats(frames, ((width - side) // 2, (height - side) // 2, side, side))
     if stats.invalid_fraction > 0.5:
-        says = f"no depth in the middle of the image ({stats.invalid_fraction:.0%} invalid)"
-        return CheckUp("note", says, LIGHTEN)
+        return found("no_middle", invalid=stats.invalid_fraction)
     if stats.n_frames < LEAST_FRAMES_FOR_NOISE:
-        says = f"{stats.n_frames} frames are too few to tell"
-        return CheckUp("note", says, f"record {TEST_FRAMES} or more")
-    says = f"{1e3 * stats.pixel_std_m:.2f} mm over time for a pixel at {stats.depth_m:.2f} m"
+        return found("few_frames", count=stats.n_frames, wanted=TEST_FRAMES)
+    mm, depth, (low, high) = 1e3 * stats.pixel_std_m, stats.depth_m, USUAL_NOISE_PX
     if camera.baseline_m is None:
-        return CheckUp("ok", says)
-    disparity = camera.depth.fx * camera.baseline_m / stats.depth_m
-    noise_px = disparity * stats.pixel_std_unrounded_m / stats.depth_m
-    low, high = USUAL_NOISE_PX
-    says += f", {noise_px:.3f} px of disparity (usual: {low} to {high} px)"
-    return _ok_if(noise_px <= high, says, f"hold everything still, and {LIGHTEN}")
+        return found("noise_alone", mm=mm, depth=depth)
+    disparity = camera.depth.fx * camera.baseline_m / depth
+    noise_px = disparity * stats.pixel_std_unrounded_m / depth
+    return found(
+        "noise", noise_px <= high, mm=mm, depth=depth, noise_px=noise_px, low=low, high=high
+    )
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from coursekit import kernels
 from coursekit.arrays import ArrayLike, Floats, NDArray
 from coursekit.checks import array, instance, number, positive, transform, transforms, want, whole
 from coursekit.formats.lens import read_lens
+from coursekit.words import say
 
 DISTORTION_MODELS = ("none", "brown_conrady", "inverse_brown_conrady", "modified_brown_conrady")
 # What others call Brown-Conrady; ROS's rational_polynomial is that where k4 to k6 are zero
@@ -240,13 +241,20 @@ def distort(xy: ArrayLike, dist: ArrayLike) -> Floats:
     Source: OpenCV, "Camera Calibration and 3D Reconstruction", with k4..k6 = 0.
     """
     xy = array("xy", xy, (2,), leading=True)
-    k1, k2, p1, p2, k3 = _coefficients("dist", dist)
-    x, y = xy[..., 0], xy[..., 1]
+    return np.stack(bent(xy[..., 0], xy[..., 1], _coefficients("dist", dist)), axis=-1)
+
+
+def bent(x: Floats, y: Floats, lens: Sequence[Any] | Floats) -> tuple[Floats, Floats]:
+    """What `distort` makes of coordinates x and y, (...) each; lens: k1, k2, p1, p2, k3.
+
+    Each of the five is one number or (...): a lens for each point.
+    """
+    k1, k2, p1, p2, k3 = lens
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
     x_bent = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
     y_bent = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
-    return np.stack([x_bent, y_bent], axis=-1)
+    return x_bent, y_bent
 
 
 def undistort(xy: ArrayLike, dist: ArrayLike) -> tuple[Floats, NDArray[np.bool_]]:
@@ -341,8 +349,8 @@ def deproject_image(
     if i.dist is None:
         kernels.deproject_pinhole(image, scale, i.fx, i.fy, i.cx, i.cy, points)
     else:
-        rays = deproject(pixel_grid(*i.size), np.ones(shape), i.K, i.dist)
-        kernels.scale_rays(image, scale, rays, points)
+        z = np.where((image > 0) & (image < np.inf), image, np.nan) * scale
+        points[...] = deproject(pixel_grid(*i.size), np.ones(shape), i.K, i.dist) * z[..., None]
     return points
 
 
@@ -489,10 +497,7 @@ def moved(T: Floats, twists: Floats) -> Floats:
 
 # --- what a camera's numbers must be ---
 
-NO_OTHER = (
-    "rational, thin-prism and fisheye lenses are not supported: undistort the images first "
-    "(cv2.undistort, cv2.fisheye.undistortImage) and use the K of those, without distortion"
-)
+NO_OTHER = say("others.no_other_lens")
 
 
 def _intrinsic_matrix(K: ArrayLike) -> Floats:

@@ -34,19 +34,6 @@ def deproject_pinhole(
 
 
 @njit(cache=True)
-def scale_rays(depth: Any, scale: float, rays: Any, out: Any) -> None:
-    """As `deproject_pinhole`, with the rays (H, W, 3) of a distorted camera at Z = 1."""
-    height, width = depth.shape
-    for v in range(height):
-        for u in range(width):
-            z = depth[v, u] * scale
-            if not (z > 0 and z < np.inf):
-                z = np.nan
-            for k in range(3):
-                out[v, u, k] = rays[v, u, k] * z
-
-
-@njit(cache=True)
 def nearest_footprint(depth: Any, first: Any, last: Any, width: int, height: int) -> Any:
     """Fill each depth pixel's rectangle first..last (H, W, 2), in target px, nearest depth first.
 

@@ -26,6 +26,7 @@ from coursekit.formats import lens as lens_files
 from coursekit.formats import numbers
 from coursekit.formats import poses as pose_files
 from coursekit.geometry import Intrinsics, cross_matrix, invert_transform
+from coursekit.words import say
 
 ROOT = Path(__file__).resolve().parent.parent
 EXPORTS = tuple(dict.fromkeys((*lens_files.LENS_FORMATS, *pose_files.PLACE_FORMATS)))
@@ -339,10 +340,7 @@ def _exportable(what: Any) -> Intrinsics | Placement:
     except ValueError:  # no result of a notebook: a lens, whose reader says what else it is
         return Intrinsics.from_file(path)
     if not (whole := result.lens or result.placement):
-        raise ValueError(
-            f"{path.name}: holds no lens and no place of a camera, as notebooks 03 and 04 keep "
-            "them; of an older course, run the notebook again"
-        )
+        raise ValueError(say("others.nothing_kept", file=path.name))
     return whole
 
 
@@ -368,11 +366,7 @@ def _place_text(
     notes = [f"of {optical}: if a driver publishes its place in a link, name the link instead"]
     if link is not None:
         if T_link_optical is None:
-            raise ValueError(
-                f"T_link_optical: where {optical} is in {link}: 'turn' where both have one origin, "
-                f"else as `ros2 run tf2_ros tf2_echo {link} {optical}` says it, for it may be "
-                "centimetres (a D435's colour camera is 15 mm beside its camera_link)"
-            )
+            raise ValueError(say("others.no_link", optical=optical, link=link))
         T = T_link_optical
         if isinstance(T, str) and T == "turn":
             T = OPTICAL_TURN

@@ -6,6 +6,7 @@ import copy
 import html
 import textwrap
 import time
+import tomllib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from coursekit.arrays import Interval
 from coursekit.checks import is_number, want
 
 Thing = TypeVar("Thing")
+ROOM_TEXTS = tomllib.loads(Path(__file__).with_name("texts.toml").read_text("utf-8"))
 WIDTH = 88  # characters: fits a notebook's output cell; JupyterLab breaks longer lines in mid-word
 
 
@@ -25,6 +27,18 @@ def wrapped(text: str, width: int = WIDTH, first: str = "", indent: str = "  ") 
         kept, width, initial_indent=first, subsequent_indent=indent, break_on_hyphens=False
     )
     return filled.replace("\0", " ")
+
+
+def say(sentence: str, /, **facts: Any) -> str:
+    """A sentence of texts.toml, by "room.name", with the facts in its places.
+
+    Raises KeyError for a sentence or a fact that is not there.
+
+    >>> say("cameras.closed", what="the camera")
+    'the camera is closed: open it again with open_camera()'
+    """
+    room, name = sentence.split(".")
+    return str(ROOM_TEXTS[room][name].format(**facts))
 
 
 def with_notes(text: str, notes: Sequence[str]) -> str:

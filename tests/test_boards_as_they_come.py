@@ -1,10 +1,8 @@
 """Images as people have them: other boards, other files, other depths, and what is no image."""
 
-import os
 import struct
 import zlib
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -17,15 +15,7 @@ import coursekit.boards.detector
 from coursekit.boards import Board, caption, detect, detect_all
 from coursekit.boards.find import on_plane
 
-CASES = Path(os.environ.get("COURSEKIT_REAL_DATA", "none")).parent / "cases"
 APRIL = "DICT_APRILTAG_36H11"
-
-
-def case(name):
-    folder = CASES / name
-    if not folder.is_dir():
-        pytest.skip("the cases are not beside the real data")
-    return folder
 
 
 # --- other boards ---
@@ -91,17 +81,6 @@ def test_a_grid_of_tags_is_no_charuco_board(kind):
     assert named >= (360 if NIGHTLY else 5)
 
 
-def test_the_grids_of_tags_of_the_case():
-    folder = case("04_grid_of_tags_taken_for_charuco")
-    asked = (Board("checkerboard", (7, 7), 0.02), CHARUCO)
-    asked += (Board("charuco", (7, 7), 0.025, dictionary=APRIL),)
-    for board in asked:
-        seen = detect_all([folder / "photo_crop.png", folder / "drawn.png"], board)
-        assert len(seen) == 0
-        for skip in seen.skipped:
-            assert "but a grid of tags (AprilGrid, GridBoard), no ChArUco board: n" in skip.reason
-
-
 @pytest.mark.parametrize("first", [27, 100])
 @pytest.mark.parametrize("squares", [(9, 6), (5, 7)])
 def test_markers_that_start_elsewhere(first, squares):
@@ -127,11 +106,6 @@ def test_mirrored_and_negative_boards_are_named(squares, dictionary):
         said = not_found(np.flipud(image), other)
         assert "markers, all mirrored: switch the camera's mirror off" in said
     assert "all with white for black: give the negatives" in not_found(255 - image, board)
-
-
-def test_the_mirrored_picture_of_the_case():
-    seen = detect_all([case("24_mirrored_image") / "mirrored.png"], CHARUCO)
-    assert "27 markers, all mirrored: switch the camera's mirror off" in seen.skipped[0].reason
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.5], ids=["symmetric", "asymmetric"])
@@ -212,14 +186,6 @@ def test_every_depth_is_scaled_by_its_own_range(kind, tmp_path):
     np.testing.assert_allclose(seen[0].pixels, detect(image, board).pixels, atol=0.1)
     if pixels.dtype == np.uint16:
         np.testing.assert_array_equal(detect(pixels, board).pixels, seen[0].pixels)
-
-
-def test_the_depths_of_the_case():
-    names = ("mono8.png", "mono10.png", "mono12.png")
-    seen = detect_all([case("11_ten_bit_png_called_blank") / name for name in names], CHARUCO)
-    assert [len(one) for one in seen] == [40, 40, 40]
-    for one in seen[1:]:
-        np.testing.assert_allclose(one.pixels, seen[0].pixels, atol=0.05)
 
 
 def test_a_flat_deep_image_is_blank():

@@ -1,6 +1,5 @@
 """Notebook 5 takes what notebooks 1 to 4 saved, and names every file that it cannot use."""
 
-import json
 import math
 from pathlib import Path
 from types import SimpleNamespace
@@ -155,14 +154,6 @@ def test_neither_yours_nor_a_reference(folders: tuple[Path, Path]) -> None:
         handed.terms()
     with pytest.raises(ValueError, match=r"^lesson: "):
         handed["05_error_budget"]
-
-
-def test_the_reference_is_only_read(folders: tuple[Path, Path]) -> None:
-    before = {p.name: p.read_bytes() for p in folders[1].iterdir()}
-    hand_over(folders[1]).budget()
-    assert {p.name: p.read_bytes() for p in folders[1].iterdir()} == before
-    assert not folders[0].exists()
-    assert json.loads(before["01_pinhole.json"])["source"] == "simulated"
 
 
 def test_a_table_says_every_row_and_whose_it_is(folders: tuple[Path, Path]) -> None:

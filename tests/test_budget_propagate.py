@@ -85,15 +85,6 @@ def test_displacements_are_those_of_the_composed_transforms(mount: str) -> None:
     np.testing.assert_allclose(found.T, expected, atol=1e-9)
 
 
-def test_what_is_drawn_goes_through_the_exact_chain() -> None:
-    where = chain("eye_in_hand", LENS, 0.5, 701.0, 92.0)
-    given = errors(0.5, 10.0, lens=True)
-    root = scaled_root(given.joint)
-    drawn = root @ np.random.default_rng(5).standard_normal((root.shape[1], 20))
-    expected = displacements(where, PARAMETERS, drawn).T
-    assert eb.monte_carlo(where, given, 20, seed=5) == pytest.approx(expected, abs=1e-12)
-
-
 @pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
 @pytest.mark.parametrize("Z", [0.25, 0.45, 0.8])
 def test_first_order_over_the_working_volume(mount: str, Z: float) -> None:
@@ -144,13 +135,3 @@ def test_where_first_order_fails() -> None:
     assert bad.ratio[2] < 0.2
     # E(omega_x² + omega_y²) / 2 = sigma²: the mean rises towards the camera by Z sigma²
     assert bad.mean_m[2] == pytest.approx(0.25 * math.radians(5) ** 2, rel=0.02)
-
-
-def test_the_parts_add() -> None:
-    where, all_of_it = chain("eye_in_hand", LENS, 0.5, 701.0, 92.0), errors(0.5, 0.5, lens=True)
-    nothing = eb.Covariances(names=PARAMETERS)
-    names = ("pixel", "depth_sigma_m", "intrinsics", "hand_eye", "arm")
-    parts = [replace(nothing, **{name: getattr(all_of_it, name)}) for name in names]
-    total = sum(eb.propagate(where, part) for part in parts)
-    assert eb.propagate(where, all_of_it) == pytest.approx(total, rel=1e-12)
-    assert eb.propagate(where, nothing) == pytest.approx(np.zeros((3, 3)))

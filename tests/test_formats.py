@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import sys
+import tomllib
 from collections import Counter
 from dataclasses import replace
 from itertools import permutations
@@ -36,7 +37,6 @@ from coursekit.hand_eye.poses import camera_board
 COEFFS = (0.0712345678901, -0.183, 1.2e-5, -0.00213, 0.0911)
 LENS = Intrinsics(848, 480, 612.34567890123, 598.1, 421.7, 243.30000000001, "brown_conrady", COEFFS)
 POINTS = np.random.default_rng(1).uniform([-0.5, -0.3, 0.8], [0.5, 0.3, 1.5], (200, 3))
-CASES = Path(__file__).resolve().parents[2] / "shared" / "cases"
 
 
 def wrote(folder, name, text, encoding="utf-8"):
@@ -155,100 +155,13 @@ def test_lens_comes_back_the_same(tmp_path, to) -> None:
 
 # --- lenses in, as their tools write them ---
 
-ROS = """# camera_calibration
-image_width: 640
-image_height: 480
-camera_name: narrow_stereo
-camera_matrix:
-  rows: 3
-  cols: 3
-  data: [600., 0., 320., 0., 601., 240., 0., 0., 1.]
-distortion_model: plumb_bob
-distortion_coefficients: {rows: 1, cols: 5, data: [0.1, -0.2, 1e-05, 0.0, 0.0]}
-"""
-TOPIC_2 = """header:
-  stamp: {sec: 1, nanosec: 2}
-  frame_id: camera_color_optical_frame
-height: 480
-width: 640
-distortion_model: plumb_bob
-d:
-- 0.1
-- -0.2
-- 1.0e-05
-- 0.0
-- 0.0
-k: [600.0, 0.0, 320.0, 0.0, 601.0, 240.0, 0.0, 0.0, 1.0]
-r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
-p: [600.0, 0.0, 320.0, 0.0, 0.0, 601.0, 240.0, 0.0, 0.0, 0.0, 1.0, 0.0]
-binning_x: 0
-binning_y: 0
-roi: {x_offset: 0, y_offset: 0, height: 0, width: 0, do_rectify: false}
----
-"""
+FILES = tomllib.loads(Path(__file__).with_name("lens_files.toml").read_text("utf-8"))
+ROS, TOPIC_2, OPENCV, KALIBR, COLMAP, OPEN3D = (
+    FILES[name] for name in ("ROS", "TOPIC_2", "OPENCV", "KALIBR", "COLMAP", "OPEN3D")
+)
 TOPIC_1 = (
     TOPIC_2.replace("\nd:", "\nD:").replace("\nk:", "\nK:").replace("plumb_bob", '"plumb_bob"')
 )
-OPENCV = """%YAML:1.0
----
-calibration_time: "Tue 01 Jan 2030 10:00:00 AM UTC"
-nr_of_frames: 20
-image_width: 640
-image_height: 480
-board_width: 9
-flags: 0
-camera_matrix: !!opencv-matrix
-   rows: 3
-   cols: 3
-   dt: d
-   data: [ 600., 0., 320., 0., 601., 240., 0., 0., 1. ]
-distortion_coefficients: !!opencv-matrix
-   rows: 5
-   cols: 1
-   dt: d
-   data: [ 1.0000000000000001e-01, -2.0000000000000001e-01,
-       1.0000000000000001e-05, 0., 0. ]
-avg_reprojection_error: 2.1e-01
-"""
-OPENCV_XML = """<?xml version="1.0"?>
-<opencv_storage>
-<!-- a comment -->
-<image_Width>640</image_Width>
-<image_Height>480</image_Height>
-<Camera_Matrix type_id="opencv-matrix"><rows>3</rows><cols>3</cols><dt>d</dt>
-  <data>600. 0. 320. 0. 601. 240. 0. 0. 1.</data></Camera_Matrix>
-<Distortion_Coefficients type_id="opencv-matrix"><rows>5</rows><cols>1</cols><dt>d</dt>
-  <data>1e-01 -2e-01 1e-05 0. 0.</data></Distortion_Coefficients>
-</opencv_storage>
-"""
-OPENCV_JSON = """{
-\t"image_width": 640, "image_height": 480,
-\t"cameraMatrix": {"type_id": "opencv-matrix", "rows": 3, "cols": 3, "dt": "d",
-\t\t"data": [600.0, 0.0, 320.0, 0.0, 601.0, 240.0, 0.0, 0.0, 1.0]},
-\t"distCoeffs": {"type_id": "opencv-matrix", "rows": 1, "cols": 5, "dt": "d",
-\t\t"data": [0.1, -0.2, 1e-05, 0, 0]}
-}
-"""
-KALIBR = """cam0:
-  cam_overlaps: []
-  camera_model: pinhole
-  distortion_coeffs: [0.1, -0.2, 1.0e-05, 0.0]
-  distortion_model: radtan
-  intrinsics: [600.0, 601.0, 320.0, 240.0]
-  resolution: [640, 480]
-  rostopic: /cam0/image_raw
-"""
-COLMAP = """# Camera list with one line of data per camera:
-#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]
-# Number of cameras: 1
-1 OPENCV 640 480 600 601 320.5 240.5 0.1 -0.2 1e-05 0
-"""
-OPEN3D = """{
-\t"height" : 480,
-\t"intrinsic_matrix" : [600.0, 0, 0, 0, 601.0, 0, 320.0, 240.0, 1],
-\t"width" : 640
-}
-"""
 OPEN3D_VIEW = json.dumps(
     {"class_name": "PinholeCameraParameters", "extrinsic": [1, 0], "intrinsic": json.loads(OPEN3D)}
 )
@@ -259,8 +172,9 @@ OURS = json.dumps(
 SESSION = json.dumps({"mount": "eye_in_hand", "intrinsics": json.loads(OURS)})
 AS_WRITTEN = {
     "ros": ROS, "ros2 topic echo": TOPIC_2, "rostopic echo": TOPIC_1, "opencv": OPENCV,
-    "opencv xml": OPENCV_XML, "opencv json": OPENCV_JSON, "kalibr": KALIBR, "colmap": COLMAP,
-    "open3d": OPEN3D, "open3d view": OPEN3D_VIEW, "ours": OURS, "session.json": SESSION,
+    "opencv xml": FILES["OPENCV_XML"], "opencv json": FILES["OPENCV_JSON"],
+    "kalibr": KALIBR, "colmap": COLMAP, "open3d": OPEN3D,
+    "open3d view": OPEN3D_VIEW, "ours": OURS, "session.json": SESSION,
 }  # fmt: skip
 KNOWN = Intrinsics(
     640, 480, 600.0, 601.0, 320.0, 240.0, "brown_conrady", (0.1, -0.2, 1e-5, 0.0, 0.0)
@@ -804,13 +718,6 @@ def test_a_log_without_names_goes_in_order_only_if_told(few) -> None:
     assert session.names == named.names
     with pytest.raises(ValueError, match=r"^images: got 4, want 3, one a row"):
         usable(place, log[:-1], in_order=True)
-
-
-def test_case_05_as_it_came(few) -> None:
-    case = CASES / "05_poses_csv_names_a_subfolder"
-    if not case.exists():
-        pytest.skip("no shared cases here")
-    assert len(HandEyeSession.from_folder(case, progress=False)) == 4
 
 
 # --- a place goes out ---

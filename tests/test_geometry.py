@@ -116,11 +116,6 @@ def test_invalid_depth_has_no_point() -> None:
     assert geometry.deproject([10, 20], 0.5, K).shape == (3,)
 
 
-def test_four_coefficients_mean_k3_is_zero() -> None:
-    a = geometry.project(points_in_view(3), K, DIST[:4])
-    assert np.array_equal(a, geometry.project(points_in_view(3), K, [*DIST[:4], 0]))
-
-
 # --- Intrinsics ---
 
 

@@ -38,14 +38,6 @@ def test_round_trip(own_results: Path) -> None:
     assert [p.name for p in own_results.iterdir()] == ["01_pinhole.json"]  # nothing left over
 
 
-def test_photographs_are_said_to_be_photographs() -> None:
-    results.save(
-        "03_intrinsics", results.Origin("photographs in desk"), {"fx": Quantity(612.4, "px")}
-    )
-    kept = results.load("03_intrinsics")
-    assert (kept.source, kept.camera, kept.serial) == ("recorded", "photographs in desk", "")
-
-
 def test_only_quantities_are_saved(own_results: Path) -> None:
     with pytest.raises(ValueError, match=r"^quantities\['fx'\]: got float, want Quantity"):
         results.save("01_pinhole", CAMERA, {"fx": 612.4})

@@ -22,22 +22,6 @@ REAL = os.environ.get("COURSEKIT_REAL_DATA")
 needs_real = pytest.mark.skipif(not REAL, reason="COURSEKIT_REAL_DATA is not set")
 
 
-def test_the_848_crop_follows_the_rule_that_published_units_follow():
-    """(f, cx, cy) at 640x480 and 848x480 of two units, librealsense 3474, realsense-ros 2788."""
-    depths = (device("D435").unit.depth, device("D455").unit.depth)
-    d435, d455 = ((depth.fx, depth.cx, depth.cy) for depth in depths)
-    for small, large, tolerance in (
-        ((382.918884, 321.015106, 235.879822), (422.806274, 425.120850, 235.450638), 1e-4),
-        ((384.207489, 319.480408, 236.351501), (424.229095, 423.426300, 236.046249), 0.08),
-        ((390.43145751953125, 331.38787841796875, 242.18734741210938), d435, 1e-4),
-        ((387.543, 324.224, 237.357), d455, 1e-3),
-    ):
-        centred = np.array(small) - (0, 320, 240)
-        predicted = centred * (848 / 1280) / (480 / 800) + (0, 424, 240)
-        assert predicted[0] == pytest.approx(large[0], abs=min(tolerance, 1e-3))
-        assert predicted[1:] == pytest.approx(large[1:], abs=tolerance)
-
-
 @pytest.mark.parametrize(
     ("name", "baseline_m", "scale_m", "nearest_mm", "projector"),
     [
@@ -82,15 +66,6 @@ def test_the_d405_sees_colour_with_its_left_imager():
     larger = (ends - (320, 240)) / 0.6 + (640, 360)
     one, other = (deproject(ends, 1.0, unit.color.K), deproject(larger, 1.0, published.K))
     np.testing.assert_allclose(one, other, atol=1e-6)
-
-
-def test_units_derived_from_larger_images():
-    """The D415's depth from librealsense issue 1430, its colour from issue 5658."""
-    depth, color = device("D415").unit.depth, device("D415").unit.color
-    assert depth.fx == depth.fy == pytest.approx(940.924011 * 848 / 1280, abs=1e-5)
-    assert depth.cx == pytest.approx(636.445312 * 848 / 1280, abs=1e-5)
-    assert depth.cy == pytest.approx((359.391479 - 360) * 848 / 1280 + 240, abs=1e-5)
-    assert (color.fx, color.cy) == pytest.approx((925.769 / 1.5, 376.119 / 1.5), abs=1e-3)
 
 
 @pytest.mark.real

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import ast
+import string
+from pathlib import Path
+
 import pytest
 
+from coursekit import doctor, words
 from coursekit.words import Finding, Findings
 
 BOW = Finding("bowed_board", "The board is <not> flat.", "0.51 ± 0.04 mm", "Use glass.", 1e-9)
@@ -50,6 +55,27 @@ def test_the_html_is_escaped_and_has_the_same_words() -> None:
     assert "<li>" not in Findings()._repr_html_()
 
 
-def test_a_finding_cannot_be_changed() -> None:
-    with pytest.raises(AttributeError):
-        BOW.name = "other"  # type: ignore[misc]
+PACKAGE = Path(words.__file__).parent
+SENTENCES = {
+    "say": {f"{room}.{name}": text for room, texts in words.ROOM_TEXTS.items()
+            for name, text in texts.items() if isinstance(text, str)},
+    "found": {name: " ".join(texts) for name, texts in doctor.DOCTOR_TEXTS["findings"].items()},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("function", SENTENCES)
+def test_every_sentence_is_there_used_and_gets_its_facts(function: str) -> None:
+    files = PACKAGE.rglob("*.py") if function == "say" else [PACKAGE / "doctor.py"]
+    nodes = [node for file in files for node in ast.walk(ast.parse(file.read_text("utf-8")))]
+    shared = doctor.DOCTOR_TEXTS["shared"].keys() if function == "found" else set()
+    for call in nodes:
+        if isinstance(call, ast.Call) and ast.unparse(call.func) == function:
+            facts = {fact.arg for fact in call.keywords} | shared
+            if isinstance(call.args[0], ast.Constant) and None not in facts:
+                text = SENTENCES[function][call.args[0].value]
+                fields = [field for _, field, _, _ in string.Formatter().parse(text) if field]
+                assert {field.split(".")[0].split("[")[0] for field in fields} <= facts, text
+    strings = {node.value for node in nodes if isinstance(node, ast.Constant)}
+    chosen = {"boards.no_charuco", "boards.no_checkerboard"}  # by the board's kind
+    chosen |= {f"boards.{word}" for word in strings if isinstance(word, str)}
+    assert SENTENCES[function].keys() <= strings | chosen

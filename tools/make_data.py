@@ -9,7 +9,8 @@ import sys
 import tempfile
 import zipfile
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -283,8 +284,16 @@ def _zip(members: dict[str, bytes]) -> bytes:
     return buffer.getvalue()
 
 
+def vendor_models() -> None:
+    """What librealsense does with each distortion model, measured here."""
+    note = f"coursekit.cameras.conventions, pyrealsense2 {version('pyrealsense2')}"
+    rows = [asdict(row) for row in ck.cameras.conventions.measure()]
+    rows = [{k: v for k, v in row.items() if v is not None} for row in rows]
+    write_json(DATA / "vendor_models.json", {"source": note, "rows": rows})
+
+
 MAKERS = {
-    "vendor_models.json": ck.cameras.conventions.store,
+    "vendor_models.json": vendor_models,
     "readme.png": readme_picture,
     "intrinsics_session": intrinsics_session,
     "diagnosis_power.json": diagnosis_power,

@@ -23,7 +23,7 @@ from coursekit import geometry
 from coursekit.arrays import AnyArray, Bools, Floats, Grey, NDArray
 from coursekit.checks import array, choice, instance, number, want, whole
 from coursekit.geometry import Intrinsics
-from coursekit.words import Listed, counted
+from coursekit.words import Listed, counted, say
 
 BoardKind = Literal["checkerboard", "charuco"]
 FEWEST_SQUARES = {"checkerboard": 4, "charuco": 3}  # OpenCV finds none with fewer corners than 3x3
@@ -252,11 +252,18 @@ def _side(name: str, value: object) -> float:
 
 
 class BoardNotFound(ValueError):
-    """The board is not in the image; the message says what is there instead, or what to mend."""
+    """The board is not in the image; the message says what is there instead, or what to mend.
+
+    kind: as `Skipped` has it.
+    """
+
+    kind = ""
 
 
 class OtherBoard(BoardNotFound):
     """Another board than was asked for is in the image."""
+
+    kind = "other_board"
 
 
 @dataclass(frozen=True, eq=False)
@@ -392,15 +399,13 @@ def check_detections(
     least_views: int = 1,
     *,
     size: tuple[int, int] | None = None,
-    name: str = "detections",
 ) -> None:
     """ValueError unless each of these views can fix a pose of `board`.
 
     least_corners: of each view. least_views: of all of them. size: (width, height) that each image
-    must have, px, the first one's by default. name: what the message calls the argument; it also
-    says which view cannot be used, and which of six faults that view has: another size, too few
-    corners, a pixel that is not finite, a corner that the board does not have, the same corner
-    twice, or all corners on one line.
+    must have, px, the first one's by default. The message says which view cannot be used, and
+    which of six faults that view has: another size, too few corners, a pixel that is not finite, a
+    corner that the board does not have, the same corner twice, or all corners on one line.
 
     >>> board = Board("checkerboard", (10, 7), 0.025)
     >>> check_detections([Detection([0, 1, 2], np.zeros((3, 2)), (640, 480), "a.png")], board, 4)
@@ -410,14 +415,13 @@ def check_detections(
     if len(detections) < least_views:
         skipped = getattr(detections, "skipped", ())
         unused = f"; {len(skipped)} not used, the first: {skipped[0]!r}" if skipped else ""
-        raise ValueError(
-            f"{name}: got {counted(len(detections), 'view')}, want at least {least_views}{unused}"
-        )
+        seen = counted(len(detections), "view")
+        raise ValueError(f"detections: got {seen}, want at least {least_views}{unused}")
     for index, view in enumerate(detections):
         fault = next(_faults(view, board, least_corners, size or detections[0].size), "")
         if fault:
             called = f" ({view.name})" if view.name else ""
-            raise ValueError(f"{name}[{index}]{called}: {fault}")
+            raise ValueError(f"detections[{index}]{called}: {fault}")
 
 
 def _faults(
@@ -533,9 +537,6 @@ MARGIN_MM = 6.0  # printers leave about 5 mm blank
 FOOT_MM = 18.0  # bar and text below the board
 BAR_MM = 100.0
 MM_PER_INCH = 25.4
-ADVICE = """\
-Print at 100 % (no "fit to page"). The bar must measure 100 mm; if not, use the measured square.
-Glue it dead flat to glass or aluminium: 1 mm of bow spoils fx by 3 %."""
 
 
 def save_sheet(
@@ -599,11 +600,9 @@ def _page(board: Board, paper: str) -> tuple[float, float]:
     sides = PAPERS_MM[name]
     square = max(_largest_square_mm(board, page) for page in (sides, sides[::-1]))
     larger = next((other for other in PAPERS_MM if _fitting(board, other)), "a print shop")
+    instead = {"paper": name, "larger": larger, "square": np.floor(10 * square) / 10}
     width, height = (1000 * side for side in board.size_m)
-    raise ValueError(
-        f"paper: a board of {width:g} x {height:g} mm does not fit on {name}: take {larger}, or "
-        f"squares of at most {np.floor(10 * square) / 10:g} mm"
-    )
+    raise ValueError(say("boards.too_big", width=width, height=height, **instead))
 
 
 def _fitting(board: Board, paper: str) -> list[tuple[float, float]]:
@@ -647,7 +646,7 @@ def _draw(board: Board, page_mm: tuple[float, float]) -> Any:
         axes.add_patch(patch)
     right = MARGIN_MM + BAR_MM + 2.0
     axes.text(right, foot + 0.75, "100 mm", fontsize=8, va="center")
-    words = f"{caption(board)}.\n{ADVICE}"
+    words = f"{caption(board)}.\n{say('boards.advice')}"
     axes.text(MARGIN_MM, foot + 3.0, words, fontsize=6.5, va="top", linespacing=1.25)
     return figure
 

@@ -20,12 +20,12 @@ import cv2
 import numpy as np
 
 from coursekit.arrays import AnyArray, Grey, NDArray
-from coursekit.boards.board import Board, BoardNotFound, Detection, Detections, OtherBoard, Skipped
+from coursekit.boards.board import Board, BoardNotFound, Detection, Detections, Skipped
 from coursekit.boards.corners import blur_covariance, refine_corners, steps
-from coursekit.boards.explain import BLANK_GREY, blank, explain
+from coursekit.boards.explain import BLANK_GREY, explain
 from coursekit.boards.find import OFF_PLANE, find_corners, on_plane
 from coursekit.checks import want
-from coursekit.words import counting
+from coursekit.words import ROOM_TEXTS, counting, say
 
 FEWEST_CORNERS = 6
 SMALLEST_IMAGE_PX = 40  # shorter side of an image in which a board can be told
@@ -37,17 +37,6 @@ JPEG, PNG = b"\xff\xd8", b"\x89PNG"
 SIZE_SEGMENTS = b"\xc0\xc1\xc2\xc3\xc5\xc6\xc7\xc9\xca\xcb\xcd\xce\xcf"  # of a JPEG hold its size
 ALPHA = (b"\4", b"\6")  # PNG: kinds of colour with transparency
 AS_STORED = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-NO_IMAGE = "not an image that OpenCV can read: if it is one, save it as PNG or JPEG"
-RAW = "a camera's raw file: develop it to PNG or TIFF, without correction of the lens"
-FILM = "a film: save single pictures of it as PNG"
-OTHERS = {  # the suffix or the first bytes of what OpenCV cannot read, or only a thumbnail of
-    r"\.hei[cf]|....ftyp(hei|hev|mif1|msf1)": "a HEIC photograph: export it as JPEG or PNG",
-    r"\.(cr[23]|ne[fw]|nrw|arw|dng|ra[fw]|orf|rw2|pef|srw)$|....ftypcrx|FUJIFILM|II\*\0....CR": RAW,
-    r"\.(mp4|mov|avi|mkv|webm|m4v|wmv|mpg)$|....ftyp(iso|mp4|M4V|qt)|RIFF....AVI|\x1aE\xdf": FILM,
-    r"\.pdf|%PDF": "a PDF: save its photographs as PNG",
-    r"\.(bag|db3|mcap)|#ROSBAG|SQLite format 3": "a recording: ck.open_camera(path) plays it",
-    r"\.np[yz]|\x93NUMPY": "arrays: load them and give the arrays",
-}
 
 
 # --- one image ---
@@ -77,7 +66,7 @@ def detect(image: NDArray[np.uint8], board: Board, name: str = "") -> Detection:
     except BoardNotFound:
         raise
     except Exception as error:  # no picture, however strange, may end a session of many
-        raise BoardNotFound(f"the search failed ({_words(error)}): leave it out") from error
+        raise BoardNotFound(say("boards.failed", error=_words(error))) from error
 
 
 def _words(error: Exception) -> str:
@@ -87,11 +76,10 @@ def _words(error: Exception) -> str:
 
 def _detect(grey: Grey, board: Board, name: str) -> Detection:
     height, width = grey.shape
-    size = f"the picture is {width}x{height} px: too"
     if grey.size > MOST_PIXELS:
-        raise BoardNotFound(f"{size} large, make it smaller")
+        raise BoardNotFound(say("boards.too_large", width=width, height=height))
     if min(grey.shape) < SMALLEST_IMAGE_PX or max(grey.shape) > NARROWEST * min(grey.shape):
-        raise BoardNotFound(f"{size} small or narrow to show a board")
+        raise BoardNotFound(say("boards.too_small", width=width, height=height))
     found = find_corners(grey, board)
     if found is None or not _usable(found[0], board):
         raise BoardNotFound(explain(grey, board, 0 if found is None else len(found[0])))
@@ -139,7 +127,7 @@ def _eight_bits(pixels: AnyArray) -> Grey:
     some = some[np.isfinite(some)]
     low, high = np.quantile(some, [0.01, 0.99]) if some.size else (0.0, 0.0)
     if not high - low > (BLANK_GREY if pixels.dtype.kind in "iu" else 0.0):
-        raise BoardNotFound(blank(low, high))
+        raise BoardNotFound(say("boards.blank", low=low, high=high))
     dark, bright = RANGE
     scale = (bright - dark) / (high - low)
     levels = np.nan_to_num((pixels.astype(np.float32) - low) * scale + dark, nan=dark)
@@ -181,8 +169,7 @@ def detect_all(
             try:
                 views.append(detect(_read(source), board, name))
             except BoardNotFound as reason:
-                kind = "other_board" if isinstance(reason, OtherBoard) else ""
-                skipped.append(Skipped(name, str(reason), kind))
+                skipped.append(Skipped(name, str(reason), reason.kind))
     except KeyboardInterrupt:
         done = len(views) + len(skipped)
         print(f"Stopped after {done} of {len(sources)} images; they are kept.")
@@ -236,27 +223,30 @@ def _read(source: Any) -> AnyArray:
         return source
     try:
         if source.stat().st_size > MOST_BYTES:
-            raise BoardNotFound(f"the file has {source.stat().st_size / 1e9:.1f} GB: no photograph")
+            raise BoardNotFound(say("boards.too_many_bytes", size_gb=source.stat().st_size / 1e9))
         data = source.read_bytes()
     except (OSError, MemoryError) as error:
-        raise BoardNotFound(f"cannot be read ({getattr(error, 'strerror', error)})") from error
+        why = getattr(error, "strerror", error)
+        raise BoardNotFound(say("boards.not_read", error=why)) from error
     if not data:
-        raise BoardNotFound("the file is empty")
-    for pattern, what in OTHERS.items() if not data.startswith((JPEG, PNG)) else ():
+        raise BoardNotFound(say("boards.empty"))
+    for pattern, what in (
+        ROOM_TEXTS["boards"]["other_files"].items() if not data.startswith((JPEG, PNG)) else ()
+    ):
         texts = (source.suffix.lower(), data[:16].decode("latin1"))
         if any(re.match(pattern, text, re.DOTALL) for text in texts):
             raise BoardNotFound(what)
     (width, height), cut_off = _header(data)
     if width * height > MOST_PIXELS:  # before it takes its memory
-        raise BoardNotFound(f"the picture is {width}x{height} px: too large, make it smaller")
+        raise BoardNotFound(say("boards.too_large", width=width, height=height))
     if cut_off:  # OpenCV would fill the rest with grey
-        raise BoardNotFound("the file is cut off, its end is missing")
+        raise BoardNotFound(say("boards.cut_off"))
     try:
         return _eight_bits(_decoded(data))
     except BoardNotFound:
         raise
     except Exception as error:  # whatever a broken file makes the decoders raise
-        raise BoardNotFound(f"{NO_IMAGE} ({_words(error)})") from error
+        raise BoardNotFound(f"{say('boards.no_image')} ({_words(error)})") from error
 
 
 def _decoded(data: bytes) -> AnyArray:
@@ -264,7 +254,7 @@ def _decoded(data: bytes) -> AnyArray:
     coded = np.frombuffer(data, np.uint8)
     image = cv2.imdecode(coded, AS_STORED | cv2.IMREAD_ANYDEPTH)
     if image is None:
-        raise BoardNotFound(NO_IMAGE)
+        raise BoardNotFound(say("boards.no_image"))
     if data.startswith(PNG) and (data[25:26] in ALPHA or b"tRNS" in data[:4096]):
         layers: AnyArray = np.asarray(
             cv2.imdecode(coded, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -302,9 +292,8 @@ def _of_one_size(views: list[Detection], skipped: list[Skipped], names: list[str
     common = max(counts, key=lambda size: (counts[size], size), default=(0, 0))
     for view in views:
         if view.size != common:
-            reason = "{}x{} px, where most are {}x{}: one calibration is for one size"
-            if view.size == common[::-1]:
-                reason += "; give the pixels as the sensor has them, not turned"
-            skipped.append(Skipped(view.name, reason.format(*view.size, *common), "other_size"))
+            reason = say("boards.other_size", view=view.size, common=common)
+            reason += say("boards.turned") * (view.size == common[::-1])
+            skipped.append(Skipped(view.name, reason, "other_size"))
     skipped.sort(key=lambda skip: names.index(skip.name))
     return Detections([view for view in views if view.size == common], skipped)

@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from coursekit.arrays import Floats, Grey, NDArray
 from coursekit.boards.board import DICTIONARIES, FEWEST_SQUARES, Board, OtherBoard
 from coursekit.boards.find import checkerboard_seen, off_homography, real_beyond, shrunk
+from coursekit.words import ROOM_TEXTS, say
 
 LONGEST_PX = 1600  # an image is looked at no larger than this
 ANY_SIZE_PX = 800  # ... and where checkerboards of any size are looked for than this
@@ -33,10 +34,6 @@ WAYS: dict[str, Callable[[Grey], Grey]] = {  # to look for markers, and what the
     "mirrored": lambda grey: np.ascontiguousarray(grey[:, ::-1]),
     "with white for black": lambda grey: 255 - grey,
 }
-CURES = {
-    "mirrored": "switch the camera's mirror off, or turn the images back: image[:, ::-1]",
-    "with white for black": "give the negatives: 255 - image",
-}
 FEWEST_MARKERS, MANY_MARKERS = 4, 12  # so many are never seen mirrored by mistake
 FEWEST_ON_PLAN = 6  # markers: any four lie on some plan
 MOST_SQUARES = 20  # each way that are tried
@@ -47,7 +44,6 @@ FAR = 8.0  # half sides of a marker: its neighbours on a board are nearer
 CUT = 0.25  # of the corners in the line beyond a checkerboard are real: something hides the others
 FEWEST_CIRCLES, LEAST_ROUND = 12, 0.82
 OFF_ROW = 0.25  # of the distance between two circles: the third in their row is off by less
-NOT_USABLE = "not usable here, print a board with ck.boards.save_sheet"
 
 
 class _Markers(NamedTuple):
@@ -73,21 +69,13 @@ def explain(grey: Grey, board: Board, corners: int) -> str:
     small = shrunk(grey, LONGEST_PX)
     low, high = np.quantile(small, [0.01, 0.99])
     if high - low < BLANK_GREY:
-        return blank(low, high)
+        return say("boards.blank", low=low, high=high)
     asked = f"the {board.text} asked for"
     if reason := _what_else(small, board):
-        raise OtherBoard(f"not {asked}, but {reason}")
+        raise OtherBoard(say("boards.not_asked_for", asked=asked, reason=reason))
     if corners:
-        return (
-            f"only {corners} usable corners of {asked}: at least 6 are needed that do not lie on "
-            "one line; bring more of the board into the picture"
-        )
+        return say("boards.few_corners", corners=corners, asked=asked)
     return _nothing(small, board)
-
-
-def blank(low: float, high: float) -> str:
-    """What to say of an image whose grey levels hardly differ."""
-    return f"the picture is blank: nearly all of it has grey levels from {low:.0f} to {high:.0f}"
 
 
 def _what_else(grey: Grey, board: Board) -> str:
@@ -97,7 +85,8 @@ def _what_else(grey: Grey, board: Board) -> str:
     blurred = _edges_px(grey) > BLURRED_PX
     if reason := _checkered(shrunk(grey, ANY_SIZE_PX), board, blurred):
         return reason
-    return f"a grid of circles: {NOT_USABLE}" if not blurred and _has_circles(grey) else ""
+    circles = not blurred and _has_circles(grey)
+    return say("boards.circles", not_usable=say("boards.not_usable")) if circles else ""
 
 
 def _edges_px(grey: Grey) -> float:
@@ -111,19 +100,8 @@ def _nothing(grey: Grey, board: Board) -> str:
     """No board of any kind: the advice that fits the picture."""
     width_px = _edges_px(grey)
     if width_px > BLURRED_PX:
-        return (
-            f"no board seen, and the picture is blurred (its sharpest edges are {width_px:.0f} px "
-            "wide): hold still, focus, or use a shorter exposure"
-        )
-    if board.kind == "checkerboard":
-        return (
-            f"no checkerboard of {board.text} seen: all of it must be in the picture, with white "
-            "around it, well lit and not too oblique"
-        )
-    return (
-        f"no marker of {board.dictionary} or any other dictionary seen: bring the board nearer "
-        "or into focus, and keep lamps from reflecting in it"
-    )
+        return say("boards.blurred", width_px=width_px)
+    return say(f"boards.no_{board.kind}", board=board)
 
 
 # --- checkerboards of another size, circles ---
@@ -145,20 +123,14 @@ def _checkered(grey: Grey, board: Board, blurred: bool) -> str:
     if found or (cut and blurred):  # a blur hides the outer corners
         return ""
     if board.kind == "charuco":
-        return (
-            f"a checkerboard of {size}, without markers: use Board('checkerboard', {squares}, ...)"
-        )
-    if cut and np.less_equal(squares, board.squares).all():
-        return (
-            f"part of a checkerboard, {size} of it: all of it must be in the picture, with nothing "
-            "in front"
-        )
-    if sorted(squares) == sorted(count + 1 for count in board.squares):
-        return (
-            f"a checkerboard of {size}: you gave inner corners, squares are one more in each "
-            "direction"
-        )
-    return f"a checkerboard of {size}: use squares={squares}"
+        what = "without_markers"
+    elif cut and np.less_equal(squares, board.squares).all():
+        what = "part"
+    elif sorted(squares) == sorted(count + 1 for count in board.squares):
+        what = "inner_corners"
+    else:
+        what = "other_squares"
+    return say(f"boards.{what}", size=size, squares=squares)
 
 
 def _is_cut(grey: Grey, grid: Floats) -> bool:
@@ -217,13 +189,12 @@ def _marked(markers: _Markers, board: Board) -> str:
     """What markers show, of this dictionary or another; "" where they fit the board asked for."""
     seen = f"{len(markers.ids)} markers of {_short_name(markers, board)}"
     if markers.way:
-        return f"{len(markers.ids)} markers, all {markers.way}: {CURES[markers.way]}"
+        cure = ROOM_TEXTS["boards"]["cures"][markers.way]
+        return f"{len(markers.ids)} markers, all {markers.way}: {cure}"
     if _is_grid(markers):
-        return (
-            f"a grid of tags (AprilGrid, GridBoard), no ChArUco board: {NOT_USABLE} ({seen} seen)"
-        )
+        return say("boards.tags", seen=seen, not_usable=say("boards.not_usable"))
     if board.kind == "checkerboard":
-        return f"{seen}: this is a ChArUco board, use Board('charuco', ...)"
+        return say("boards.with_markers", seen=seen)
     return _other_charuco(markers, board, seen)
 
 
@@ -233,16 +204,15 @@ def _other_charuco(markers: _Markers, board: Board, seen: str) -> str:
     plans = _plans(board, name, markers.ids) if enough else ()
     plan = next((plan for plan in plans if _on_plan(markers, plan)), None)
     if plan is None and name != board.dictionary:
-        return f"{seen}: use dictionary={name!r}"
+        return say("boards.other_dictionary", seen=seen, name=name)
     if plan is None:
-        lost = f"{seen} that lie as on no board of up to {MOST_SQUARES}x{MOST_SQUARES} squares"
-        return lost if enough else ""
+        return say("boards.no_plan", seen=seen, most=MOST_SQUARES) if enough else ""
     fields = ("dictionary", "squares", "first_marker", "old_origin")
     new = [(field, getattr(plan, field)) for field in fields]
     changes = [f"{field}={value!r}" for field, value in new if value != getattr(board, field)]
     if changes:
         size = "{}x{} squares".format(*plan.squares)
-        return f"{seen} as on a board of {size} or more: use {', '.join(changes)}"
+        return say("boards.other_plan", seen=seen, size=size, changes=", ".join(changes))
     return ""
 
 

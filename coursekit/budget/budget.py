@@ -36,7 +36,7 @@ from coursekit.checks import want
 from coursekit.geometry import cross_matrix
 from coursekit.results import ErrorKind
 from coursekit.stereo.law import depth_slope
-from coursekit.words import html_list, html_table, wrapped
+from coursekit.words import html_list, html_table, say, wrapped
 
 Along = Literal["image", "ray", "disparity", "depth", "turn", "shift", "intrinsics"]
 Directions = Literal["own", "isotropic"]
@@ -362,10 +362,7 @@ class ErrorBudget:
         if changes:
             stated = [term.name for term in self.terms if term.stated_m is not None]
             if stated:
-                raise ValueError(
-                    f"{next(iter(changes))}: {stated[0]!r} is stated at the object and knows no "
-                    "other place; take a budget whose rows are converted"
-                )
+                raise ValueError(say("budget.elsewhere", what=next(iter(changes)), row=stated[0]))
             own["view"] = self.view.moved(**changes)
         return replace(self, **own)
 
@@ -426,24 +423,20 @@ class ErrorBudget:
     @property
     def worst_case_m(self) -> Interval:
         """(low, high) of the biases if all point one way."""
-        lows, highs = self._bias_lengths
-        return sum(lows), sum(highs)
+        return _added(self._bias_ends)[0]
 
     @property
     def quadrature_m(self) -> Interval:
         """(low, high) of the biases if their directions are unrelated."""
-        lows, highs = self._bias_lengths
-        return math.hypot(*lows), math.hypot(*highs)
+        return _added(self._bias_ends)[1]
 
     def along(self, axis: str) -> AxisBudget:
         """Along "closing", "approach" or "lateral": each term with its greatest effect there."""
         i = axis_index(axis)
         direction = self.grasp.directions[i]
         ends = [term.ends_m(self.view, matrix, direction) for term, matrix in self._of("bias")]
-        lows, highs = [low for low, _ in ends], [high for _, high in ends]
         noise = float(np.sqrt(direction @ self.noise_covariance @ direction))
-        worst, quadrature = (sum(lows), sum(highs)), (math.hypot(*lows), math.hypot(*highs))
-        return AxisBudget(axis, self.grasp.tolerance_m[i], noise, worst, quadrature)
+        return AxisBudget(axis, self.grasp.tolerance_m[i], noise, *_added(ends))
 
     # how often
 
@@ -511,9 +504,8 @@ class ErrorBudget:
         return math.hypot(term.range[1] / math.sqrt(effective), term.floor)
 
     @property
-    def _bias_lengths(self) -> tuple[list[float], list[float]]:
-        ranges = [term.at_object_m(self.view) for term, _ in self._of("bias")]
-        return [low for low, _ in ranges], [high for _, high in ranges]
+    def _bias_ends(self) -> list[Interval]:
+        return [term.at_object_m(self.view) for term, _ in self._of("bias")]
 
     # for people
 
@@ -548,19 +540,15 @@ class ErrorBudget:
             return text
         for axis in AXES:
             a = self.along(axis)
-            text.append(
-                f"{axis}: bias up to {1e3 * a.worst_case_m[1]:.1f} mm, in quadrature "
-                f"{1e3 * a.quadrature_m[1]:.1f}, noise {1e3 * a.noise_m:.2f}; "
-                f"tolerance ±{1e3 * a.tolerance_m:.1f}"
-            )
+            lengths = a.worst_case_m[1], a.quadrature_m[1], a.noise_m, a.tolerance_m
+            names = ("worst", "quadrature", "noise", "tolerance")
+            mm = {name: 1e3 * length for name, length in zip(names, lengths, strict=True)}
+            text.append(say("budget.axis", axis=axis, **mm))
         return text
 
     def _heading(self) -> str:
-        view = self.view
-        return (
-            f"{self.title}: Z = {view.distance_m:.2f} m, {view.off_axis_deg:.0f}° off axis, "
-            f"f = {view.intrinsics.fx:.0f} px, baseline {1e3 * view.baseline_m:.0f} mm"
-        )
+        baseline_mm = 1e3 * self.view.baseline_m
+        return say("budget.heading", title=self.title, view=self.view, baseline_mm=baseline_mm)
 
     @property
     def _stated(self) -> bool:
@@ -575,6 +563,12 @@ class ErrorBudget:
     def _repr_html_(self) -> str:
         heading, sums = html.escape(self._heading()), [*self.summary(), *self.sources()]
         return f"<p><b>{heading}</b></p>{html_table(*self.table())}{html_list(sums)}"
+
+
+def _added(ends: list[Interval]) -> tuple[Interval, Interval]:
+    """(low, high) of lengths that have such ends: all in one direction, and in quadrature."""
+    lows, highs = [low for low, _ in ends], [high for _, high in ends]
+    return (sum(lows), sum(highs)), (math.hypot(*lows), math.hypot(*highs))
 
 
 def axis_index(axis: str) -> int:

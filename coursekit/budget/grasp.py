@@ -11,6 +11,7 @@ from coursekit import checks
 from coursekit.budget.budget import ErrorBudget
 from coursekit.budget.view import AXES
 from coursekit.checks import want
+from coursekit.words import say
 
 DRAWS = 20_000  # of a probability that is redrawn while dragging: a standard error of 0.4 % at most
 FEW_DRAWS = 10  # a gain of so many draws says nothing about which row is first
@@ -90,10 +91,8 @@ class Success:
 
     def __repr__(self) -> str:
         axes = ", ".join(f"{a} {100 * p:.1f}" for a, p in zip(AXES, self.by_axis, strict=True))
-        return (
-            f"{100 * self.probability:.1f} % of grasps succeed ({axes});\n"
-            f"    {100 * self.rigs:.1f} % of rigs would be within the tolerance without noise"
-        )
+        percent, rigs = 100 * self.probability, 100 * self.rigs
+        return say("budget.success", percent=percent, axes=axes, rigs=rigs)
 
 
 def success_probability(budget: ErrorBudget) -> Success:

@@ -19,9 +19,10 @@ from coursekit import checks
 from coursekit.arrays import ArrayLike, Floats
 from coursekit.budget.view import View
 from coursekit.checks import want
-from coursekit.geometry import cross_matrix, distortion_jacobian
+from coursekit.geometry import bent, cross_matrix, distortion_jacobian
 from coursekit.hand_eye.poses import Mount
 from coursekit.intrinsics.derivatives import PARAMETERS, scaled_root
+from coursekit.words import say
 
 PINHOLE_PARAMETERS, LENS_PARAMETERS = PARAMETERS[:4], PARAMETERS[4:]
 CHUNK = 65_536  # samples at a time: what one step needs stays in the cache
@@ -52,14 +53,9 @@ class Chain:
 
     @property
     def gripper(self) -> Floats:
-        """The frame that X is given in: T_base_gripper, or the base itself, (4, 4)."""
+        """The frame that X is given in, in the base: T_base_gripper, or the base itself, (4, 4)."""
         carried = self.mount == "eye_in_hand" and self.T_base_gripper is not None
         return np.asarray(self.T_base_gripper) if carried else np.eye(4)
-
-    @property
-    def R_base_frame(self) -> Floats:
-        """From the axes that X is given in (base or gripper) to the base's, (3, 3)."""
-        return self.gripper[:3, :3]
 
     @property
     def arm_lever(self) -> Floats:
@@ -114,7 +110,7 @@ def jacobian(chain: Chain, names: tuple[str, ...] = PINHOLE_PARAMETERS) -> Float
 
     names (p): the parameters of K and the lens that count, in their order.
     """
-    view, R, frame = chain.view, chain.view.R_base_camera, chain.R_base_frame
+    view, R, frame = chain.view, chain.view.R_base_camera, chain.gripper[:3, :3]
     chosen = [PARAMETERS.index(name) for name in names]
     turned = -cross_matrix(view.lever_base) @ frame
     arm = np.concatenate([-cross_matrix(chain.arm_lever), np.eye(3)], axis=1)
@@ -186,10 +182,7 @@ class FirstOrderCheck:
     def __repr__(self) -> str:
         ratio = ", ".join(f"{r:.3f}" for r in self.ratio)
         shift = ", ".join(f"{1e3 * m:+.2f}" for m in self.mean_m)
-        return (
-            f"variances of first order over Monte Carlo's ({self.n:,} samples): {ratio}; "
-            f"mean off by {shift} mm"
-        )
+        return say("budget.first_order", n=self.n, ratio=ratio, shift=shift)
 
 
 def check_first_order(
@@ -224,7 +217,7 @@ def displacements(chain: Chain, names: tuple[str, ...], errors: Floats) -> Float
     where there is no ray.
     """
     pixel, depth, K, X, arm = np.split(errors, np.cumsum([2, 1, len(names), 6]))
-    view, frame, lever = chain.view, chain.R_base_frame, chain.arm_lever[:, None]
+    view, frame, lever = chain.view, chain.gripper[:3, :3], chain.arm_lever[:, None]
     seen = _seen(view, names, pixel, K) * (view.distance_m + depth[0])
     in_frame = _turn(X[:3], frame.T @ view.R_base_camera @ seen) + X[3:]
     moved = frame @ in_frame - view.lever_base[:, None]
@@ -254,13 +247,9 @@ def _ideal(x: Floats, y: Floats, start: Floats, lens: Any) -> tuple[Floats, Floa
     lens: k1, k2, p1, p2, k3, of one number or (m,) each.
     NaN where Newton's method has not arrived: close to a fold, or beyond it.
     """
-    k1, k2, p1, p2, k3 = lens
     a, b = np.full_like(x, start[0]), np.full_like(y, start[1])
     for _ in range(UNDISTORTION_STEPS):
-        r2 = a * a + b * b
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        off_x = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a) - x
-        off_y = b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b - y
+        off_x, off_y = np.subtract(bent(a, b, lens), (x, y))
         xx, xy, yy = distortion_jacobian(np.stack([a, b], axis=-1), lens)
         determinant = xx * yy - xy * xy
         step_a = (yy * off_x - xy * off_y) / determinant

@@ -13,16 +13,13 @@ from coursekit.cameras.librealsense import LibraryMissing, connected_realsenses
 from coursekit.cameras.realsense import RealSense
 from coursekit.cameras.recording import INDEX, INTRINSICS
 from coursekit.cameras.simulated import SimulatedCamera, my_unit
+from coursekit.words import say
 
 __all__ = [
     "Camera", "CameraError", "Frame", "Frames", "conventions", "my_unit", "open_camera", "place",
 ]  # fmt: skip
 
 VARIABLE = "COURSEKIT_CAMERA"
-CAMERA_NAMES = (
-    'want "auto", "simulated", a serial number, the path of a .db3, .bag or .mcap recording, '
-    "or a folder of them or of depth images"
-)
 
 
 def open_camera(
@@ -60,7 +57,7 @@ def open_camera(
         path = Path(which)
         if path.suffix or "/" in which or os.sep in which or (which and path.is_dir()):
             return _recording(path)
-    raise ValueError(f"{argument}: got {which!r}, {CAMERA_NAMES}")
+    raise ValueError(f"{argument}: got {which!r}, {say('cameras.which')}")
 
 
 def _connected_or_simulated(infrared: bool, seed: int | None) -> Camera:
@@ -75,10 +72,8 @@ def _live(serial: str, infrared: bool) -> Camera:
     present = connected_realsenses()  # librealsense waits 15 s for a camera that is not there
     if serial not in present:
         found = ", ".join(f"{number} ({name})" for number, name in present.items())
-        raise CameraError(
-            f"there is no RealSense with serial number {serial} on USB; "
-            + (f"there is {found}: open that one" if found else "there is none: plug it in")
-        )
+        instead = f"there is {found}: open that one" if found else "there is none: plug it in"
+        raise CameraError(say("cameras.no_such_serial", serial=serial, instead=instead))
     return RealSense(serial, infrared=infrared)
 
 

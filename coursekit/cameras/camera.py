@@ -9,14 +9,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from coursekit import checks
 from coursekit.cameras import recording
 from coursekit.cameras.frames import CameraError, Description, Frame, Frames
 from coursekit.geometry import Intrinsics
 from coursekit.results import Quantity
-from coursekit.words import counting
+from coursekit.words import counting, say
 
 
 @dataclass(frozen=True)
@@ -43,15 +43,13 @@ class HiddenTruth:
         return self.reported_baseline_m / self.baseline_m - 1.0
 
     def __repr__(self) -> str:
-        return (
-            f"true baseline {1000 * self.baseline_m:.3f} mm, reported "
-            f"{1000 * self.reported_baseline_m:.3f} mm: depth scale error "
-            f"{100 * self.scale_error:+.2f} %\n"
-            f"disparity offset {self.disparity_offset_px:+.3f} px, drifting by "
-            f"{self.drift_px:.3f} px with a correlation time of {self.drift_time_s:g} s\n"
-            f"true colour lens {_lens_text(self.color_lens)}\n"
-            f"        reported {_lens_text(self.reported_color_lens)}"
-        )
+        baselines_mm = {
+            "true_mm": 1e3 * self.baseline_m,
+            "reported_mm": 1e3 * self.reported_baseline_m,
+        }
+        lenses = map(_lens_text, (self.color_lens, self.reported_color_lens))
+        both = dict(zip(("true_lens", "reported_lens"), lenses, strict=True))
+        return say("cameras.truth", t=self, percent=100 * self.scale_error, **baselines_mm, **both)
 
 
 class Camera(Description, ABC):
@@ -82,7 +80,7 @@ class Camera(Description, ABC):
         and CameraError for what a recorded set does not hold (the message lists what it does).
         """
         recording.check_distance(distance_m)
-        print(f"{self.name}: a recording cannot be rearranged, it shows what it shows.")
+        print(f"{say('cameras.not_rearranged', name=self.name)}, it shows what it shows.")
 
     def set(
         self,
@@ -97,14 +95,16 @@ class Camera(Description, ABC):
         RealSense changes nothing else, and this only where the device offers it. A recording cannot
         be changed. Raises ValueError for a figure out of range, and CameraError.
         """
+        asked = {"ambient": ambient, "exposure": exposure, "depth_scale_m": depth_scale_m}
+        return self._change({name: value for name, value in asked.items() if value is not None})
+
+    def _change(self, asked: dict[str, Any]) -> str:
+        """Do what `set` was asked for, and say what was done."""
         return "A recording cannot be changed: light, exposure and units are as recorded."
 
     def reveal(self) -> HiddenTruth:
         """What the simulated camera really is, to be looked at last; CameraError for any other."""
-        raise CameraError(
-            f"nobody knows the true geometry of the {self.name}: only a camera that "
-            'open_camera("simulated") opened can reveal it'
-        )
+        raise CameraError(say("cameras.not_revealed", name=self.name))
 
     def factory_values(self) -> dict[str, Quantity]:
         """What the device says of itself, for `results.save`: nobody has told how uncertain it is.
@@ -178,7 +178,9 @@ class Camera(Description, ABC):
         """
         checks.whole("n", n)
         if not self.can_place:
-            raise CameraError(f"{self.name}: a recording cannot be rearranged, so it makes no set")
+            raise CameraError(
+                f"{say('cameras.not_rearranged', name=self.name)}, so it makes no set"
+            )
         index = recording.Index.to_extend(Path(folder).expanduser(), name, distances_m, overwrite)
         for distance_m in distances_m:
             scene = recording.scene_to_record(name, distance_m)
@@ -225,19 +227,15 @@ def place(camera: Camera, name: str, distance_m: float) -> Iterator[Camera]:
 
 def camera_line(camera: Camera, where: str, without: str) -> str:
     """A camera's figures in a line; without: what is said of a baseline that it does not have."""
-    depth, color, baseline_m = camera.depth, camera.color, camera.baseline_m
+    color, baseline_m, unit_mm = camera.color, camera.baseline_m, 1000 * camera.depth_scale_m
     colour = f"colour {color.width}x{color.height}" if color else "no colour"
     baseline = without if baseline_m is None else f"{1000 * baseline_m:.1f} mm"
-    return (
-        f"{camera.name} ({where}): depth {depth.width}x{depth.height}, {colour}, "
-        f"baseline {baseline}, depth unit {1000 * camera.depth_scale_m:g} mm"
+    return say(
+        "cameras.camera", c=camera, where=where, colour=colour, baseline=baseline, unit_mm=unit_mm
     )
 
 
 def _lens_text(lens: Intrinsics) -> str:
     names = ("k1", "k2", "p1", "p2", "k3")
     coeffs = ", ".join(f"{n} {c:+.4f}" for n, c in zip(names, lens.coeffs, strict=True) if c)
-    return (
-        f"fx {lens.fx:.2f}, fy {lens.fy:.2f}, cx {lens.cx:.2f}, cy {lens.cy:.2f} px, "
-        f"{coeffs or 'no distortion'}"
-    )
+    return say("cameras.lens", lens=lens, coeffs=coeffs or "no distortion")

@@ -36,6 +36,7 @@ from coursekit.cameras.frames import CameraError
 from coursekit.cameras.simulated import SimulatedCamera
 from coursekit.geometry import Intrinsics, make_transform, project
 from coursekit.geometry import transform_points as through
+from coursekit.words import say
 
 FOLDER = "03_views"
 STILL_FRAMES = 5  # over so many frames in a row ...
@@ -117,8 +118,10 @@ def capture(
             if not album.views:
                 raise
         except CameraError as error:
-            kept = f"{len(album.views)} views are kept in {album.folder}; capture goes on from them"
-            raise CameraError(f"{error}. {kept}", error.frames) from error
+            kept = say(
+                "cameras.views_kept", error=error, count=len(album.views), folder=album.folder
+            )
+            raise CameraError(kept, error.frames) from error
     print(_summary(camera, album, views, before))
     return Detections(album.views, album.skipped)
 
@@ -131,16 +134,14 @@ class Shot(NamedTuple):
 
 
 def _summary(camera: Camera, album: Album, views: int, before: int) -> str:
-    have, where = len(album.views), album.folder.name
+    have, about = len(album.views), {"name": camera.name, "folder": album.folder.name}
     if have == before:
-        return (
-            f"{before} views of the {camera.name} were in {where} already, none was "
-            "taken: ask for more, or start again with overwrite=True."
-        )
+        return say("cameras.none_taken", before=before, **about)
     count = f"{have} views" if have >= views else f"{have} of {views} views"
     moved = ": there is no board to hold, so the simulated camera was moved"
-    how = moved if isinstance(camera, SimulatedCamera) else ""
-    return f"{count} of the {camera.name} in {where}{how}."
+    return say(
+        "cameras.taken", count=count, how=moved * isinstance(camera, SimulatedCamera), **about
+    )
 
 
 # --- where views come from ---
@@ -258,10 +259,8 @@ class _Waiting:
                 except BoardNotFound as error:
                     self._why = str(error)
         if time_s - self._since_s > self._timeout_s:
-            raise CameraError(
-                f"no still, new and sharp view of the board within {self._timeout_s:g} s: "
-                + (self._why or "hold it still where the live image asks for it, in good light")
-            )
+            why = self._why or say("cameras.hold_still")
+            raise CameraError(say("cameras.too_long", timeout_s=self._timeout_s, why=why))
         return self._why or NO_BOARD * (detection is None)
 
     def is_over(self, detection: Detection, taken: Sequence[Detection]) -> bool:
@@ -316,11 +315,8 @@ class Album:
         known = json.loads(path.read_text("utf-8")) if path.exists() else None
         if known != self._session:
             whose = "nobody knows what" if known is None else f"{known['camera']}, {known['board']}"
-            raise ValueError(
-                f"folder: {self.folder} holds {len(images)} views of {whose}, not of "
-                f"{self._session['camera']}, {self._session['board']}: name another folder, or "
-                "overwrite=True to delete them"
-            )
+            held = {"folder": self.folder, "count": len(images), "whose": whose}
+            raise ValueError(say("cameras.other_views", card=self._session, **held))
         for path in images:
             image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
             try:

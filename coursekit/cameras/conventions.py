@@ -6,8 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from importlib.metadata import version
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -114,10 +113,3 @@ def table(*yours: Function) -> tuple[list[Agreement], str]:
         return measure(*yours), "measured on this computer"
     except LibraryMissing:
         return stored(), "stored: pyrealsense2 is not installed here"
-
-
-def store() -> None:
-    """Measure and write data/vendor_models.json (called by tools/make_data.py)."""
-    note = f"coursekit.cameras.conventions, pyrealsense2 {version('pyrealsense2')}"
-    rows = [{k: v for k, v in asdict(row).items() if v is not None} for row in measure()]
-    results.write_json(VENDOR_MODELS, {"source": note, "rows": rows})

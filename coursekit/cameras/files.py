@@ -14,13 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from coursekit import checks, results
 from coursekit.arrays import AnyArray, Floats, NDArray
+from coursekit.boards.detector import natural
 from coursekit.cameras import recording
 from coursekit.cameras.camera import Camera, camera_line
 from coursekit.cameras.frames import FRAMES_PER_S, NO_DEPTH, CameraError, Description, Frame
 from coursekit.cameras.librealsense import LibraryMissing
 from coursekit.cameras.realsense import RealSense, shortest_decimal
 from coursekit.geometry import Intrinsics, invert_transform, make_transform
-from coursekit.words import counted
+from coursekit.words import counted, say
 
 FINE_M = 0.0001  # a count of depth that was recorded as metres
 STREAM = {  # by our name what is in the name of its topic
@@ -90,9 +91,7 @@ class RosBag(Camera):
         except CameraError:
             raise
         except Exception as error:  # of damaged bytes rosbags, SQLite and zstd raise what they like
-            raise CameraError(
-                f"{self._what} is damaged ({error}): copy it again or record it anew"
-            ) from error
+            raise CameraError(say("cameras.damaged", what=self._what, error=error)) from error
 
     def _messages(self, reader: Any, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
         """Topic, time (ns) and message, in the order of their times."""
@@ -171,7 +170,7 @@ class RosBag(Camera):
         )
 
     def lock(self) -> str:
-        return "A recording cannot be changed: exposure and focus are as they were recorded."
+        return say("cameras.as_recorded")
 
     def close(self) -> None:
         pass  # the file is open only while frames are read
@@ -329,10 +328,8 @@ class RecordedSet(Camera):
         played = play(self._index.folder / scene.file)
         if before is not None and played.serial != before.serial:
             played.close()
-            raise CameraError(
-                f"{scene.file} was recorded by another camera ({played.serial}, not "
-                f"{before.serial}): record one set with one camera"
-            )
+            serials = {"serial": played.serial, "before": before.serial}
+            raise CameraError(say("cameras.other_camera", file=scene.file, **serials))
         if before is not None:
             before.close()
         self._played, self._scene = played, scene
@@ -340,19 +337,15 @@ class RecordedSet(Camera):
             setattr(self, name, getattr(played, name))
 
     def __repr__(self) -> str:
-        return (
-            f"{self.name} (recorded set {self._index.folder.name}, now {self._scene}), "
-            f"which holds {self._index}"
-        )
+        where = {"folder": self._index.folder.name, "index": self._index}
+        return say("cameras.set", name=self.name, scene=self._scene, **where)
 
     def place(self, name: str, distance_m: float) -> None:
         recording.check_distance(distance_m)
         scene = next((s for s in self._index.scenes if s.is_at(name, distance_m)), None)
         if scene is None:
-            raise CameraError(
-                f"the set {self._index.folder.name} has no {name} at {distance_m:.3f} m: it holds "
-                f"{self._index}"
-            )
+            where = {"folder": self._index.folder.name, "index": self._index}
+            raise CameraError(say("cameras.not_held", name=name, distance_m=distance_m, **where))
         if scene != self._scene:
             self._turn_to(scene, before=self._played)
 
@@ -377,17 +370,11 @@ class ImageFolder(Camera):
 
     def __init__(self, folder: Path) -> None:
         path, self._what = folder / recording.INTRINSICS, f"the folder {folder.name}"
-        numbers = re.compile(r"(\d+)")  # a text's odd parts: img_2 comes before img_10
-        self._images = sorted(
-            folder.glob("*.png"),
-            key=lambda png: [int(t) if i % 2 else t for i, t in enumerate(numbers.split(png.stem))],
-        )
+        self._images = sorted(folder.glob("*.png"), key=natural)  # img_2 comes before img_10
         if not self._images or not path.exists():
             missing = recording.INTRINSICS if self._images else "16-bit PNGs"
-            raise CameraError(
-                f"{self._what} lacks {missing}: to be a camera it holds 16-bit PNGs of depth and "
-                f"{recording.INTRINSICS} with width, height, fx, fy, cx, cy (px) and depth_scale_m"
-            )
+            lacks = {"missing": missing, "intrinsics": recording.INTRINSICS}
+            raise CameraError(say("cameras.incomplete_folder", what=self._what, **lacks))
         try:
             given = results.read_json(path)
             self.depth_scale_m = recording.check_depth_scale(given.pop("depth_scale_m", None))

@@ -10,7 +10,7 @@ import numpy as np
 
 from coursekit.arrays import AnyArray, Floats, Image, NDArray
 from coursekit.geometry import Intrinsics, align_depth_to_color, deproject_image
-from coursekit.words import Listed, counted
+from coursekit.words import Listed, counted, say
 
 NO_DEPTH = np.iinfo(np.uint16).max  # what some devices say of what is too far or not seen
 FRAMES_PER_S = 30  # of all streams that the course opens, simulates and records
@@ -85,9 +85,7 @@ class Frame:
         Raises CameraError when the camera has no colour stream.
         """
         if self.color_intrinsics is None or self.T_color_depth is None:
-            raise CameraError(
-                "this frame has no colour stream to put the depth on: use depth_m or points()"
-            )
+            raise CameraError(say("cameras.no_colour"))
         return align_depth_to_color(
             self.depth_m, self.depth_intrinsics, self.color_intrinsics, self.T_color_depth
         )

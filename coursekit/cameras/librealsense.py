@@ -11,22 +11,11 @@ from types import ModuleType
 from typing import Any
 
 from coursekit.cameras.frames import CameraError
+from coursekit.words import ROOM_TEXTS, say
 
 USB_DEVICES = Path("/sys/bus/usb/devices")  # Linux only
 
-UDEV_ADVICE = (
-    "install librealsense's udev rules (config/99-realsense-libusb.rules of its repository into "
-    "/etc/udev/rules.d, then `sudo udevadm control --reload-rules && sudo udevadm trigger`) "
-    "and plug the camera in again"
-)
-# By words in librealsense's message: what happened and what to do next
-START_ADVICE = {
-    "busy|power state": "another program uses it: close the RealSense Viewer, shut down other "
-    "notebooks' kernels, or unplug it and plug it in again",
-    "permission|access": f"you have no permission to use it: {UDEV_ADVICE}",
-    "resolve|no device connected": "it does not offer depth 848x480 with colour 640x480 at 30 Hz "
-    "here: plug it into a USB 3 port with a USB 3 cable",
-}
+UDEV_ADVICE = say("cameras.udev")
 
 
 class LibraryMissing(CameraError):
@@ -46,18 +35,9 @@ def load_librealsense() -> ModuleType:
     try:
         import pyrealsense2
     except ModuleNotFoundError:
-        raise LibraryMissing(
-            "pyrealsense2 is not installed, so no RealSense can be opened and nothing recorded: "
-            "`pip install -r requirements-camera.txt` installs it on x86-64 Linux and Windows; "
-            "there is none for macOS and most ARM computers, where recordings and the simulated "
-            "camera work"
-        ) from None
+        raise LibraryMissing(say("cameras.not_installed")) from None
     except ImportError as error:
-        raise LibraryMissing(
-            f"pyrealsense2 is installed but does not load ({error}): "
-            "`pip install --force-reinstall -r requirements-camera.txt` may help; "
-            "the simulated camera works without it"
-        ) from error
+        raise LibraryMissing(say("cameras.not_loading", error=error)) from error
     return pyrealsense2
 
 
@@ -76,10 +56,7 @@ def connected_realsenses() -> dict[str, str]:
         raise CameraError(start_problem("the RealSense", error)) from error
     found.pop("", None)  # a device in recovery mode has no serial number
     if not found and _realsense_on_usb():
-        raise CameraError(
-            "a RealSense is plugged in, but librealsense cannot open it; most likely you have no "
-            f"permission to use it: {UDEV_ADVICE}"
-        )
+        raise CameraError(say("cameras.not_permitted", udev=UDEV_ADVICE))
     return found
 
 
@@ -91,10 +68,11 @@ def device_info(rs: ModuleType, device: Any, name: str) -> str:
 
 def start_problem(what: str, error: RuntimeError) -> str:
     """The message for a live camera that does not start: what happened and what to do next."""
-    for words, advice in START_ADVICE.items():
+    for words, advice in ROOM_TEXTS["cameras"]["start"].items():
         if re.search(words, str(error).lower()):
-            return f"{what} does not start; {advice} (librealsense says: {error})"
-    return f"{what} does not start (librealsense says: {error}): unplug it, plug it in, try again"
+            because = advice.format(udev=UDEV_ADVICE)
+            return say("cameras.not_starting_because", what=what, advice=because, error=error)
+    return say("cameras.not_starting", what=what, error=error)
 
 
 def _realsense_on_usb() -> bool:

@@ -10,7 +10,7 @@ import threading
 import weakref
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from coursekit.cameras.camera import Camera, camera_line
 from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Frame
 from coursekit.cameras.librealsense import device_info, load_librealsense, start_problem
 from coursekit.geometry import Intrinsics, make_transform
+from coursekit.words import ROOM_TEXTS, say
 
 DEPTH_SIZE, COLOR_SIZE = (848, 480), (640, 480)
 WARM_UP_FRAMES = 30  # automatic exposure settles in about a second
@@ -29,15 +30,6 @@ POLL_MS = 50  # a recording's last wait always runs out, so it is short
 # Without a frame in so many waits (5 s) the camera is gone. Waits are counted, because a busy
 # computer can let any time pass between two of them.
 MOST_POLLS = 100
-
-UNPLUGGED = "is it still plugged in? Plug it in again, directly and with its own cable, and reopen"
-
-PLACING = {
-    "60 mm block": "Put the 60 mm block on the table, its front face square to the camera,",
-    "wall": "Point the camera at a bland wall that fills the image, turned by about 7 degrees,",
-    "artefacts": "Look down on a table with something dark, shiny, tall and small on it and a "
-    "finger near the camera, the middle of the image",
-}
 
 _live_cameras: weakref.WeakValueDictionary[str, RealSense] = weakref.WeakValueDictionary()
 
@@ -86,7 +78,7 @@ class RealSense(Camera):
         """Start streaming; of a recording from its beginning."""
         with self._running.turn:
             if self._running.left:
-                raise CameraError(f"{self._what} was closed while it was giving frames")
+                raise CameraError(say("cameras.closed_meanwhile", what=self._what))
             try:
                 pipeline = self._rs.pipeline()
                 config = self._playback_config(pipeline) if self._path else self._live_config()
@@ -99,8 +91,7 @@ class RealSense(Camera):
                     raise CameraError(start_problem(self._what, error)) from error
                 reason = str(error).rsplit("Reason: ", maxsplit=1)[-1]
                 raise CameraError(
-                    f"{self._what} cannot be read: it is damaged, incomplete or not from a "
-                    f"RealSense; copy it again or record it anew (librealsense says: {reason})"
+                    say("cameras.not_read", what=self._what, reason=reason)
                 ) from error
             self._running.run(pipeline, playback)
 
@@ -148,7 +139,7 @@ class RealSense(Camera):
 
     def _check_open(self) -> None:
         if not self._running:
-            raise CameraError(f"{self._what} is closed: open it again with open_camera()")
+            raise CameraError(say("cameras.closed", what=self._what))
 
     def _depth_sensor(self) -> Any:
         return self._profile.get_device().first_depth_sensor()
@@ -221,10 +212,7 @@ class RealSense(Camera):
             if last is not None and last.number in numbers:
                 lost = numbers[::-1].index(last.number)
             if lost:
-                raise CameraError(
-                    f"{self._what} is damaged: its last {lost} depth images cannot be read; "
-                    "ask for fewer frames, copy the file again or record it anew"
-                )
+                raise CameraError(say("cameras.damaged_end", what=self._what, lost=lost))
         if last is None:
             raise CameraError(f"{self._what} holds no frames: record it anew")
 
@@ -235,18 +223,21 @@ class RealSense(Camera):
             try:
                 arrived, frameset, status = self._running.poll()
             except RuntimeError as error:
-                raise CameraError(
-                    f"{self._what} stopped giving frames ({error}): {UNPLUGGED}"
-                ) from error
+                stopped = (
+                    f"{self._what} stopped giving frames ({error}): {say('cameras.unplugged')}"
+                )
+                raise CameraError(stopped) from error
             if arrived is None:
-                raise CameraError(f"{self._what} was closed while it was giving frames")
+                raise CameraError(say("cameras.closed_meanwhile", what=self._what))
             if arrived:
                 return frameset
             if ended:
                 return None
             ended = status is not None and status == self._rs.playback_status.stopped
         silence_s = MOST_POLLS * POLL_MS / 1000
-        raise CameraError(f"no frame came from {self._what} for {silence_s:g} s: {UNPLUGGED}")
+        raise CameraError(
+            f"no frame came from {self._what} for {silence_s:g} s: {say('cameras.unplugged')}"
+        )
 
     def _frame(self, group: _Group) -> Frame:
         depth, color, infrared = group
@@ -269,29 +260,26 @@ class RealSense(Camera):
         recording.check_distance(distance_m)
         device = specified(self.name)
         glass_m = device.nominal.glass_m if device else 0.0
-        what = PLACING.get(name, f"Put the {name}")
-        print(
-            f"{what} {1000 * (distance_m - glass_m):.0f} mm from the camera's front glass by tape "
-            f"measure: Z = {distance_m:.3f} m begins {1000 * glass_m:.1f} mm behind the glass."
+        what, distance_mm = (
+            ROOM_TEXTS["cameras"]["placing"].get(name, f"Put the {name}"),
+            1000 * (distance_m - glass_m),
         )
+        where = {"distance_mm": distance_mm, "distance_m": distance_m, "glass_mm": 1000 * glass_m}
+        print(say("cameras.place", what=what, **where))
         input("Press Enter when it stands there")
         self._skip(WARM_UP_FRAMES)  # those from before, and until automatic exposure has settled
 
-    def set(
-        self,
-        ambient: float | None = None,
-        exposure: float | Literal["auto"] | None = None,
-        depth_scale_m: float | None = None,
-    ) -> str:
+    def _change(self, asked: dict[str, Any]) -> str:
         if self._path is not None:
-            return super().set(ambient, exposure, depth_scale_m)
+            return super()._change(asked)
         said = []
-        if ambient is not None:
+        if "ambient" in asked:
             said.append("the room's light is yours to change: draw the curtains, turn on a lamp")
-        if exposure is not None:
+        if "exposure" in asked:
             said.append("exposure stays: lock() fixes it where automatic exposure has put it")
-        if depth_scale_m is not None:
-            said.append(self._set_depth_scale(recording.check_depth_scale(depth_scale_m)))
+        if "depth_scale_m" in asked:
+            scale_m = recording.check_depth_scale(asked["depth_scale_m"])
+            said.append(self._set_depth_scale(scale_m))
         sentence = "; ".join(said or ["nothing to change"])
         return sentence[0].upper() + sentence[1:] + "."
 
@@ -311,9 +299,9 @@ class RealSense(Camera):
         self._query()
         self._skip(WARM_UP_FRAMES)
         if refused or not np.isclose(self.depth_scale_m, depth_scale_m, rtol=1e-3):
+            keeps = say("cameras.keeps_unit", what=self._what, unit_mm=1000 * self.depth_scale_m)
             raise CameraError(
-                f"{self._what} keeps its depth unit of {1000 * self.depth_scale_m:g} mm"
-                + (f" (librealsense says: {refused})" if refused else "")
+                keeps + (f" (librealsense says: {refused})" if refused else "")
             ) from refused
         return f"depth unit set to {1000 * self.depth_scale_m:g} mm"
 
@@ -326,7 +314,7 @@ class RealSense(Camera):
         takes its manual setting. A recording is left as it is. Returns one sentence that says so.
         """
         if self._path is not None:
-            return "A recording cannot be changed: exposure and focus are as they were recorded."
+            return say("cameras.as_recorded")
         self._check_open()
         rs, locked = self._rs, []
         try:

@@ -20,6 +20,7 @@ from coursekit.arrays import AnyArray
 from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Description, Frame
 from coursekit.cameras.librealsense import load_librealsense
 from coursekit.geometry import Intrinsics
+from coursekit.words import say
 
 FILE_STARTS = {
     ".db3": b"SQLite format 3\0",
@@ -45,9 +46,7 @@ SAME_PLACE_M = 0.0005  # distances closer than this are one place
 def check_recording(path: Path) -> None:
     """CameraError with what to do when `path` is no recording, before librealsense opens it."""
     if path.suffix not in FILE_STARTS:
-        raise CameraError(
-            f"{path} is no recording: its name must end in .db3, .bag or .mcap, in lower case"
-        )
+        raise CameraError(say("cameras.no_recording", path=path))
     if not path.exists():
         raise CameraError(f"there is no file {path}: check the name and the folder")
     if not path.is_file():
@@ -56,16 +55,12 @@ def check_recording(path: Path) -> None:
         with path.open("rb") as file:
             start = file.read(16)
     except OSError as error:
-        raise CameraError(
-            f"{path} cannot be read ({error.strerror}): check its permissions"
-        ) from error
+        denied = f"{path} cannot be read ({error.strerror}): check its permissions"
+        raise CameraError(denied) from error
     if not start:
         raise CameraError(f"{path} is empty: copy it again or record it anew")
     if not start.startswith(FILE_STARTS[path.suffix]):
-        raise CameraError(
-            f"{path} is not a {path.suffix} recording, though its name says so: "
-            "open a file that a RealSense program or camera.record() wrote"
-        )
+        raise CameraError(say("cameras.other_file", path=path, suffix=path.suffix))
     _topics(path)  # which says when it is truncated
 
 
@@ -79,14 +74,8 @@ def is_of_ros(path: Path) -> bool:
 
 def without_depth(path: Path, topics: Sequence[str]) -> CameraError:
     """What is wrong with a recording of ROS topics that hold no depth images."""
-    shown = min(
-        topics, key=lambda topic: ("depth" not in topic, "info" in topic, topic), default=""
-    )
-    return CameraError(
-        f"{path} is a recording of ROS topics ({shown} ...) without depth images (16UC1 or 32FC1) "
-        "and their camera_info, which is what the course plays: record those two topics, or "
-        "record with `coursekit record` or realsense-viewer"
-    )
+    nearest = sorted(topics, key=lambda topic: ("depth" not in topic, "info" in topic, topic))
+    return CameraError(say("cameras.without_depth", path=path, shown="".join(nearest[:1])))
 
 
 def _topics(path: Path) -> list[str]:
@@ -96,10 +85,7 @@ def _topics(path: Path) -> list[str]:
 
 
 def _truncated(path: Path, there: int, wanted: int) -> CameraError:
-    return CameraError(
-        f"{path} is truncated: {there / 1e6:.2f} MB of at least {wanted / 1e6:.2f} MB are there; "
-        "copy it again or record it anew"
-    )
+    return CameraError(say("cameras.truncated", path=path, there=there / 1e6, wanted=wanted / 1e6))
 
 
 def _topics_of_db3(path: Path) -> list[str]:
@@ -171,10 +157,7 @@ def _database(path: Path, mode: str = "ro") -> Iterator[sqlite3.Connection]:
         with contextlib.closing(sqlite3.connect(address, uri=True)) as file, file:
             yield file
     except sqlite3.DatabaseError as error:
-        raise CameraError(
-            f"the recording {path.name} is damaged or the disk is full ({error}): "
-            "free some space, copy the file again or record it anew"
-        ) from error
+        raise CameraError(say("cameras.damaged_or_full", name=path.name, error=error)) from error
 
 
 # --- writing -----------------------------------------------------------------------------------
@@ -257,17 +240,11 @@ def _publish(unfinished: Path, target: Path, given: int) -> None:
     """Give a finished recording its name, once all its frames are found in it."""
     written = len(depth_frame_numbers(unfinished))
     if written < given:  # librealsense does not say when it cannot write
-        raise CameraError(
-            f"only {written} of {given} frames could be written beside {target}, so nothing was "
-            "kept: the disk is probably full; free some space and record again"
-        )
+        raise CameraError(say("cameras.not_written", written=written, given=given, target=target))
     try:
         os.replace(unfinished, target)
     except OSError as error:
-        raise CameraError(
-            f"the recording could not be named {target} ({error.strerror}): "
-            "close the programs and cameras that have it open and record again"
-        ) from error
+        raise CameraError(say("cameras.not_named", target=target, error=error.strerror)) from error
 
 
 class Writer:
@@ -395,10 +372,7 @@ class Index:
         """The index of a set; CameraError for a folder without one, and for a damaged one."""
         path = folder / INDEX
         if not path.exists():
-            raise CameraError(
-                f"{folder} is a folder: name the .db3 or .bag file in it, "
-                f"or a folder that camera.record_set() wrote, or with 16-bit PNGs and {INTRINSICS}"
-            )
+            raise CameraError(say("cameras.no_index", folder=folder, intrinsics=INTRINSICS))
         try:
             scenes = [RecordedScene(**entry) for entry in results.read_json(path)["scenes"]]
             for scene in scenes:
@@ -425,10 +399,7 @@ class Index:
         index = cls.read(folder) if (folder / INDEX).exists() else cls(folder, [])
         held = [scene for scene in index.scenes if any(scene.is_at(name, d) for d in distances_m)]
         if held and not overwrite:
-            raise ValueError(
-                f"distances_m: the set {folder} holds {cls(folder, held)} already: choose another "
-                "folder or overwrite=True"
-            )
+            raise ValueError(say("cameras.held_already", folder=folder, held=cls(folder, held)))
         try:
             folder.mkdir(exist_ok=True)
         except OSError as error:

@@ -21,10 +21,8 @@ from coursekit.geometry import Intrinsics, invert_transform
 from coursekit.simulation import Rig, RigView, Scene, artefact_scene, render, tabletop, wall_scene
 from coursekit.simulation.board_images import board_scene, check_pose, render_board
 from coursekit.specifications import Unit
+from coursekit.words import say
 
-PLUG_IN = (
-    'Plug in a RealSense and run this cell again, or name a recording: ck.open_camera("file.bag")'
-)
 SCENES: dict[str, Callable[[float], Scene]] = {
     "60 mm block": tabletop,
     "wall": wall_scene,
@@ -101,7 +99,7 @@ class SimulatedCamera(Camera):
         ambient: float = 0.01,
         exposure: float | Literal["auto"] = "auto",
         depth_scale_m: float | None = None,
-        advice: str = PLUG_IN,
+        advice: str = say("cameras.plug_in"),
     ) -> None:
         self.seed = my_unit() if seed is None else checks.whole("seed", seed, least=0)
         self._advice, self._closed = advice, False
@@ -158,22 +156,14 @@ class SimulatedCamera(Camera):
         self._place_name, self._distance_m = name, float(T[2, 3])
         self._start_afresh()
 
-    def set(
-        self,
-        ambient: float | None = None,
-        exposure: float | Literal["auto"] | None = None,
-        depth_scale_m: float | None = None,
-    ) -> str:
-        scale_m = self.depth_scale_m if depth_scale_m is None else check_depth_scale(depth_scale_m)
-        asked: dict[str, Any] = {"ambient": ambient, "exposure": exposure}
-        changed = {name: value for name, value in asked.items() if value is not None}
-        self._rig, self.depth_scale_m = replace(self._rig, **changed), scale_m
+    def _change(self, asked: dict[str, Any]) -> str:
+        scale_m = check_depth_scale(asked.pop("depth_scale_m", self.depth_scale_m))
+        self._rig, self.depth_scale_m = replace(self._rig, **asked), scale_m
         self._start_afresh()
         fixed = self._rig.exposure
-        return (
-            f"Ambient infrared {self._rig.ambient:g}, exposure "
-            f"{fixed if fixed == 'auto' else f'{fixed:.3g} ms'}, depth unit {1000 * scale_m:g} mm."
-        )
+        exposure_ms = fixed if fixed == "auto" else f"{fixed:.3g} ms"
+        light = {"ambient": self._rig.ambient, "exposure": exposure_ms}
+        return say("cameras.light", **light, unit_mm=1000 * scale_m)
 
     def lock(self) -> str:
         """Fix the exposure at what it is now, as on a real camera; one sentence that says so."""
@@ -214,7 +204,7 @@ class SimulatedCamera(Camera):
 
     def _check_open(self) -> None:
         if self._closed:
-            raise CameraError(f"the {self.name} is closed: open it again with open_camera()")
+            raise CameraError(say("cameras.closed", what=f"the {self.name}"))
 
     def _start_afresh(self) -> None:
         """Start the named stream of random numbers, and the drift at a moment that it names."""

@@ -153,10 +153,10 @@ def _colmap(words: list[str], name: str) -> dict[str, Any]:
     return found | centre | {"model": "brown_conrady" if any(coeffs) else "none", "coeffs": coeffs}
 
 
-def write_lens(fields: dict[str, Any], to: str, name: str = "camera") -> str:
+def write_lens(fields: dict[str, Any], to: str) -> str:
     """The text of a file that holds these fields, as Brown-Conrady.
 
-    to: one of `LENS_FORMATS`, or "opencv_xml". name: of the camera. Kalibr has no k3 and Open3D no
+    to: one of `LENS_FORMATS`, or "opencv_xml". Kalibr has no k3 and Open3D no
     coefficient at all: ValueError where one would be lost.
     """
     if to == "json":
@@ -164,7 +164,7 @@ def write_lens(fields: dict[str, Any], to: str, name: str = "camera") -> str:
     fx, fy, cx, cy = (float(fields[key]) for key in PINHOLE)
     coeffs = [float(value) * (fields["model"] != "none") for value in fields["coeffs"]]
     want(to != "kalibr" or not coeffs[4], "to", to, "a lens without k3: Kalibr has no place for it")
-    values = {"name": name, "width": int(fields["width"]), "height": int(fields["height"])}
+    values = {"name": "camera", "width": int(fields["width"]), "height": int(fields["height"])}
     if to == "open3d":
         want(not any(coeffs), "to", to, "a lens without distortion: undistort the images first")
         columns = {"intrinsic_matrix": [fx, 0.0, 0.0, 0.0, fy, 0.0, cx, cy, 1.0]}

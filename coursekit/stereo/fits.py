@@ -19,7 +19,7 @@ import numpy as np
 from coursekit.arrays import ArrayLike, Floats, Interval
 from coursekit.checks import array, choice, positive, want
 from coursekit.stereo.law import fx_baseline, rounded_variance
-from coursekit.words import Estimate, counted, with_notes
+from coursekit.words import Estimate, counted, say, with_notes
 
 WIDENED_BELOW = 0.05  # scatter less likely than this by chance widens the intervals
 FREE_CONSTANT_FROM = 5  # distances, from which a constant depth error is estimated
@@ -296,30 +296,22 @@ def _noise_points(
 def _noise_notes(fit: NoiseFit, z: Floats, step: float | None) -> Iterator[str]:
     free, span = "exponent" in fit.names, z[-1] / z[0]
     if fit.baseline_m is None:
-        yield "without a baseline there is no disparity: this is std over distance"
+        yield say("stereo.std_alone")
     if fit.exponent is None:
-        what = "std elsewhere" if fit.baseline_m is None else "sigma_d"
-        yield f"one distance has no exponent; {what} takes it to be 2"
+        yield say(
+            "stereo.no_exponent", what="std elsewhere" if fit.baseline_m is None else "sigma_d"
+        )
     if fit.scatter > 0:
-        yield (
-            f"repeats at one distance differ by {fit.scatter:.0%} more than their own errors say, "
-            "and the intervals hold that"
-        )
+        yield say("stereo.repeats", scatter=fit.scatter)
     if free and span < 3:
-        yield (
-            f"the distances span a factor of {span:.1f} only: 10 % more noise at one end moves "
-            f"the exponent by {math.log(1.1) / math.log(span):.2f}"
-        )
+        yield say("stereo.short_span", span=span, moves=math.log(1.1) / math.log(span))
     if free and fit.dof == 0:
-        yield "two distances and two unknowns leave nothing to check the law with"
+        yield say("stereo.no_freedom")
     if not fit.consistent:
-        yield "the distances scatter about the law by more than their errors; intervals are widened"
+        yield say("stereo.off_the_law")
     for d, std in zip(z, fit.std_m(z)[0], strict=True):
         if step and std < step / 2:
-            yield (
-                f"at {d:g} m the noise is {std / step:.2f} of the depth unit, and its correction "
-                "supposes that the true depths lie anywhere between two steps"
-            )
+            yield say("stereo.below_the_unit", d=d, share=std / step)
 
 
 # --- bias ---
@@ -486,18 +478,15 @@ def fit_bias(
 
 def _bias_notes(fit: BiasFit) -> Iterator[str]:
     if "disparity_offset_px" not in fit.names:
-        yield "one distance cannot tell a disparity offset from scale"
+        yield say("stereo.offset_or_scale")
     else:
         of_both = fit.sigma("baseline_error") * fit.sigma("disparity_offset_px")
         correlation = fit.covariance[0, 1] / of_both
         ends = fit.interval("baseline_error"), fit.interval("disparity_offset_px")
         if abs(correlation) > 0.9 and any(low <= 0 <= high for low, high in ends):
-            yield (
-                f"these distances hardly tell the two apart (correlation {correlation:.2f}): "
-                "use their sum, the bias at a distance"
-            )
+            yield say("stereo.hardly_apart", correlation=correlation)
     if not fit.consistent:
-        yield "the residuals are larger than the stated errors; intervals are widened"
+        yield say("stereo.larger_residuals")
 
 
 def _measured(

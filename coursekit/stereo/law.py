@@ -8,6 +8,7 @@ import numpy as np
 
 from coursekit.arrays import ArrayLike, Floats
 from coursekit.checks import array, number, positive, want, whole
+from coursekit.words import say
 
 
 def depth_from_disparity(disparity_px: ArrayLike, fx: float, baseline_m: float | None) -> Floats:
@@ -104,8 +105,5 @@ def unrounded_std(std: float, step: float | None) -> float:
 def fx_baseline(fx: float, baseline_m: float | None) -> float:
     """fx baseline, px m, of a focal length and a baseline that are known and positive."""
     if baseline_m is None:
-        raise ValueError(
-            "baseline_m: got None: no stereo camera, or a recording without its baseline, and so "
-            "no disparity; give 0.050 m, a D435's, if that will do"
-        )
+        raise ValueError(say("stereo.no_baseline"))
     return positive("fx", fx) * positive("baseline_m", baseline_m)

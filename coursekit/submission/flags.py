@@ -30,7 +30,7 @@ from coursekit import specifications
 from coursekit.arrays import Floats, NDArray
 from coursekit.checks import want
 from coursekit.submission.format import CameraFacts, Stack, Submission
-from coursekit.submission.recompute import TABLE_COLUMNS, SEEN, Recomputed, grading_rules
+from coursekit.submission.recompute import HEADINGS, SEEN, Recomputed, grading_rules
 
 LARGEST_WAVE = 6  # so many of them across a window; finer ones hold what was added
 N_WAVES = (
@@ -51,7 +51,7 @@ MOODLE = re.compile(
     r"(?:^|/)(?P<at>(?P<name>[^/]+?)_(?P<id>\d+)_assignsubmission_(?:file|onlinetext)_?)"
 )
 CANVAS = re.compile(r"(?:^|/)(?P<name>[^/_]+)(?P<late>_LATE)?_(?P<id>\d{2,})_\d{2,}_[^/]+$")
-NAME_COLUMNS, FIRST_AND_LAST, IDS = (TABLE_COLUMNS[k] for k in ("names", "parts_of_names", "ids"))
+NAME_COLUMNS, FIRST_AND_LAST, IDS = (HEADINGS[k] for k in ("names", "parts_of_names", "ids"))
 SHARED_RUNS = 0.7  # part of the runs of the shorter of two paragraphs that the other one has too
 
 

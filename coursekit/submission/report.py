@@ -40,14 +40,12 @@ from coursekit.submission.flags import (
     words_of,
 )
 from coursekit.submission.format import Plot, Refused, Submission, TableRow, read_bundle
-from coursekit.submission.recompute import TABLE_COLUMNS, LABELS, MISTAKES, REPEAT, SEEN, Recomputed
+from coursekit.submission.recompute import HEADINGS, LABELS, MISTAKES, REPEAT, SEEN, Recomputed
 from coursekit.submission.rubric import Grade, Item, grade
 from coursekit.words import counted
 
-HEADER = (*TABLE_COLUMNS["first"], *LABELS, *TABLE_COLUMNS["last"])  # of grades.csv
-MOODLE_COLUMNS, CANVAS_COLUMNS, OWN_COLUMNS = (
-    TABLE_COLUMNS[k] for k in ("moodle", "canvas", "own")
-)
+HEADER = (*HEADINGS["first"], *LABELS, *HEADINGS["last"])  # of grades.csv
+MOODLE_COLUMNS, CANVAS_COLUMNS, OWN_COLUMNS = (HEADINGS[k] for k in ("moodle", "canvas", "own"))
 FORMULA = tuple("=+-@\t\r\n＝＋－＠")  # what makes a spreadsheet calculate a cell
 HERE = Path(__file__).parent
 
