@@ -44,7 +44,7 @@ FRAMES_ASKED = 12  # frames of a stack that are looked for in others
 FRAMES_FOUND = 9  # of these, for the stacks to be the same measurement
 DIFFERENT = 5  # steps between values of a frame that is told by its values alone
 STRANGERS, STANDS_OUT = 0.55, 0.3  # second look: a likeness worth it, and the lead (atanh) it asks
-LEAST_FRAMES, LEAST_COUNTS = 30, 0.5  # to tell even noise from uneven
+LEAST_FRAMES, LEAST_PIXELS, LEAST_COUNTS = 30, 100, 0.5  # to tell even noise from uneven
 PERFECT_CLOCK_S = 1e-8  # no real clock keeps step so well
 WORDS_IN_A_ROW = 3  # words in a row, by which paragraphs are compared
 MOODLE = re.compile(
@@ -128,13 +128,13 @@ def _invented(found: Recomputed, limits: dict[str, float]) -> Iterator[Flag]:
     ]
     likeness = max((look.likeness for _, look in looks), default=math.inf)
     pattern = max((look.pattern for _, look in looks), default=math.inf)
-    uneven = max((look.uneven for _, look in looks if look.uneven), default=math.inf)
+    uneven = max((look.uneven for _, look in looks if look.uneven is not None), default=math.inf)
     if likeness < limits["white"]:
         yield _flag("white_in_space", likeness=likeness)
     if pattern < limits["pattern"]:
         yield _flag("no_pattern", times=pattern)
     if uneven < limits["uneven"]:
-        yield _flag("even_noise", times=uneven)
+        yield _flag("even_noise", part=uneven)
     for (one, first), (two, second) in combinations(looks, 2):
         likeness = _correlation(first.stays, second.stays)
         if likeness > limits["same_pattern"]:
@@ -145,14 +145,14 @@ class _Look(NamedTuple):
     """What the noise of a stack is like.
 
     likeness: correlation of neighbours over time. pattern: what stays in the mean, in units of what
-    averaging leaves of noise. uneven: how much the logarithms of the pixels' variances differ, in
-    units of what chance gives; 0 where frames are too few or counts too coarse to tell. stays
+    averaging leaves of noise. uneven: by which part the stds of pixels differ beyond chance; None
+    where frames or pixels are too few, or counts too coarse, to tell. stays
     (h, w): what stays in the mean, less a twisted plane, NaN where pixels are not always valid.
     """
 
     likeness: float
     pattern: float
-    uneven: float
+    uneven: float | None
     stays: Floats
 
 
@@ -177,11 +177,15 @@ def _look(counts: NDArray[np.uint16]) -> _Look | None:
     ):
         if ok.any():
             rho.append(float(np.einsum("nij,nij->", one, two)) / int(ok.sum()) / float(power))
-    uneven = 0.0
-    if n >= LEAST_FRAMES and typical >= LEAST_COUNTS:
-        apart = deviation[:, good] - deviation[:, good].mean(axis=1, keepdims=True)
+    inner = good.copy()  # a filter is uneven where a window ends
+    for edge in (inner, inner.T):
+        edge[: len(edge) // 5], edge[-(len(edge) // 5) - 1 :] = False, False
+    uneven = None
+    if n >= LEAST_FRAMES and typical >= LEAST_COUNTS and inner.sum() >= LEAST_PIXELS:
+        apart = deviation[:, inner] - deviation[:, inner].mean(axis=1, keepdims=True)
         variances = np.maximum(apart.var(axis=0), 1e-6 * typical**2)
-        uneven = float(np.log(variances).var()) / (2 / (n - 1))
+        beyond = float(np.log(variances).var()) - 2 / (n - 1)  # of a variance: twice that of a std
+        uneven = math.sqrt(max(beyond, 0.0)) / 2
     rows, columns = np.nonzero(good)
     design = np.stack([np.ones(len(rows)), columns, rows, columns * rows], axis=-1)
     stays = np.full((height, width), np.nan)
