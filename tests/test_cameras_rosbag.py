@@ -222,7 +222,7 @@ def test_a_recording_plays_where_librealsense_is_not_installed(tabletop, tmp_pat
     for package in Path(np.__file__).parents[1].iterdir():
         if not package.name.startswith(("pyrealsense2", "coursekit", "__editable__")):
             (packages / package.name).symlink_to(package)
-    (packages / "coursekit.pth").write_text(f"{Path(coursekit.__file__).parents[1]}\n")
+    (packages / "coursekit.pth").write_text(f"{Path(coursekit.__file__).parents[1]}\n", "utf-8")
     python = next((tmp_path / "env").glob("*/python"))
     ran = subprocess.run(
         [python, "-c", WITHOUT, tabletop], capture_output=True, text=True, check=False, cwd=tmp_path
