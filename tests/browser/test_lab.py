@@ -20,7 +20,7 @@ from common import NIGHTLY
 from playwright.sync_api import expect
 
 import coursekit as ck
-from coursekit.lessons.questions import Choice
+from coursekit.lessons.questions import LETTERS, Choice
 from tools import build_notebooks, copies
 
 pytestmark = pytest.mark.browser
@@ -188,6 +188,7 @@ def test_each_checkpoint_and_figure_becomes_a_widget(page, name):
     assert cells.get_by_role("button", name="Commit").count() == cells.count()
     figures = cell_with(page, "ck.drag(")
     assert figures.locator(".jupyter-widgets img[alt]").count() == figures.count()
+    assert figures.locator(".noUi-handle:not([aria-label])").count() == 0
 
 
 def test_every_checkpoint_explains_wrong_and_right_answers(page, name):
@@ -211,8 +212,11 @@ def attempts(checkpoint):
 
 
 def choose(cell, letter):
-    """By keyboard."""
-    cell.get_by_role("radio", name=letter, exact=True).press("Space")
+    """By keyboard: arrow keys go through the options, and not to another cell."""
+    cell.get_by_role("radio", name="A", exact=True).press("Space")
+    for before in LETTERS[: LETTERS.index(letter)]:
+        cell.get_by_role("radio", name=before, exact=True).press("ArrowDown")
+    expect(cell.get_by_role("radio", name=letter, exact=True)).to_be_focused()
     cell.get_by_role("button", name="Commit").press("Enter")
 
 
