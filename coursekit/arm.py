@@ -479,7 +479,7 @@ class SimulatedArm:
         self._truth = ArmTruth(offset, play, link, with_link_errors(self.nominal, link))
         self._rng = np.random.default_rng([seed, zlib.crc32(b"moves")])
         self._at = np.array(HOME)
-        self._last = self._rng.choice([-1.0, 1.0], 6)  # direction of each joint's last move
+        self._last = self._rng.choice(np.array([-1.0, 1.0]), 6)  # the way each joint last moved
         self._joints = self._true_joints(self._at[None], self._last[None])[0]
 
     def move(self, q: ArrayLike) -> Floats:

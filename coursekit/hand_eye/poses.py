@@ -176,11 +176,11 @@ class Observability:
         deg, mm = (f"{s:.2f}" if s < 10 else f"{s:.0f}" if s < 1e4 else "over 10000" for s in worst)
         free = "; ".join(self.free)  # of what is free nothing is known, whatever the poses' noise
         sizes = {"rotation": f"{deg} deg", "translation": f"{mm} mm"}
-        known = [size for what, size in sizes.items() if what not in free]
+        determined = [size for what, size in sizes.items() if what not in free]
         lines = (
             f"{self.poses} poses, turned by {turns} deg (rms) about three axes, at most "
             f"{self.largest_turn_deg:.0f} deg between two",
-            f"X would be known to {' and '.join(known) or 'nothing'} (1 sigma, worst axis)",
+            f"X would be known to {' and '.join(determined) or 'nothing'} (1 sigma, worst axis)",
             f"NOT determined: {free}." if free else "All of X is determined.",
         )
         return "\n".join(map(wrapped, lines))

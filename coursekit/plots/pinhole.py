@@ -219,7 +219,7 @@ def point_cloud(points: NDArray[np.float32]) -> LessonFigure:
     some = np.random.default_rng(0).permutation(len(near))[:30_000]  # a stride makes moiré
     fig = figure(9.0, 3.9)
     fig.set_layout_engine("none")  # the 3-D axes reserve far more room than they use
-    colors = {"vmin": cloud[:, 2].min(), "vmax": cloud[:, 2].max()}
+    colors: dict[str, Any] = {"vmin": cloud[:, 2].min(), "vmax": cloud[:, 2].max()}
     _solid(fig.add_axes((0.05, 0.0, 0.45, 0.94), projection="3d"), near[some], colors)
     above = fig.add_axes((0.55, 0.15, 0.34, 0.75))
     flat = cloud[np.abs(cloud[:, 1]) < SLICE_M]
