@@ -63,6 +63,10 @@ from coursekit.words import Estimate, wrapped
 SENTENCES = DiagnosisTexts.of("hand_eye")
 METHODS = ("refine", *CLOSED_FORMS)
 POSES = "poses.csv"
+OF_SIZE = (
+    "one of these images, {} x {} px: calibrate at their resolution, or scale K: fx and fy times "
+    "the ratio of the widths, cx + 0.5 and cy + 0.5 likewise"
+)
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 OPTIONAL = {"times": ("time",), "q": JOINTS, "dq": VELOCITIES}
 REPEATS = "repeats"  # how the reason begins for which a pair is left out by `once`
@@ -296,6 +300,13 @@ class HandEyeSession:
             )
         T, columns = _stacked(rows[file] for file in used)
         views_ = Detections(found[file] for file in used)
+        size, wanted = views_.size, (intrinsics.width, intrinsics.height)
+        want(
+            size == wanted,
+            "intrinsics",
+            "a lens of {} x {} px".format(*wanted),
+            OF_SIZE.format(*size),
+        )
         names, unused = tuple(used), tuple(skipped)
         return cls(mount, T, views_, board, intrinsics, names=names, skipped=unused, **columns)
 
@@ -359,7 +370,8 @@ def _card(folder: Path) -> dict[str, Any]:
 
 def _from_card(card: dict[str, Any], key: str) -> Any:
     if key not in card:
-        raise ValueError(f"{key}: neither given nor in {SESSION}")
+        or_ = ' (mount="eye_in_hand" or "eye_to_hand")' if key == "mount" else ""
+        raise ValueError(f"{key}: neither given{or_} nor in {SESSION}")
     return card[key]
 
 
@@ -382,7 +394,9 @@ def _table(
     files = sorted((p for p in folder.rglob("*") if p.is_file()), key=natural)
     if in_order:
         images = [file for file in files if file.suffix.lower() in IMAGES]
-        pair = f"{len(read)}, one a row: with in_order they go together"
+        pair = (
+            f"{len(read)}, one a row (with in_order they go together): keep the row of each image"
+        )
         want(len(images) == len(read) and "file" not in columns, "images", len(images), pair)
         named = zip(read, images, strict=True)
         read = [replace(row, file=file.relative_to(folder).as_posix()) for row, file in named]
