@@ -28,6 +28,7 @@ Bending under load, temperature and wear are left out.
 from __future__ import annotations
 
 import json
+import math
 import zlib
 from dataclasses import dataclass, replace
 from functools import cache
@@ -318,8 +319,9 @@ class FkErrors:
     independent normal entries with standard deviations `sigma` and the same value in every pose,
     and e_i is independent from pose to pose with covariance `each[i]`.
 
-    shared (..., 6, 55); sigma (55,); names (55,): six offsets, six plays and what the plays have in
-    common, and three rotations and three displacements at each of seven origins. each (..., 6, 6).
+    shared (..., 6, k); sigma (k,); names (k,), of `fk_covariance` 55: six offsets, six plays and
+    what the plays have in common, and three rotations and three displacements at each of seven
+    origins. each (..., 6, 6).
     """
 
     shared: Floats
@@ -368,6 +370,38 @@ def fk_covariance(
     )
     each = loose @ np.swapaxes(loose, -1, -2)
     return FkErrors(np.concatenate(columns, axis=-1), sigma, names, each)
+
+
+def upright_errors(T_base_gripper: ArrayLike, errors: ArmErrors | None = None) -> FkErrors:
+    """What poses (..., 4, 4), m, of any arm on a vertical first axis may all be wrong by.
+
+    For arms whose joint angles nobody knows. The arm may turn and shift as a whole about its base,
+    and the gripper by itself: a hand-eye session takes either for X or Y, and no residual tells.
+    Turns about the horizontal axis across the reach do show, at the shoulder, where half of what
+    the elbow does is counted, and at the wrist; they tell how large this arm's errors are. errors:
+    the sizes, the course's unless given.
+
+    >>> upright_errors([np.eye(4)]).shared.shape
+    (1, 6, 14)
+    """
+    T, errors = np.asarray(T_base_gripper, float), errors or ArmErrors()
+    R, t = T[..., :3, :3], T[..., :3, 3]
+    across = np.cross([0.0, 0.0, 1.0], t)[..., None]
+    across /= np.maximum(np.linalg.norm(across, axis=-2, keepdims=True), 1e-12)
+    base = np.broadcast_to(np.eye(3), R.shape)
+    axes = np.concatenate([base, across, across, R], axis=-1)
+    lever = np.where(np.arange(8) < 4, t[..., None], 0.0)  # about the base, or the gripper's origin
+    turns = np.concatenate([axes, np.cross(axes, lever, axis=-2)], axis=-2)
+    shifts = np.concatenate([np.zeros((*R.shape[:-1], 6)), np.concatenate([base, R], -1)], axis=-2)
+    joint, link = math.hypot(errors.offset_rad, errors.play_rad), errors.link_rad
+    sizes = {"rx of the base": link, "ry of the base": link}
+    sizes |= {"rz of the base": math.hypot(joint, link)}
+    sizes |= {"turn of the shoulder": 1.25**0.5 * joint, "turn of the wrist": 2**0.5 * joint}
+    sizes |= {f"r{axis} of the gripper": joint for axis in "xyz"}
+    sizes |= {f"{axis} of the base": errors.link_m for axis in "xyz"}
+    sizes |= {f"{axis} of the gripper": 2 * errors.link_m for axis in "xyz"}
+    shared, sigma = np.concatenate([turns, shifts], axis=-1), np.array(list(sizes.values()))
+    return FkErrors(shared, sigma, tuple(sizes), np.zeros((*R.shape[:-2], 6, 6)))
 
 
 def _by_link(frames: Floats, T: Floats) -> Floats:
@@ -445,7 +479,7 @@ class SimulatedArm:
         self._truth = ArmTruth(offset, play, link, with_link_errors(self.nominal, link))
         self._rng = np.random.default_rng([seed, zlib.crc32(b"moves")])
         self._at = np.array(HOME)
-        self._last = self._rng.choice([-1.0, 1.0], 6)  # direction of each joint's last move
+        self._last = self._rng.choice(np.array([-1.0, 1.0]), 6)  # the way each joint last moved
         self._joints = self._true_joints(self._at[None], self._last[None])[0]
 
     def move(self, q: ArrayLike) -> Floats:

@@ -11,7 +11,7 @@ import json
 import os
 import platform
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -123,6 +123,7 @@ class Placement:
 
     mount: "eye_in_hand" or "eye_to_hand". covariance (6, 6): of a small turn about the axes of
     `parent` (rad) and a shift along them (m), (rx, ry, rz, tx, ty, tz); None where nobody knows.
+    verdict: how good it is, in a sentence that goes along wherever the place goes.
     """
 
     parent: str
@@ -130,9 +131,11 @@ class Placement:
     mount: str
     T: Floats
     covariance: Floats | None = None
+    verdict: str = ""
 
     def __post_init__(self) -> None:
         checks.choice("mount", self.mount, PARENTS)
+        checks.instance("verdict", self.verdict, str)
         object.__setattr__(self, "T", checks.transform("T", self.T))
         if self.covariance is not None:
             known = checks.covariance("covariance", self.covariance, 6)
@@ -151,13 +154,15 @@ class Placement:
             "quaternion_xyzw": [q[name] for name in pose_files.TURN],
             "rpy_rad": [q[name] for name in ("roll", "pitch", "yaw")],
             "covariance_rad_m": known,
+            "verdict": self.verdict,
         }
 
     @classmethod
     def from_dict(cls, content: dict[str, Any]) -> Placement:
         """Of `to_dict`; the matrix counts, what else says the same is for other readers."""
         c = content
-        return cls(c["parent"], c["child"], c["mount"], c["T"], c["covariance_rad_m"])
+        verdict = c.get("verdict", "")  # files of before have none
+        return cls(c["parent"], c["child"], c["mount"], c["T"], c["covariance_rad_m"], verdict)
 
     def of_link(self, link: str, T_link_optical: ArrayLike) -> Placement:
         """Where the link is that a driver hangs the optical frame on: T inv(T_link_optical)."""
@@ -165,7 +170,7 @@ class Placement:
         known, moved = self.covariance, np.eye(6)
         moved[3:, :3] = -cross_matrix(T[:3, 3] - self.T[:3, 3])  # a turn of the camera moves it
         known = None if known is None else moved @ known @ moved.T
-        return Placement(self.parent, link, self.mount, T, known)
+        return replace(self, child=link, T=T, covariance=known)
 
 
 @dataclass(frozen=True)
@@ -262,6 +267,13 @@ def read(path: Path) -> Result:
 
 # --- to other programs ---
 
+FROM = "a file, or a result that notebook 03 or 04 kept in {}/; `ck.export(result)` takes your own"
+UNSAID_PARENT = (
+    "in {parent}, for nobody said `parent`: it is the frame of your arm's poses (on a Universal "
+    "Robots arm tool0, beside it base, which is turned by 180 deg from base_link)"
+)
+COMMENTS = {"urdf": "<!-- {} -->\n"} | dict.fromkeys(("ros", "tf2", "moveit"), "# {}\n")
+
 
 @dataclass(frozen=True)
 class Exported:
@@ -299,17 +311,26 @@ def export(
     frame has one parent only: name the `link` and give T_link_optical, (4, 4) in m, "turn" where
     both have one origin, or "x y z qx qy qz qw" as tf2_echo says it.
 
-    Raises ValueError for what a format cannot hold, FileExistsError for a file that is there.
+    What the result's `verdict` begins with is said, and stands in the file where it may hold a
+    comment. Raises ValueError for what a format cannot hold, FileExistsError for a file that is
+    there.
     """
     found = _exportable(what)
+    verdict = _verdict(what)
     if isinstance(found, Intrinsics):
         checks.choice("to (of a lens)", to, lens_files.LENS_FORMATS)
         xml = out is not None and to == "opencv" and os.fspath(out).endswith(".xml")
         text, notes = _lens_text(found, to, xml)
     else:
         checks.choice("to (of a camera's place)", to, (*pose_files.PLACE_FORMATS, "json"))
-        placed = Placement(parent or found.parent, optical, found.mount, found.T, found.covariance)
+        placed = replace(found, parent=parent or found.parent, child=optical)
         text, notes = _place_text(placed, to, link, T_link_optical)
+        verdict = found.verdict
+        if parent is None:
+            notes += (UNSAID_PARENT.format(parent=found.parent),)
+    if verdict:
+        text = COMMENTS.get(to, "").format(verdict.replace("--", "-")) + text
+        notes = (verdict, *notes)
     path = None if out is None else Path(out)
     if path is not None:
         if path.exists() and not overwrite:
@@ -321,7 +342,15 @@ def export(
 def placement(result: Any) -> Placement:
     """The camera's place as `hand_eye.solve` found it, with the usual names of the two frames."""
     known = None if result.refined is None else result.covariance[:6, :6]
-    return Placement(PARENTS[result.mount], OPTICAL, result.mount, result.X, known)
+    return Placement(
+        PARENTS[result.mount], OPTICAL, result.mount, result.X, known, _verdict(result)
+    )
+
+
+def _verdict(result: Any) -> str:
+    """How the verdict on a result begins, in one line; "" for what has none."""
+    verdict = getattr(result, "verdict", None)
+    return " ".join(verdict().split("\n- ")[0].split()) if callable(verdict) else ""
 
 
 def _exportable(what: Any) -> Intrinsics | Placement:
@@ -334,7 +363,7 @@ def _exportable(what: Any) -> Intrinsics | Placement:
         return checks.instance("what", what.intrinsics, Intrinsics)
     want(isinstance(what, (str, os.PathLike)), "what", what, "a result, or the path of a file")
     path = Path(what) if Path(what).exists() else folder() / f"{what}.json"
-    want(path.is_file(), "what", os.fspath(what), f"a file, or a result in {folder().name}/")
+    want(path.is_file(), "what", os.fspath(what), FROM.format(folder().name))
     try:
         result = read(path)
     except ValueError:  # no result of a notebook: a lens, whose reader says what else it is

@@ -56,7 +56,9 @@ def depths(random, facts, z, frames=100, size=40, sigma_d=0.065, holes=0.01, err
     shape = (frames, wide, wide)
     noise = uniform_filter(random.standard_normal(shape, np.float32), (1, MATCHING_PX, MATCHING_PX))
     pattern = uniform_filter(random.standard_normal(shape[1:]), MATCHING_PX) * MATCHING_PX
-    noise = noise[:, inner, inner] * MATCHING_PX * sigma_d
+    other_dots = uniform_filter(random.spawn(1)[0].standard_normal((size, size)), MATCHING_PX)
+    uneven = np.exp(0.3 * MATCHING_PX * other_dots)  # as the dots are that a window sees
+    noise = noise[:, inner, inner] * MATCHING_PX * sigma_d * uneven / np.sqrt((uneven**2).mean())
     pattern = pattern[inner, inner] * 1.1 * sigma_d
     drift = np.zeros(frames)
     for i, kick in enumerate(random.standard_normal(frames)):
@@ -320,6 +322,10 @@ COPIES: dict[str, Callable[[Counts, Random], Counts]] = {
         np.sort(r.permutation(len(counts))[: len(counts) * 6 // 10])
     ],
     "mirrored": lambda counts, _: counts[:, :, ::-1],
+    "half mirrored": lambda counts, _: np.where(
+        np.arange(len(counts))[:, None, None] % 2, counts, counts[:, :, ::-1]
+    ),
+    "every other one, mirrored": lambda counts, _: counts[::2, :, ::-1],
     "turned": lambda counts, _: np.rot90(counts, 1, (1, 2)),
     "transposed": lambda counts, _: counts.transpose(0, 2, 1),
     "rolled": lambda counts, _: np.roll(counts, (7, 3), (1, 2)),
@@ -341,19 +347,34 @@ def copied(original: Submission, how: str) -> Submission:
     return finished(facts, tuple(stacks), "Copying Student")
 
 
-def _made_up(make: Callable[..., Counts], seed: int, **of_camera: Any) -> Submission:
+@cache
+def made_up(make: Callable[..., Counts], seed: int, **of_camera: Any) -> Submission:
+    """Depths that nobody measured."""
     random, facts = np.random.default_rng(seed), camera(seed, **of_camera)
     return finished(facts, stacks_of(random, lambda z: make(random, facts, z)), "Inventive Student")
 
 
-@cache
-def random_numbers(seed: int = 0) -> Submission:
-    """Independent Gaussian numbers of the right size instead of a camera's."""
+def _smooth(random: Random, frames: int = 100) -> NDArray[np.float32]:
+    """Gaussian noise of std 1 that neighbours share as in a matching window."""
+    shape = (frames, 40 + MATCHING_PX, 40 + MATCHING_PX)
+    wide = uniform_filter(random.standard_normal(shape, np.float32), (0, MATCHING_PX, MATCHING_PX))
+    return wide[:, :40, :40] * MATCHING_PX
 
-    def make(random: Random, _: CameraFacts, z: float) -> Counts:
-        return np.rint(1e3 * z + 3 * z**2 * random.normal(0, 1, (100, 40, 40)))
 
-    return _made_up(make, seed)
+def _disparities(random: Random, facts: CameraFacts, z: float) -> Counts:
+    """Smoothed noise in disparity with a pattern that stays, rounded to 1/32 px."""
+    pattern = _smooth(np.random.default_rng(round(1e6 * facts.fx)), 1)
+    noise = 0.07 * pattern + 0.065 * _smooth(random)
+    disparity = np.rint(32 * (facts.fx * facts.baseline_m / z + noise)) / 32
+    return np.rint(1e3 * facts.fx * facts.baseline_m / disparity)
+
+
+INVENTIONS: dict[str, Callable[[Random, CameraFacts, float], Counts]] = {  # with growing care
+    "a pixel": lambda r, _, z: np.rint(1e3 * z + 3 * z**2 * r.normal(0, 1, (100, 40, 40))),
+    "smoothed": lambda r, _, z: np.rint(1e3 * z + 0.7 * _smooth(r)),
+    "grows": lambda r, _, z: np.rint(1e3 * z + 3 * z**2 * _smooth(r)),
+    "disparity": _disparities,
+}
 
 
 def _flat(random: Random, facts: CameraFacts, z: float) -> Counts:
@@ -505,9 +526,9 @@ def injecting(text: str, seed: int = 0) -> Submission:
 
 
 DISHONEST: dict[str, tuple[str, Callable[[int], Submission]]] = {
-    "random numbers": ("white_in_space", random_numbers),
-    "flat noise": ("not_distance_dependent", partial(_made_up, _flat)),
-    "too clean": ("too_clean", partial(_made_up, _clean, depth_scale_m=1e-5)),
+    "random numbers": ("white_in_space", partial(made_up, INVENTIONS["a pixel"])),
+    "flat noise": ("not_distance_dependent", partial(made_up, _flat)),
+    "too clean": ("too_clean", partial(made_up, _clean, depth_scale_m=1e-5)),
     "repeated frames": ("repeated_frames", _repeated_frames),
     "one stack twice": ("one_stack_twice", _one_stack_twice),
 }

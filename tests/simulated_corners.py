@@ -43,6 +43,17 @@ def fit(board: Board, seed: int, **session) -> intrinsics.IntrinsicsResult:
     return intrinsics.calibrate(corner_session(board, LENS, seed, **session)[0], board)
 
 
+def dense_jacobian(result: intrinsics.IntrinsicsResult) -> np.ndarray:
+    """Of a fit's residuals by the shared parameters and by six numbers of each view."""
+    shared, poses = result.jacobian
+    whole = np.zeros((len(shared), shared.shape[1] + 6 * len(poses)))
+    whole[:, : shared.shape[1]] = shared
+    for i, (block, rows) in enumerate(zip(poses, result.equations.slices, strict=True)):
+        at = shared.shape[1] + 6 * i
+        whole[rows, at : at + 6] = block
+    return whole
+
+
 def ordinary_session(seed: int, **more) -> tuple[Detections, Truth, Board]:
     """Both kinds of board, four lenses, 15 to 40 views and noise of 0.04 to 0.15 px in turn.
 

@@ -222,7 +222,7 @@ def test_a_recording_plays_where_librealsense_is_not_installed(tabletop, tmp_pat
     for package in Path(np.__file__).parents[1].iterdir():
         if not package.name.startswith(("pyrealsense2", "coursekit", "__editable__")):
             (packages / package.name).symlink_to(package)
-    (packages / "coursekit.pth").write_text(f"{Path(coursekit.__file__).parents[1]}\n")
+    (packages / "coursekit.pth").write_text(f"{Path(coursekit.__file__).parents[1]}\n", "utf-8")
     python = next((tmp_path / "env").glob("*/python"))
     ran = subprocess.run(
         [python, "-c", WITHOUT, tabletop], capture_output=True, text=True, check=False, cwd=tmp_path
@@ -237,6 +237,10 @@ def test_a_recording_plays_where_librealsense_is_not_installed(tabletop, tmp_pat
 def test_damaged_messages_are_an_error_of_the_camera(tmp_path):
     data = Driver(tmp_path / "a.bag").write(depth=raw).read_bytes()
     rng, path, failed = np.random.default_rng(5), tmp_path / "b.bag", 0
+    for at in (100, len(data) // 3, len(data) // 2):  # librealsense would read on for ever
+        path.write_bytes(data[:at] + bytes(rng.integers(0, 256, 3000, np.uint8)) + data[at:])
+        with pytest.raises(CameraError, match=r"b\.bag is (damaged inside|truncated)"):
+            open_camera(path)
     for _ in range(60):
         changed = bytearray(data)
         for at in rng.integers(len(data) // 2, len(data), 40) if rng.random() < 0.5 else range(300):

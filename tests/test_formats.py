@@ -689,6 +689,13 @@ def test_images_in_a_subfolder(few) -> None:
     assert "there are 2 files of this name" in repr(session.skipped)
 
 
+def test_a_lens_of_another_size_is_refused_with_what_to_do(few) -> None:
+    place, lines = few
+    lens = replace(usable(place, lines).intrinsics, width=1920, height=1080)
+    with pytest.raises(ValueError, match=r"a lens of 1920 x 1080 px', want .* or scale K"):
+        usable(place, lines, intrinsics=lens)
+
+
 def test_two_folders_with_the_same_names(few) -> None:
     place, (header, *rows) = few
     (place / "b").mkdir()
@@ -875,9 +882,7 @@ def kept(tmp_path, monkeypatch, result):
     camera = type("Camera", (), {"source": "live", "name": "D435", "serial": "728612070259"})()
     quantity = {"fx": results.Quantity(LENS.fx, "px", 0.9)}
     results.save("03_intrinsics", camera, quantity, lens=LENS)
-    placed = results.Placement(
-        "ee_gripper_link", results.OPTICAL, "eye_in_hand", result.X, result.covariance[:6, :6]
-    )
+    placed = results.placement(result)
     above = results.Placement("base_link", results.OPTICAL, "eye_to_hand", result.X)
     results.save("04_hand_eye", camera, {}, placement=placed, eye_to_hand=above)
     return tmp_path / "results"
@@ -908,6 +913,23 @@ def test_results_of_before_are_read_and_say_what_they_lack(kept) -> None:
         assert results.load(lesson).camera == "D435"
         with pytest.raises(ValueError, match=f"{lesson}.json.*{message}.*run the notebook again"):
             ck.export(lesson, "json")
+
+
+@pytest.mark.parametrize("to", ["urdf", "tf2", "moveit", "easy_handeye2", "json"])
+def test_the_verdict_goes_along(kept, result, to) -> None:
+    """Of a result, and of what a notebook kept: in what is printed, and where a comment may be."""
+    assert result.verdict().startswith("Usable with care")
+    for what in (result, "04_hand_eye"):
+        done = ck.export(what, to)
+        assert "- Usable with care: a point 300 mm in front" in repr(done)
+        assert ("Usable with care" in done.text) is (to != "easy_handeye2")
+    wrong = replace(result.session, T_base_gripper=invert_transform(ARM)).solve()
+    assert "Not to be trusted: " in ck.export(wrong, to, parent="tool0").notes[0]
+
+
+def test_whose_poses_they_are_is_said_where_nobody_does(result) -> None:
+    assert "in ee_gripper_link, for nobody said" in repr(ck.export(result, "urdf"))
+    assert "nobody said" not in repr(ck.export(result, "urdf", parent="tool0"))
 
 
 def test_a_file_that_is_there_stays(kept, tmp_path) -> None:

@@ -44,8 +44,10 @@ KINDS = {
     "bounded": {"q": None, "kind": "uniform"},
     "shifts only": {"q": None, "ratio": 0.05},
     "zeros and play too": {"errors": ArmErrors()},
+    "zeros, no joint angles": {"errors": ArmErrors(), "q": None},
 }
-ORDINARY = [("joint angles", 8), ("no joint angles", 15), ("poses", 15), ("zeros and play too", 15)]
+ORDINARY = [("joint angles", 8), ("no joint angles", 15), ("poses", 15)]
+ORDINARY += [("zeros and play too", 15), ("zeros, no joint angles", 8)]
 
 
 def solved(
@@ -58,7 +60,8 @@ def solved(
     session = replace(jittery(known, seed, **options).session, q=q)
     if of_poses:
         session = replace(session, seen=session.T_camera_board)
-    return session.solve(), session, known.X
+    how = "upright" if kind == "zeros, no joint angles" else "usual"
+    return session.solve(fk=how), session, known.X
 
 
 CASES = [(kind, n) for kind in KINDS for n in (8, 15, 30)] if NIGHTLY else ORDINARY
@@ -76,8 +79,10 @@ def test_intervals_hold_whatever_the_arm_does_at_each_pose(kind, n, mount):
         assert result.judgement.trusted
         assert repr(result).count("(95 %)") == 2
     least, most = (0.92, 0.98) if n == 8 else (0.93, 0.97)
-    if kind == "zeros and play too":
+    if kind.startswith("zeros"):
         least, most = 0.90, 0.98
+    if kind == "zeros, no joint angles":  # an arm before a fixed camera shows little of its zeros
+        least, most = 0.85, 0.99
     assert least - SLACK <= np.mean(inside) <= most + SLACK
     if NIGHTLY:
         assert np.median(off) <= 1.02 * np.median(park)

@@ -8,7 +8,7 @@ import pytest
 from common import each, refusals
 from scipy.spatial.transform import Rotation
 from scipy.stats import t as student
-from simulated_corners import CHARUCO, CHECKERBOARD, LENS, fit
+from simulated_corners import CHARUCO, CHECKERBOARD, LENS, dense_jacobian, fit
 
 from coursekit import intrinsics
 from coursekit.boards import Detection
@@ -182,11 +182,7 @@ def test_a_shared_focal_length_has_one_column():
 
 def test_joint_covariance_is_the_inverse_of_the_whole_normal_matrix(result):
     """The Schur complements against one dense inverse of the whole, 177 x 177."""
-    shared, poses = result.jacobian
-    whole = np.zeros((len(shared), 9 + 6 * len(poses)))
-    whole[:, :9] = shared
-    for i, (block, rows) in enumerate(zip(poses, result.equations.slices, strict=True)):
-        whole[rows, 9 + 6 * i : 15 + 6 * i] = block
+    whole = dense_jacobian(result)
     scale = np.linalg.norm(whole, axis=0)
     _, triangle = np.linalg.qr(whole / scale)
     inverse = np.linalg.inv(triangle)

@@ -64,43 +64,6 @@ def test_inverted_poses_leave_centimetres_and_are_not_the_inverse() -> None:
     assert CHECKPOINTS["hand_eye.inverted_poses"].lettered()["B"].right
 
 
-def test_the_grid_fixes_the_rotation_and_leaves_the_translation_free() -> None:
-    grid, truth = hand_eye_session("eye_in_hand", 7, mistakes=HandEyeMistakes(design="grid"))
-    R_X = ck.hand_eye.rotation_from_shifts(grid.T_base_gripper, grid.T_camera_board, "eye_in_hand")
-    off = Rotation.from_matrix(R_X.T @ truth.X[:3, :3]).magnitude()
-    assert np.degrees(off) < 0.5
-    known = ck.hand_eye.observability(grid.T_base_gripper, "eye_in_hand")
-    assert not known.determined
-    assert "translation" in known.free[0]
-    with pytest.raises(ValueError, match="t_X drops out"):
-        grid.solve("closed_form")
-    off_mm = [1000 * np.linalg.norm(grid.solve(m).X[:3, 3] - truth.X[:3, 3])
-              for m in ("park", "horaud", "andreff", "daniilidis")]  # fmt: skip
-    assert min(off_mm) > 50
-
-
-def test_one_axis_leaves_the_slide_along_it_and_a_turn_in_the_first_half() -> None:
-    session, truth = hand_eye_session(
-        "eye_in_hand", 7, mistakes=HandEyeMistakes(design="single_axis")
-    )
-    A, _ = ck.hand_eye.motions(session.T_base_gripper, session.T_camera_board, "eye_in_hand")
-    _, sizes, directions = np.linalg.svd(
-        (A[:, :3, :3] - np.eye(3)).reshape(-1, 3), full_matrices=False
-    )
-    assert sizes[2] < 0.05
-    assert sizes[1] > 5
-    for method, least_deg, most_deg in (("park", 5, 30), ("daniilidis", 0, 0.2)):
-        off = ck.geometry.pose_difference(truth.X, session.solve(method).X)
-        assert least_deg < np.degrees(np.linalg.norm(off[:3])) < most_deg
-        assert abs(off[3:] @ directions[2]) > 0.95 * np.linalg.norm(off[3:]) > 0.05
-    with pytest.raises(ck.hand_eye.NotDetermined, match="all poses turn about one axis"):
-        session.solve()
-    guess = session.solve(guess=ck.arm.widowx().T_gripper_camera)
-    best = ck.hand_eye.next_pose(guess)
-    assert best.now_mm > 50
-    assert best.then_mm[best.index] < 1
-
-
 def test_three_sessions_are_told_by_what_they_show() -> None:
     """The evidence of notebook 04, with other arms than the one on its page."""
     for name, session in ck.simulation.unknown_sessions(23).items():
@@ -124,9 +87,9 @@ def test_the_lever_is_what_a_rotation_does() -> None:
 
 
 def test_more_poses_shrink_the_interval_and_not_the_error() -> None:
-    """Over a dozen arms: four times the poses, half the sigma, and no less error to speak of."""
+    """Over six arms: four times the poses, half the sigma, and no less error to speak of."""
     few, many = [], []
-    for seed in range(12):
+    for seed in range(6):
         for n, kept in ((25, few), (100, many)):
             session, truth = hand_eye_session(
                 "eye_in_hand", seed, n=n, arm_errors=ck.arm.ArmErrors()

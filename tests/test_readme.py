@@ -87,7 +87,7 @@ def test_files_that_it_links_to_exist() -> None:
 
 
 def test_folders_are_those_that_are_there() -> None:
-    (block,) = [b for b in re.findall(r"```\n(.*?)```", TEXT, re.DOTALL) if "notebooks/ " in b]
+    (block,) = [b for b in re.findall(r"```\w*\n(.*?)```", TEXT, re.DOTALL) if "notebooks/ " in b]
     for line in block.splitlines():
         assert (ROOT / line.split()[0]).exists(), line
 

@@ -21,16 +21,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hostile_bundles import ZOE, hostile
-from sample_submissions import canvas, class_names, class_zip, honest, moodle
+from sample_submissions import canvas, class_names, class_zip, moodle
 
 from coursekit import cli
 from coursekit.specifications import DATA
 from coursekit.submission import batch
 from coursekit.submission.batch import Bundle, Limits
-from coursekit.submission.format import Claims, bundle_bytes
+from coursekit.submission.format import Claims, bundle_bytes, zip_bytes
 from coursekit.submission.recompute import grading_rules
-from coursekit.submission.report import ReportLine, grade_file, not_graded
-from coursekit.submission.rubric import grade
+from coursekit.submission.report import ReportLine, not_graded
 
 NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 USUAL = {"impossible_times", "not_distance_dependent"}  # of the small bundle
@@ -140,20 +139,6 @@ def test_the_same_bytes_come_out_however_many_processes_there_are(in_process, re
             assert (tmp_path / "one" / path.relative_to(report)).read_bytes() == path.read_bytes()
 
 
-def test_a_batch_grades_as_the_rubric_does(tmp_path):
-    whole = honest(seed=5)
-    path = tmp_path / "a.zip"
-    path.write_bytes(bundle_bytes(whole))
-    line, page = grade_file(str(path), "a.zip", "students/a.html")
-    found = grade(whole)
-    brief = {"says": "", "tolerance": None}
-    assert (line.points, line.of) == (found.points, found.of)
-    assert line.items == tuple(replace(item, **brief) for item in found.items)
-    assert (line.made, line.paragraph) == (whole.made, whole.conclusion.paragraph)
-    assert line.page == "students/a.html"
-    assert page.startswith("<!doctype html>")
-
-
 def test_every_hostile_bundle_is_a_row_with_its_reason(tmp_path):
     cases = [case for case in hostile().values() if case[0]]
     folder, out = quick(tmp_path / "in", ()), tmp_path / "out"
@@ -179,6 +164,7 @@ def raised(error: BaseException):
 
 BEHAVIOUR = {  # by the name of a bundle that the reader let through
     "hang": lambda: time.sleep(3600),
+    "wait": lambda: time.sleep(0.8),  # and does not compute
     "spin": spin,
     "kill": lambda: os.kill(os.getpid(), getattr(signal, "SIGKILL", signal.SIGTERM)),
     "crash": os.abort,
@@ -204,12 +190,11 @@ def outcomes(names: Iterable[str], limits: Limits) -> dict[str, ReportLine]:
 
 
 def test_the_batch_outlives_whatever_a_bundle_does_to_its_process():
-    late = outcomes(["hang", "spin"], Limits(2, timeout_s=1.0))
-    assert {name: line.reason for name, line in late.items()} == {
-        "hang": "timeout",
-        "spin": "timeout",
-    }
-    assert "longer than 1 s" in late["hang"].says
+    late = outcomes(["hang", "spin", "wait"], Limits(2, timeout_s=0.5))
+    reasons = {name: line.reason for name, line in late.items()}
+    assert reasons == {"hang": "timeout", "spin": "timeout", "wait": "well"}
+    assert late["hang"].says == late["spin"].says
+    assert "longer than 0.5 s" in late["spin"].says
     wanted = dict.fromkeys(("kill", "crash", "exit"), "died")
     wanted |= dict.fromkeys(("quit", "interrupt", "raise"), "error")
     names, before = [*wanted], dict(os.environ)
@@ -234,6 +219,7 @@ def test_a_bundle_that_wants_too_much_memory_is_a_row_and_its_process_lives():
 def test_processes_that_start_from_nothing_do_the_same(monkeypatch):
     """As on Windows and macOS."""
     monkeypatch.setattr(batch, "_context", lambda: multiprocessing.get_context("spawn"))
+    monkeypatch.setattr(batch, "PATIENCE_S", 600.0)  # however busy the machine is
     found = outcomes(["kill", "good"], Limits(1))
     assert (found["kill"].reason, found["good"].reason) == ("died", "well")
     assert found["good"].says.split()[1] == "1"
@@ -313,7 +299,7 @@ def test_ctrl_c_keeps_what_is_done_and_the_same_command_goes_on(tmp_path, capsys
     here = [sys.executable, "-m", "coursekit.cli", *command, "--workers", "2"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     running = subprocess.Popen(here, start_new_session=True, **pipes)
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 600  # however busy the machine is
     while len(list(out.glob(".rows/*.json"))) < 5 and time.monotonic() < deadline:
         time.sleep(0.02)
     os.killpg(running.pid, signal.SIGINT)  # as a terminal does: to all of them
@@ -376,13 +362,22 @@ def test_what_is_kept_of_a_bundle_may_go_and_the_report_says_so(in_process, tmp_
     assert [row["status"] for row in table(out)] == ["not graded: lost", "graded"]
 
 
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names")
-def test_what_is_no_file_is_refused_and_nothing_waits_for_it(in_process, tmp_path):
+@pytest.mark.skipif(sys.platform == "win32", reason="such paths cannot be made there")
+def test_a_folder_in_a_folder_a_thousand_times(in_process, tmp_path, capsys):
     folder = quick(tmp_path / "in", ["a"])
-    os.mkfifo(folder / "pipe.zip")
-    (folder / "gone.zip").symlink_to(tmp_path / "nowhere")
-    summary = graded(folder, tmp_path / "out", timeout_s=5)
-    assert (summary.graded, summary.refused, summary.failed) == (1, 2, 0)
+    below = [*["d"] * 1100, "deep.zip"]
+    (tmp_path / "lms.zip").write_bytes(zip_bytes({"/".join(below): bundle_bytes(ZOE)}))
+    with contextlib.chdir(folder):
+        for part in below[:-1]:
+            os.mkdir(part)
+            os.chdir(part)
+        Path("deep.zip").write_bytes(bundle_bytes(ZOE))
+    try:
+        assert graded(folder, tmp_path / "out").graded == 2
+    finally:  # which pytest could not
+        subprocess.run(["rm", "-rf", str(folder)], check=True)
+    assert cli.main(["grade", str(tmp_path / "lms.zip"), "--out", str(tmp_path / "two")]) == 1
+    assert "got 1101, want at most 100 folders in each other" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="such names cannot be made elsewhere")

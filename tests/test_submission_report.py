@@ -13,7 +13,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 import sample_submissions as samples
-from sample_submissions import MADE, PARAGRAPH, honest, with_part, with_row
+from sample_submissions import PARAGRAPH, honest, with_part, with_row
 
 from coursekit.submission import report
 from coursekit.submission.flags import Flag, as_json, same_words, words_of
@@ -23,6 +23,7 @@ from coursekit.submission.recompute import LABELS, MISTAKES
 VOID = {"meta", "br", "img", "hr", "input", "link"}
 GOOD = honest(0)
 WRONG = samples.mistaken(0)
+INVENTED = samples.made_up(samples.INVENTIONS["a pixel"], 2)
 
 
 class Page(HTMLParser):
@@ -106,7 +107,7 @@ def lines():
         GOOD,
         samples.weak(1),
         own_words(samples.copied(GOOD, "few_values"), 1),
-        own_words(samples.random_numbers(2), 2),
+        own_words(INVENTED, 2),
         samples.injecting('=HYPERLINK("http://x")<script>alert(1)</script>', 4),
         own_words(replace(WRONG["sign"][1], student="Student 3"), 3),
     ]
@@ -134,9 +135,9 @@ def test_what_cost_points_comes_first():
 
 
 def test_flags_are_not_on_the_students_page():
-    flags = samples.graded(samples.random_numbers(2)).flags
+    flags = samples.graded(INVENTED).flags
     assert flags
-    text = page_of(samples.random_numbers(2))
+    text = page_of(INVENTED)
     assert not any(escape(flag.says) in text or flag.code in text for flag in flags)
     assert "flag" not in text.casefold()
 
@@ -278,11 +279,6 @@ def test_a_student_counts_once_with_the_newest_bundle():
     assert [row["points"] for row in rows] == ["75.25", "90", "80", "10", ""]
 
 
-def test_of_bundles_made_at_the_same_moment_the_first_counts():
-    some = [replace(said_by("Ann", "", made=MADE), file=f"{i}.zip") for i in range(3)]
-    assert [line.counts for line in report.across(some)] == [True, False, False]
-
-
 # --- words that are shared, and all paragraphs ----------------------------------------------------
 
 
@@ -325,11 +321,6 @@ def test_changed_words_and_added_sentences_are_noticed_short_and_own_ones_not(on
     flags = notes(report.across([said_by("Ann", one), said_by("Bob", two)]), "same_words")
     assert set(flags) == ({"Ann.zip", "Bob.zip"} if said else set())
     assert said in flags.get("Ann.zip", "")
-
-
-def test_one_student_may_say_it_again():
-    found = report.across([said_by("Ann", PARAGRAPH), said_by(" ANN", PARAGRAPH)])
-    assert notes(found, "same_words") == {}
 
 
 def test_many_paragraphs_are_compared():
@@ -385,7 +376,7 @@ def test_the_table_has_a_row_a_bundle_and_points_that_add_up(lines):
     assert rows[0]["lost"] == ""
     assert ": sign of the bias turned (-" in rows[5]["lost"]
     assert (rows[-1]["status"], rows[-1]["points"]) == ("not graded: zip_bomb", "")
-    assert rows[3]["flags"] == "no_pattern white_in_space"
+    assert rows[3]["flags"] == "even_noise no_pattern white_in_space"
 
 
 FORMULAS = ["=1+1", "+1", "-1", "@A1", "\t=1", "\r=1", "\n=1", " =1", "＝1", "=cmd|' /C calc'!A0"]
@@ -398,12 +389,6 @@ def test_a_cell_is_never_a_formula(text):
         for cell in row.values():
             assert not cell.lstrip().startswith(report.FORMULA)
             assert "\n" not in cell
-
-
-def test_an_ordinary_name_stays_as_it_is():
-    name = 'Zoë "Z" O\'Neil-Żak, Jr.'
-    (row,) = read(report.grades_csv([said_by(name, "")]))
-    assert (row["student"], row["percent"]) == (name, "50.0")
 
 
 def test_a_line_goes_through_json(lines):

@@ -19,7 +19,6 @@ from coursekit.lessons import questions
 from coursekit.results import Quantity
 from coursekit.submission import submit as handing_in
 from coursekit.submission.format import Conclusion, Plot, TableRow, bundle_bytes, read_bundle, slug
-from coursekit.submission.recompute import grading_rules
 from coursekit.submission.rubric import grade, shortcomings
 from coursekit.submission.submit import MEASURED, keep, load_measured, relative, submit
 from tools import build_notebooks
@@ -203,19 +202,6 @@ def test_small_differences_of_spelling_are_understood(kept):
     conclusion = read_bundle(submit("Ada", 0.45, " Bias", PARAGRAPH, frames=10.0).path).conclusion
     assert (conclusion.dominates, conclusion.frames) == ("bias", 10)
     assert isinstance(conclusion.frames, int)
-
-
-def test_a_typing_error_in_the_rubric_is_an_error_here_too(kept, own_results, monkeypatch, capsys):
-    broken = own_results.parent / "rubric.toml"
-    broken.write_text("[points]\nbias = 'six'\n", encoding="utf-8")
-    monkeypatch.setattr("coursekit.submission.recompute.RULES", broken)
-    grading_rules.cache_clear()
-    try:
-        assert cli.main(["submit", "--student", "Ada"]) == 1
-        assert capsys.readouterr().err == "coursekit: rubric.toml: exercise: is missing\n"
-    finally:
-        grading_rules.cache_clear()
-    assert [path.name for path in own_results.iterdir()] == [MEASURED]
 
 
 WRONG_ARGUMENTS = [

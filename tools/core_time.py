@@ -1,7 +1,8 @@
 """Minutes that a notebook's core takes: `python -m tools.core_time` prints them by section.
 
-A student reads 200 words a minute, and takes 1.5 minutes for a checkpoint, 5 for an exercise and 1
-for a figure. What is collapsed, and what is marked deeper or comes after the core's end, is not in.
+A student reads 200 words a minute, what is printed and what is collapsed as well, and takes 1.5
+minutes for a checkpoint, 5 for an exercise and 1 for a figure. What is marked deeper or comes after
+the core's end is not in.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from tools.build_notebooks import Cell, Notebook, find, joined, read
 
 WORDS_A_MINUTE, CHECKPOINT, EXERCISE, FIGURE = 200, 1.5, 5.0, 1.0
 MOST, MOST_OF_ALL = 25, 110
-NOT_READ = re.compile(r"<details.*?</details>|!\[.*?\]\(.*?\)|<[^>]*>", re.DOTALL)
+NOT_READ = re.compile(r"!\[.*?\]\(.*?\)|<style.*?</style>|<[^>]*>", re.DOTALL)
 HEADING = re.compile(r"##? (.*)")
 BEYOND = ("Deeper", "Studio", "Next", "Where this goes", "Keep what you have", "Onto the robot")
 
@@ -34,11 +35,22 @@ def minutes(cell: Cell) -> float:
     """What one cell takes."""
     source = joined(cell["source"])
     if cell["cell_type"] == "markdown":
-        return len(re.findall(r"\S*\w\S*", NOT_READ.sub(" ", source))) / WORDS_A_MINUTE
+        return words(source) / WORDS_A_MINUTE
     checkpoints, exercises = source.count("ck.checkpoint("), source.count("ck.check(")
-    drawn = any("image/png" in output.get("data", {}) for output in cell["outputs"])
-    figures = drawn and not checkpoints and not exercises
-    return CHECKPOINT * checkpoints + EXERCISE * exercises + FIGURE * figures
+    if checkpoints or exercises:
+        return CHECKPOINT * checkpoints + EXERCISE * exercises
+    shown = [
+        output.get("data", {"text/plain": output.get("text", "")}) for output in cell["outputs"]
+    ]
+    figures = any("image/png" in data for data in shown)
+    texts = [joined(d.get("text/html") or d["text/plain"]) for d in shown if "image/png" not in d]
+    read = sum(words(text) for text in texts if '<details class="alt">' not in text)
+    return FIGURE * figures + read / WORDS_A_MINUTE
+
+
+def words(text: str) -> int:
+    """How many there are, less markup."""
+    return len(re.findall(r"\S*\w\S*", NOT_READ.sub(" ", text)))
 
 
 def core_minutes(notebook: Notebook) -> float:

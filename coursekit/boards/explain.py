@@ -176,7 +176,7 @@ def _markers(grey: Grey, board: Board) -> _Markers | None:
         corners, ids, _, which = detector.detectMarkersMultiDict(seen_so(grey))
         if len(corners) == 0:
             continue
-        counts = np.bincount(which.ravel(), minlength=len(names))
+        counts = np.bincount(which.ravel().astype(np.intp), minlength=len(names))
         most = int(counts.argmax())
         if counts[most] >= FEWEST_MARKERS and (best is None or counts[most] > len(best.ids)):
             own = which.ravel() == most
@@ -248,13 +248,14 @@ def _plans(board: Board, dictionary: str, ids: NDArray[np.intp]) -> Iterator[Boa
     another first marker; each with its own origin and with the other one."""
     first, (columns, rows) = board.first_marker, board.squares
     counts = range(FEWEST_SQUARES["charuco"], MOST_SQUARES + 1)
-    tries = [(first, columns, rows), (int(ids.min()), columns, rows)]
-    for start in (first, int(ids.min())):
-        fewest = {n: max(2 * (ids.max() - start + 1) // n, counts[0]) for n in counts}
+    lowest, highest = int(ids.min()), int(ids.max())
+    tries = [(first, columns, rows), (lowest, columns, rows)]
+    for start in (first, lowest):
+        fewest = {n: max(2 * (highest - start + 1) // n, counts[0]) for n in counts}
         sizes = [(n, m) for n in counts for m in range(fewest[n], fewest[n] + 3)]
-        sizes = [(n, m) for n, m in sizes if ids.max() - start < (n * m + 1) // 2 and m in counts]
+        sizes = [(n, m) for n, m in sizes if highest - start < (n * m + 1) // 2 and m in counts]
         tries += [(start, *size) for size in sorted(sizes, key=lambda size: size[0] * size[1])]
-    tries += [(start, columns, rows) for start in range(ids.min(), -1, -1)[1:columns]]
+    tries += [(start, columns, rows) for start in range(lowest, -1, -1)[1:columns]]
     for start, n, m in tries:
         for old in (board.old_origin, not board.old_origin)[: 1 + (m + 1) % 2]:
             plan: dict[str, Any] = {"squares": (n, m), "first_marker": start, "old_origin": old}

@@ -104,9 +104,10 @@ def _topics_of_db3(path: Path) -> list[str]:
 
 
 def _topics_of_bag(path: Path) -> list[str]:
-    """The topics in the index at the end of a bag; CameraError for a bag that ends before it does.
+    """The topics in the index at the end of a bag; CameraError for a bag that ends before it does,
+    or whose records do not fill it: librealsense would look for the next one for ever.
 
-    http://wiki.ros.org/Bags/Format/2.0: the first record says where the index begins, which is a
+    http://wiki.ros.org/Bags/Format/2.0: the first record says where the index begins; a bag is a
     row of headers and data, each after its length; in a header so is each field, name=value.
     """
     there = path.stat().st_size
@@ -115,15 +116,19 @@ def _topics_of_bag(path: Path) -> list[str]:
         index = int.from_bytes(start.group(1), "little") if start else 0
         if start and not 0 < index < there:
             raise _truncated(path, there, max(index, there))
+        at, ends = len(FILE_STARTS[".bag"]), set[int]()
+        while at < there:
+            ends.add(at)
+            file.seek(at)
+            at += 4 + int.from_bytes(file.read(4), "little")
         file.seek(index)
         data = file.read() if index else b""
-    at = 0
-    while at < len(data):
-        at += 4 + int.from_bytes(data[at : at + 4], "little")
-    if at > len(data):
-        raise _truncated(path, there, there + at - len(data))
-    ends = ((m.end(), int.from_bytes(m.group(1), "little")) for m in re.finditer(TOPIC, data))
-    return [data[end : end + length - 6].decode("utf-8", "replace") for end, length in ends]
+    if index in ends and at > there:
+        raise _truncated(path, there, at)
+    if index and (index not in ends or at != there):
+        raise CameraError(f"{path} is damaged inside: copy it again or record it anew")
+    ends_of = ((m.end(), int.from_bytes(m.group(1), "little")) for m in re.finditer(TOPIC, data))
+    return [data[end : end + length - 6].decode("utf-8", "replace") for end, length in ends_of]
 
 
 def depth_frame_numbers(path: Path) -> list[int]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from coursekit.arm import FkErrors, fk_covariance
+from coursekit.arm import FkErrors
 from coursekit.arrays import ArrayLike, Floats, Mask
 from coursekit.boards import Board, Detection
 from coursekit.boards.board import seen
@@ -89,16 +89,18 @@ def held_out(
 
     T_base_gripper (m, 4, 4), m, and seen as in a session; board and intrinsics are the result's
     unless given. q (m, 6), rad, or fk for these poses apply what the fit has learnt of the arm's
-    own errors; without them the arm is taken at its word. Compare its rms_px with the result's own:
-    where it is much larger, X fits the noise of its poses. Raises ValueError as a session does.
+    own errors; without them the arm of a session with joint angles is taken at its word. Compare
+    its rms_px with the result's own: where it is much larger, X fits the noise of its poses. Raises
+    ValueError as a session does.
     """
     given, fit = result.session, result.refined
     board, intrinsics = board or given.board, intrinsics or given.intrinsics
     other = HandEyeSession(result.mount, T_base_gripper, seen, board, intrinsics, q)  # type: ignore[arg-type]
     poses = other.T_base_gripper
     offsets = fit is not None and fit.problem.arm is not None and other.q is not None
-    if fit is not None and fit.problem.guessed and fk is None and other.q is not None:
-        fk = fk_covariance(other.q, arm=given.arm)
+    known = other.q is not None or not given.has_its_joints
+    if fit is not None and fit.problem.guessed and fk is None and known:
+        fk = given.shared_errors(poses, other.q)
     if fit is not None and (fk is not None or offsets):
         poses = arm_poses_with(fit, replace(fit.problem, T_base_gripper=poses, q=other.q, fk=fk))
     expected = camera_board(poses, result.X, result.Y, result.mount)

@@ -172,13 +172,16 @@ class Observability:
         turns = ", ".join(f"{turn:.1f}" for turn in self.turns_deg)
         known = np.minimum(self.sigma_mm, NOTHING_MM)[:, None] * self.directions
         turn, shift = known[:, :3] / 1e3, known[:, 3:]  # rad, mm: by direction, along each axis
-        sizes = np.degrees(np.linalg.norm(turn, axis=0).max()), np.linalg.norm(shift, axis=0).max()
-        deg, mm = (f"{s:.2f}" if s < 10 else f"{s:.0f}" if s < 1e4 else "over 10000" for s in sizes)
+        worst = np.degrees(np.linalg.norm(turn, axis=0).max()), np.linalg.norm(shift, axis=0).max()
+        deg, mm = (f"{s:.2f}" if s < 10 else f"{s:.0f}" if s < 1e4 else "over 10000" for s in worst)
+        free = "; ".join(self.free)  # of what is free nothing is known, whatever the poses' noise
+        sizes = {"rotation": f"{deg} deg", "translation": f"{mm} mm"}
+        determined = [size for what, size in sizes.items() if what not in free]
         lines = (
             f"{self.poses} poses, turned by {turns} deg (rms) about three axes, at most "
             f"{self.largest_turn_deg:.0f} deg between two",
-            f"X would be known to {deg} deg and {mm} mm (1 sigma, about and along the worst axis)",
-            f"NOT determined: {'; '.join(self.free)}." if self.free else "All of X is determined.",
+            f"X would be known to {' and '.join(determined) or 'nothing'} (1 sigma, worst axis)",
+            f"NOT determined: {free}." if free else "All of X is determined.",
         )
         return "\n".join(map(wrapped, lines))
 

@@ -33,7 +33,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coursekit.arm import Arm, FkErrors, fk_covariance, widowx
+from coursekit.arm import Arm, FkErrors, fk_covariance, upright_errors, widowx
 from coursekit.arrays import ArrayLike, Floats, Integers
 from coursekit.boards import Board, Detection, Detections, detect_all
 from coursekit.boards.board import Skipped
@@ -63,6 +63,10 @@ from coursekit.words import Estimate, wrapped
 SENTENCES = DiagnosisTexts.of("hand_eye")
 METHODS = ("refine", *CLOSED_FORMS)
 POSES = "poses.csv"
+OF_SIZE = (
+    "one of these images, {} x {} px: calibrate at their resolution, or scale K: fx and fy times "
+    "the ratio of the widths, cx + 0.5 and cy + 0.5 likewise"
+)
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 OPTIONAL = {"times": ("time",), "q": JOINTS, "dq": VELOCITIES}
 REPEATS = "repeats"  # how the reason begins for which a pair is left out by `once`
@@ -149,6 +153,17 @@ class HandEyeSession:
             return False
         off = np.abs(self.arm.forward(self.q) - self.T_base_gripper).max(axis=(1, 2))
         return float(np.median(off)) < BELONGS
+
+    def shared_errors(self, T_base_gripper: Floats, q: Floats | None) -> FkErrors:
+        """What this arm may be wrong by in all poses (n, 4, 4) alike; q (n, 6): their joints.
+
+        Of the session's joints where they are its own and known, else those of any upright arm.
+        What each pose has for itself is not in it: that is estimated.
+        """
+        if q is None or not self.has_its_joints:
+            return upright_errors(T_base_gripper)
+        errors = fk_covariance(q, arm=self.arm)
+        return replace(errors, each=np.zeros_like(errors.each))
 
     @property
     def corner_sigma_px(self) -> float:
@@ -285,6 +300,13 @@ class HandEyeSession:
             )
         T, columns = _stacked(rows[file] for file in used)
         views_ = Detections(found[file] for file in used)
+        size, wanted = views_.size, (intrinsics.width, intrinsics.height)
+        want(
+            size == wanted,
+            "intrinsics",
+            "a lens of {} x {} px".format(*wanted),
+            OF_SIZE.format(*size),
+        )
         names, unused = tuple(used), tuple(skipped)
         return cls(mount, T, views_, board, intrinsics, names=names, skipped=unused, **columns)
 
@@ -348,7 +370,8 @@ def _card(folder: Path) -> dict[str, Any]:
 
 def _from_card(card: dict[str, Any], key: str) -> Any:
     if key not in card:
-        raise ValueError(f"{key}: neither given nor in {SESSION}")
+        or_ = ' (mount="eye_in_hand" or "eye_to_hand")' if key == "mount" else ""
+        raise ValueError(f"{key}: neither given{or_} nor in {SESSION}")
     return card[key]
 
 
@@ -371,7 +394,9 @@ def _table(
     files = sorted((p for p in folder.rglob("*") if p.is_file()), key=natural)
     if in_order:
         images = [file for file in files if file.suffix.lower() in IMAGES]
-        pair = f"{len(read)}, one a row: with in_order they go together"
+        pair = (
+            f"{len(read)}, one a row (with in_order they go together): keep the row of each image"
+        )
         want(len(images) == len(read) and "file" not in columns, "images", len(images), pair)
         named = zip(read, images, strict=True)
         read = [replace(row, file=file.relative_to(folder).as_posix()) for row, file in named]
@@ -450,7 +475,7 @@ def solve(
     *,
     free_scale: bool = False,
     free_offsets: bool = False,
-    fk: FkErrors | Literal["usual"] | None = "usual",
+    fk: FkErrors | Literal["usual", "upright"] | None = "usual",
     guess: ArrayLike | None = None,
 ) -> HandEyeResult:
     """Where the camera is, from arm poses and what the camera saw at each.
@@ -470,8 +495,11 @@ def solve(
     the board is than it says; free_offsets also estimates the offsets of the session's joint
     angles. fk: what the arm errs by in all poses alike: errors whose sizes are known
     (`arm.fk_covariance` at the session's q), None for none, or "usual": those of `ArmErrors`, as
-    large as the session shows them to be, where the arm poses are those of its joint angles. guess
-    (4, 4): an X to start from, in place of the closed form.
+    large as the session shows them to be, where the arm poses are those of its joint angles.
+    "upright" is that for poses without joint angles, of an arm of the WidowX's class
+    (`arm.upright_errors`): zeros of the first and last joint move X and show in no pose, so that
+    without it the intervals hold only what the poses show. guess (4, 4): an X to start from, in
+    place of the closed form.
 
     Raises ValueError that names the argument for fewer than three poses and for images without a
     pose; NotDetermined where the arm did not turn about two axes; SolverFailed where a solver's
@@ -496,6 +524,10 @@ def solve(
         counts = session.first_alike == np.arange(n)
         stated = replace(stated, shared=stated.shared[counts], each=stated.each[counts])
     session = session.once
+    if fk == "upright":
+        want(not session.has_its_joints, "fk", fk, "'usual': the joint angles are known")
+        free = observability(session.T_base_gripper, session.mount).free
+        want(not free, "fk", fk, "None: the poses leave X free, and tell nothing of the arm")
     n = len(session)
     want(n >= FEWEST_POSES, "T_base_gripper", n, f"at least {FEWEST_POSES} poses that differ")
     first = "closed_form" if method == "refine" else method
@@ -506,12 +538,11 @@ def solve(
     seen: views.Views = views.PoseViews(measured, np.zeros((n, 6, 6)))
     if session.detections is not None:
         seen = session.corners(session.corner_sigma_px)
-    usual = fk == "usual" and not free_offsets and session.has_its_joints
-    if usual:
-        stated = fk_covariance(session.q, arm=session.arm)  # type: ignore[arg-type]
-        stated = replace(stated, each=np.zeros_like(stated.each))  # estimated
+    guessed = not free_offsets and (fk == "upright" or (fk == "usual" and session.has_its_joints))
+    if guessed:
+        stated = session.shared_errors(session.T_base_gripper, session.q)
     given = session.T_base_gripper, session.mount, seen
-    problem = refinement.Problem(*given, free_scale, arm, q, stated, usual)
+    problem = refinement.Problem(*given, free_scale, arm, q, stated, guessed)
     best = refinement.refine(problem, X, Y, measured)
     return HandEyeResult(best.state.X, best.state.Y, method, session, measured, best)
 
@@ -836,6 +867,9 @@ class HandEyeResult(Estimate):
         """In words: how far to trust X, and what to do about what is weak."""
         judged = self.judgement
         reasons = [*([judged.large] if judged.large else []), *judged.broken, *judged.weak]
+        told = self.refined is not None and judged.trusted and math.isfinite(judged.worst_mm)
+        if told and self._fit.problem.fk is None and not self.session.has_its_joints:
+            reasons.append(SENTENCES.words["poses_alone"])
         return "\n".join(map(wrapped, [self._head(), *(f"- {reason}" for reason in reasons)]))
 
     def _head(self) -> str:

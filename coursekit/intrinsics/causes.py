@@ -83,6 +83,9 @@ SPOILED_RATIO = 3.0  # a view's rms over the others' median; blurred or far view
 SPOILED_PX = 0.2  # and at least this: what is a good corner's noise in a poor image
 BAD_CORNER_PX = 0.5  # a wrong corner is off by pixels; good ones stay below 5 sigma of 0.1 px
 RAYLEIGH_MEDIAN = 1.1774  # the median length of two independent standard normal numbers
+RAYLEIGH_99 = 3.0349 / RAYLEIGH_MEDIAN  # and the 99th percentile, in medians
+HEAVIEST_TAIL = 1.35  # of corners that differ in noise by 30 %; beyond, one in a hundred is wrong
+SIGMA_OF_MAD = 1.4826  # the standard deviation of a normal distribution, in median deviations
 SHRINK_DOF = 30.0  # per-view variances are drawn to the common one as by this many observations
 
 
@@ -393,8 +396,10 @@ class Calibration:
         if test.cause != SPOILED_VIEW:
             return True
         rms = self._rms_by_view()
-        others = float(np.median(np.delete(rms, rms.argmax())))
-        return test.size >= max(SPOILED_RATIO * others, SPOILED_PX)
+        others = np.delete(rms, rms.argmax())
+        unlike = np.log(others / np.median(others))  # views differ in noise, some sessions' by much
+        ratio = max(SPOILED_RATIO, math.exp(4 * SIGMA_OF_MAD * float(np.median(np.abs(unlike)))))
+        return test.size >= max(ratio * float(np.median(others)), SPOILED_PX)
 
     def accept(self, test: engine.Tested) -> Calibration:
         """The calibration with a cause added, or corners set aside, fitted again."""
@@ -420,13 +425,20 @@ class Calibration:
         return np.sqrt(np.bincount(self.index, squares) / np.bincount(self.index))
 
     def _wrong_corners(self) -> NDArray[np.intp]:
-        """Single corners too far out for the noise of the session and of their view."""
+        """Single corners too far out for the noise of the session and of their view.
+
+        Corners that differ in noise have heavier tails than a normal distribution: what the 99th
+        percentile is too far out goes into the limit, to the third power, as a mixture of normal
+        distributions has it where one corner in a million is.
+        """
         length = np.linalg.norm(self.plain.residuals.reshape(-1, 2), axis=1)
         sigma = np.full(len(length), np.median(length))
         for view in self.views:
             mine = self.corners.view == view
             sigma[mine] = np.maximum(sigma[mine], np.median(length[mine]))
         limit = np.sqrt(2 * np.log(len(length) / CHANCE_LEVEL)) / RAYLEIGH_MEDIAN
+        tail = float(np.percentile(length / sigma, 99)) / RAYLEIGH_99
+        limit *= np.clip(tail, 1.0, HEAVIEST_TAIL) ** 3
         return np.flatnonzero((length > limit * sigma) & (length > BAD_CORNER_PX))
 
     def _noise_weights(self, explained: engine.Explained) -> Floats:
@@ -590,7 +602,7 @@ def dents(model: Calibration) -> list[tuple[int, float]]:
     smooth = np.column_stack([bow_shape(model, model.board)[seen], plane])
     z = model.shape[seen, 2]
     from_plane, off = (z - A @ np.linalg.lstsq(A, z, rcond=None)[0] for A in (plane, smooth))
-    limit = max(DENT_SIGMAS * 1.4826 * float(np.median(np.abs(off))), DENT_M)
+    limit = max(DENT_SIGMAS * SIGMA_OF_MAD * float(np.median(np.abs(off))), DENT_M)
     return [(int(seen[k]), float(from_plane[k])) for k in np.flatnonzero(np.abs(off) > limit)]
 
 

@@ -288,4 +288,5 @@ def _scaled_parts(matrix: Floats) -> tuple[Floats, Floats, Floats]:
     """Scale (p,) that makes the diagonal 1, and eigenvalues and vectors of what is left."""
     scale = np.sqrt(np.maximum(np.diag(matrix), 0.0))
     scale = np.where(scale > 0, scale, 1.0)
-    return scale, *np.linalg.eigh(matrix / np.outer(scale, scale))
+    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
+    return scale, values, vectors

@@ -51,7 +51,7 @@ BARE_MARGIN, BARE_SIDES, ONE_BARE_MARGIN = 0.125, 2, 0.25
 # Real and normal: a glass plate is flat to 0.1 mm, a fixed lens breathes 0.1 % with temperature,
 # and a board held "still" moves 5 mm/s for the 20 ms that an image takes.
 NORMAL_BOW_M, NORMAL_DRIFT, NORMAL_MOTION_M = 1e-4, 2e-3, 1e-4
-RIVAL_LEVEL = 0.01  # of a fisheye with fewer coefficients: to lenses of this model it loses
+RIVAL_LEVEL = 0.04  # of a fisheye with fewer coefficients: to lenses of this model it loses
 NORMAL_LENS_PX = 0.05  # no measurement with the camera notices less
 NORMAL_SHIFT_PX = 1.0  # of the centre over a session
 UNEXPLAINED = 0.8  # of the corners' noise: what neighbours share in any JPEG stays below
@@ -260,14 +260,15 @@ def _wrong_lens(start: Calibration) -> Finding | None:
         beyond = {"out": math.degrees(math.atan(out)), "fold": math.degrees(math.atan(fold))}
         return _TEXTS.finding("lens_folds", rms=_flat(start.left_px), **beyond)
     if start.estimated[4:].any(axis=1).all():  # else the model has more coefficients to give
-        rival, p_value = causes.as_fisheye(start)
-        least = causes.LEAST_GAIN * start.noise_px**2
-        if start.shows_shape:  # where paper that is no plane explains more, it comes first
+        model = start
+        if start.shows_shape:  # paper that is no plane passes for a lens, and the reverse
             heights = start.plain.explains(start.hypothesis(causes.HEIGHTS))
-            least = max(least, start.left_px**2 - heights.rest)
-        if p_value < RIVAL_LEVEL and start.left_px**2 - rival.left_px**2 > least:
+            model = start.with_cause(heights.tested())
+        rival, p_value = causes.as_fisheye(model)
+        gain = model.left_px**2 - rival.left_px**2
+        if p_value < RIVAL_LEVEL and gain > causes.LEAST_GAIN * model.noise_px**2:
             figures = {"rival": _flat(rival.left_px), "noise": _flat(rival.noise_px)}
-            return _TEXTS.finding("lens_is_fisheye", p_value, rms=_flat(start.left_px), **figures)
+            return _TEXTS.finding("lens_is_fisheye", p_value, rms=_flat(model.left_px), **figures)
     step = causes.search_lens(start)
     if step is None or _gain_px([step]) < NORMAL_LENS_PX:
         return None

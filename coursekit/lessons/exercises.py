@@ -81,8 +81,8 @@ class Exercise:
     first one that fails is shown: `describe(args)` and `show(row)` put it into words. Where a
     result has rows and the first `per_row` arguments have the same, one row of them is shown;
     otherwise (a result that is one number, say) the whole case. parts: what the columns of a
-    result, or its numbers, are called. Results agree within `tolerance`
-    (in `unit`) or a millionth of their size, as float32 does, and NaN with NaN. Where
+    result, or its numbers, are called; seen: names in formulas of the text. Results agree within
+    `tolerance` (in `unit`) or a millionth of their size, as float32 does, and NaN with NaN. Where
     `nan_answers`, NaN is an answer like any other; otherwise a wrong model that comes to NaN or
     infinity has overflowed. ways: other right answers, what each does and the steps that do it;
     `way` is what the model does. An
@@ -98,6 +98,7 @@ class Exercise:
     describe: Callable[[tuple[Any, ...]], str]
     show: Callable[[Floats], str]
     parts: tuple[str, ...] = ()
+    seen: str = ""
     per_row: int = 0
     tolerance: float = 1e-6
     nan_answers: bool = False
@@ -172,7 +173,7 @@ class Exercise:
         if unfinished:
             return unfinished
         expected = [np.asarray(self._answer((), args)) for args in self.cases]
-        known = set(inspect.signature(self.model()).parameters)
+        known = {*inspect.signature(self.model()).parameters, *self.seen.split()}
         again = _as_numbers(_run(function, self.cases[0]).value)
         first = _as_numbers(runs[0].value)
         if again is None or first is None or not np.array_equal(again, first, equal_nan=True):
@@ -219,6 +220,8 @@ class Exercise:
                 if _as_numbers(run.value) is not None:
                     continue
                 text = f"it returns a {type(run.value).__name__} that is not an array of numbers."
+                if isinstance(run.value, tuple | list):
+                    text += f" Its parts: {', '.join(map(_form, run.value))}."
             return self._say(kind, text, self._given(args))
         return None
 
@@ -285,16 +288,30 @@ class Exercise:
                 return verdict
         if relation and not mistakes:
             mistakes = (_device(relation, "your result", "", replace),)
+        where = self._parts_off(values, expected)
         if mistakes:
-            return self._one(_in_words(mistakes[0], known), count, evidence)
-        return self._say("wrong", f"not right yet. {count}", evidence, FOUND["by_hand"])
+            where = where * mistakes[0].device
+            return self._one(_in_words(mistakes[0], known), count + where, evidence)
+        return self._say("wrong", f"not right yet. {count}{where}", evidence, FOUND["by_hand"])
+
+    def _part(self, i: int) -> Any:
+        """The index of a part of a result: of a column, or of a number."""
+        return (..., i) if self.per_row else i
+
+    def _parts_off(self, values: list[Floats], expected: list[Floats]) -> str:
+        """Says which parts of the result are wrong, where others are right."""
+        both = list(zip(values, expected, strict=True))
+        off = [
+            name
+            for i, name in enumerate(self.parts)
+            if not all(self._agrees(v[self._part(i)], e[self._part(i)]) for v, e in both)
+        ]
+        return f" Look at {_listed(off)}: all else is right." if len(off) < len(self.parts) else ""
 
     def _found(self, values: list[Floats], told: bool) -> tuple[Mistake, ...]:
         """The first mistakes that give these values; told: without the device's."""
         for mistakes in self._combinations():
-            if told and mistakes[-1].device:
-                break
-            if self._explains(mistakes, values):
+            if not (told and mistakes[-1].device) and self._explains(mistakes, values):
                 return mistakes
         return ()
 
@@ -369,22 +386,46 @@ class Exercise:
         return self._say("wrong", text, *lines, first.ask, named=f"several, first {first.name}")
 
     def _combinations(self) -> Iterator[tuple[Mistake, ...]]:
-        """Each mistake alone, then each pair of different steps, earlier step first; the device's
-        edits; a mistake and an edit of the whole."""
+        """Each mistake alone, and in one part of the result; each pair of different steps, earlier
+        step first; the device's edits; a mistake and an edit of the result, or two of those."""
+        yield from ((m,) for m in self.single_mistakes())
+        of_result, single, double = self._edits
         order = list(self.steps)
-        yield from ((m,) for m in self.mistakes)
         listed = [m for m in self.mistakes if not m.alone]
         for a, b in itertools.combinations(listed, 2):
             if a.step != b.step:
                 yield (a, b) if order.index(a.step) < order.index(b.step) else (b, a)
+        yield from ((m,) for m in (*single, *double))
+        common = [m for m in of_result if m.name in FOUND["common"] and "each of" not in m.says]
+        yield from itertools.product(self.mistakes, common)
+        yield from itertools.combinations(common, 2)
+
+    def single_mistakes(self) -> list[Mistake]:
+        """Those listed, the device's edits of the result, and those in one part of it."""
         if not self._edits:
             self._edits += _all_edits(self)
-        yield from ((m,) for m in itertools.chain(*self._edits))
-        common = [
-            m for m in self._edits[0] if m.name in FOUND["common"] and "each of" not in m.says
-        ]
-        yield from itertools.product(listed, common)
-        yield from itertools.combinations(common, 2)
+        return [*self.mistakes, *self._edits[0], *self._partial]
+
+    @cached_property
+    def _partial(self) -> list[Mistake]:
+        """Each mistake in each part of the result alone."""
+        parts = range(len(self.parts))
+        return [self._in_part(m, i) for m in self.mistakes for i in parts]
+
+    def _in_part(self, mistake: Mistake, i: int) -> Mistake:
+        """The mistake in one part of the result only."""
+        at, wrong = self._part(i), self.model(mistake)
+
+        def mixed(right: Model) -> Model:
+            def model(*args: Any) -> Floats:
+                result = np.array(right(*args))
+                result[at] = np.asarray(wrong(*args))[at]
+                return result
+
+            return model
+
+        says = f"in {self.parts[i]}: {mistake.says}"
+        return replace(mistake, says=says, step="", wrong=mixed, of_result=True)
 
     def _explains(self, mistakes: tuple[Mistake, ...], values: list[Floats]) -> bool:
         """Whether a wrong model gives exactly these values.
@@ -509,6 +550,11 @@ def _in_words(mistake: Mistake, known: set[str]) -> Mistake:
     if not mistake.device or (len(names) <= MOST_NAMES and known.issuperset(names)):
         return mistake
     return replace(mistake, says=_NAMED.sub(FOUND["unseen"], mistake.says))
+
+
+def _form(part: Any) -> str:
+    array = _as_numbers(part)
+    return f"a {type(part).__name__}" if array is None else _shape(array)
 
 
 def _shape(array: Floats) -> str:

@@ -95,6 +95,7 @@ def _places_subtracted(motion: Step, sign: int) -> Step:
 for _step in ("A", "B"):
     _motion = MOTION_PAIR.steps[_step]
     MOTION_PAIR.add_mistakes(
+        (_step, "one_not_inverted", lambda i, j, inverse: j @ i),
         (_step, "one_pose_only", lambda i, j, inverse: np.eye(4)),
         (_step, "product_inverted", lambda i, j, inverse: inverse(j @ i)),
         (_step, "product_inverted", lambda i, j, inverse: inverse(i @ j)),
@@ -108,6 +109,7 @@ for _step in ("A", "B"):
     )
 MOTION_PAIR.add_mistakes(
     ("read", "gripper_twice", lambda gi, gj, bi, bj: (gi, gj, gi, gj)),
+    ("read", "arm_and_board", lambda gi, gj, bi, bj: (bi, bj, gi, gj)),
     ("read", "board_twice", lambda gi, gj, bi, bj: (bi, bj, bi, bj)),
     ("inverse", "transposed_pose", lambda T: T.T),
     ("inverse", "translation_not_turned", lambda T: make_transform(T[:3, :3].T, -T[:3, 3])),

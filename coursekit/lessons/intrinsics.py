@@ -74,6 +74,11 @@ def _with_lengths(residuals: Floats) -> Floats:
     return np.c_[residuals, np.linalg.norm(residuals, axis=1)]
 
 
+def _squares_subtracted(observed: Floats, predicted: Floats) -> Floats:
+    axes = np.sqrt(np.abs(np.mean(observed**2 - predicted**2, axis=0)))
+    return np.array([*axes, np.hypot(*axes)])
+
+
 for _step in ("axis", "shown"):  # whether or not the 2-D number is made of them
     REPROJECTION_RMS.add_mistakes(
         (_step, "mean_removed", lambda e, *_: np.std(e, axis=0)),
@@ -87,6 +92,8 @@ for _step in ("axis", "shown"):  # whether or not the 2-D number is made of them
         (_step, "no_root", lambda e, *_: np.mean(e**2, axis=0)),
         (_step, "summed", lambda e, *_: np.sqrt(np.sum(e**2, axis=0))),
         (_step, "axis_over_2n", lambda e, *_: np.sqrt(np.sum(e**2, axis=0) / (2 * len(e)))),
+        (_step, "root_before_the_mean", lambda e, *_: np.sqrt(np.sum(e**2, axis=0)) / len(e)),
+        (_step, "median_absolute", lambda e, *_: np.sqrt(np.median(e**2, axis=0))),
         (_step, "largest", lambda e, *_: np.max(np.abs(e), axis=0)),
         (_step, "median_absolute", lambda e, *_: np.median(np.abs(e), axis=0)),
         (_step, "wrong_axis", lambda e, *_: np.sqrt(np.mean(e**2, axis=1))[:2]),
@@ -102,6 +109,7 @@ REPROJECTION_RMS.add_mistakes(
     ("both", "norm_of_everything", lambda residuals, axes: float(np.linalg.norm(residuals))),
     ("whole", "squares_everywhere", lambda residuals, result: result**2),
     ("whole", "mean_distances", lambda e, result: np.mean(np.abs(_with_lengths(e)), axis=0)),
+    ("", "squares_subtracted", lambda _: _squares_subtracted),
     ("order", "both_first", lambda axes, both: np.array([both, *axes])),
 )
 
@@ -161,9 +169,14 @@ FOCAL_SIGMA.add_mistakes(
     ("freedom", "nothing_fitted", lambda J, residuals: J.shape[0]),
     ("freedom", "one_parameter", lambda J, residuals: J.shape[0] - 1),
     ("freedom", "corners_counted", lambda J, residuals: J.shape[0] / 2 - J.shape[1]),
+    ("freedom", "corners_counted", lambda J, residuals: J.shape[0] * 2 - J.shape[1]),
+    ("freedom", "mean_fitted_too", lambda J, residuals: J.shape[0] - J.shape[1] - 1),
+    ("freedom", "parameters_for_freedom", lambda J, residuals: J.shape[1]),
     ("noise", "no_noise", lambda residuals, freedom: 1.0),
     ("noise", "noise_not_squared", lambda e, freedom: math.sqrt(e @ e / freedom)),
     ("noise", "noise_not_squared", lambda e, freedom: np.sum(np.abs(e)) / freedom),
+    ("noise", "noise_not_squared", lambda e, freedom: np.linalg.norm(e) / freedom),
+    ("scale", "noise_outside_the_root", lambda noise, first: noise**2 * first),
     ("noise", "noise_summed", lambda e, freedom: e @ e),
     ("noise", "spread_of_residuals", lambda residuals, freedom: np.var(residuals)),
     ("noise", "spread_of_residuals", lambda residuals, freedom: np.var(residuals, ddof=1)),

@@ -123,6 +123,7 @@ PROJECT = Exercise(
     ],
     per_row=1,
     parts=("u", "v"),
+    seen="fx fy cx cy x y",
     unit="px",
     tolerance=1e-3,
     describe=_describe_project,
@@ -171,6 +172,7 @@ _CAMERA: list[tuple[str, str, Step]] = [
     ("lens", "fx_for_both", lambda fx, fy, cx, cy: (fx, fx, cx, cy)),
     ("lens", "cx_cy_swapped", lambda fx, fy, cx, cy: (fx, fy, cy, cx)),
     ("lens", "principal_point_forgotten", lambda fx, fy, cx, cy: (fx, fy, 0.0, 0.0)),
+    ("lens", "principal_point_forgotten", lambda fx, fy, cx, cy: (fx, fx, 0.0, 0.0)),
     ("lens", "half_pixel", lambda fx, fy, cx, cy: (fx, fy, cx + 0.5, cy + 0.5)),
     ("lens", "half_pixel", lambda fx, fy, cx, cy: (fx, fy, cx - 0.5, cy - 0.5)),
     ("read", "p1_p2_swapped", lambda k1, k2, p1, p2, k3: (k1, k2, p2, p1, k3)),
@@ -285,6 +287,7 @@ DEPROJECT = Exercise(
     ],
     per_row=2,
     parts=("X", "Y", "Z"),
+    seen="fx fy cx cy u v x y",
     unit="m",
     tolerance=1e-5,
     describe=_describe_deproject,
@@ -330,18 +333,26 @@ def _from_the_wrong_side_scaled(u: Floats, v: Floats, *lens: float) -> Any:
     return x / w, y / w, 1.0
 
 
+def _only_the_centre_scaled(pixels: Floats, depth: Floats, K: Floats, *_: Any) -> Floats:
+    fx, fy, cx, cy = _lens(K)
+    u, v = pixels.T
+    return np.stack([u - cx * depth / fx, v - cy * depth / fy, depth], axis=1)
+
+
 def _along_the_ray(x: Floats, y: Floats, w: Any, depth: Floats) -> Any:
     return _scale(x, y, w, depth / np.sqrt(x**2 + y**2 + w**2))
 
 
 DEPROJECT.add_mistakes(
     ("rays", "inverse_missing", lambda u, v, *lens: (*_to_pixels(u, v, 1.0, *lens), 1.0)),
+    ("rays", "input_swapped", lambda u, v, *lens: _to_normalised(v, u, *lens)),
     ("rays", "inverse_transposed", _from_the_wrong_side),
     ("rays", "inverse_transposed", _from_the_wrong_side_scaled),
     ("lens", "principal_point_added", lambda fx, fy, cx, cy: (fx, fy, -cx, -cy)),
     ("lens", "brackets_missing", lambda fx, fy, cx, cy: (1.0, 1.0, cx / fx, cy / fy)),
     ("lens", "times_focal_length", lambda fx, fy, cx, cy: (1 / fx, 1 / fy, cx, cy)),
     *_CAMERA,
+    ("", "brackets_missing", lambda _: _only_the_centre_scaled),
     ("scale", "depth_along_ray", _along_the_ray),
     ("scale", "not_scaled", lambda x, y, w, depth: (x, y, w * depth)),
     ("scale", "divided_by_depth", lambda x, y, w, depth: (x / depth, y / depth, w * depth)),

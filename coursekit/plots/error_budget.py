@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from matplotlib.patches import Ellipse, Rectangle
 
-from coursekit.arrays import ArrayLike, Floats
+from coursekit.arrays import ArrayLike
 from coursekit.attribution import SimulatedMisses
-from coursekit.budget import Draws, ErrorBudget, Gripper, Target
-from coursekit.plots.style import COLORS, LessonFigure, figure, panels, single
+from coursekit.budget import ErrorBudget, Gripper, Target
+from coursekit.plots.style import COLORS, LessonFigure, panels, single
 
 KINDS = {"bias": "measured", "noise": "depth"}
 CHI2_95_IN_A_PLANE = 5.991  # of two degrees of freedom
-CHI2_95_SPACE = 7.815  # of three
 
 
 def bars(budget: ErrorBudget) -> LessonFigure:
@@ -50,28 +48,6 @@ def bars(budget: ErrorBudget) -> LessonFigure:
     return fig.saying("The budget's rows at the object: " + "; ".join(said))
 
 
-def biases(draws: Draws, tolerance_m: float) -> LessonFigure:
-    """Many rigs of one budget: how long their bias is, and how much of it lies along closing."""
-    fig, (length, along) = panels(2, 2, 9.0, 3.6)
-    norm, closing = 1000 * draws.norm_m, 1000 * draws.along_m[:, 0]
-    length.hist(norm, 60, color=COLORS["measured"], density=True)
-    along.hist(closing, 60, color=COLORS["measured"], density=True)
-    for ax, places in ((length, (1,)), (along, (-1, 1))):
-        for sign in places:
-            ax.axvline(1000 * sign * tolerance_m, color=COLORS["ink"], ls="--")
-        ax.set_yticks([])
-    over = 100 * np.mean(norm > 1000 * tolerance_m)
-    out = 100 * np.mean(np.abs(closing) > 1000 * tolerance_m)
-    length.set(xlabel="length of the bias (mm)", ylabel="share of rigs")
-    along.set(xlabel="bias along the closing axis (mm)")
-    length.set_title(f"{over:.1f} % beyond ±{1000 * tolerance_m:g} mm")
-    along.set_title(f"{out:.1f} % beyond ±{1000 * tolerance_m:g} mm")
-    return fig.saying(
-        f"Bias of many rigs: mean length {norm.mean():.1f} mm, {over:.1f} % longer than "
-        f"{1000 * tolerance_m:g} mm; along the closing axis {out:.1f} % beyond it."
-    )
-
-
 def between_fingers(
     gripper: Gripper,
     target: Target,
@@ -79,81 +55,36 @@ def between_fingers(
     bias_mm: ArrayLike,
     others_mm: ArrayLike = (),
 ) -> LessonFigure:
-    """The cube between the fingers at true scale, in space and from above, and where it may be.
+    """The object between the fingers from above, at true scale, and where its centre may be.
 
-    covariance (3, 3): of the cube's centre along closing, approach and lateral, m^2, drawn as the
-    ellipsoid (from above: the ellipse) that holds 95 %. bias_mm (3,): its middle. others_mm (n, 3):
-    the biases of other rigs, as dots.
+    covariance (3, 3): of the centre along closing, approach and lateral, m^2, drawn as the ellipse
+    that holds 95 %. bias_mm (3,): its middle. others_mm (n, 3): biases of other rigs, as dots.
     """
-    covariance, bias = 1e6 * np.asarray(covariance, float), np.asarray(bias_mm, float)
+    flat, bias = 1e6 * np.asarray(covariance)[::2, ::2], np.asarray(bias_mm, float)
     others = np.reshape(np.asarray(others_mm, float), (-1, 3))
     width, opening = 1000 * target.width_m, 1000 * gripper.opening_m
-    reach = opening / 2 + 10
-    fig = figure(10.0, 4.6)
-    grid = fig.add_gridspec(1, 2, width_ratios=(1.15, 1))
-    space: Any = fig.add_subplot(grid[0], projection="3d")
-    for side in (-1, 1):
-        _box(space, (side * (opening / 2 + 4), 0, 0), (8, 16, 30), COLORS["block"], 0.5)
-    _box(space, (0, 0, 0), (width,) * 3, COLORS["cube"], 0.15)
-    space.plot_surface(*_surface(covariance, bias), color=COLORS["measured"], shade=True)
-    space.scatter(others[:, 0], others[:, 2], -others[:, 1], s=2, color=COLORS["ink"], alpha=0.4)
-    limits: dict[str, Any] = {f"{axis}lim": (-reach, reach) for axis in "xyz"}
-    space.set(xlabel="closing (mm)", ylabel="lateral (mm)", zlabel="up (mm)", **limits)
-    space.set_box_aspect((1, 1, 1), zoom=1.05)
-    space.yaxis.labelpad = 9
-    for axis in (space.xaxis, space.yaxis, space.zaxis):
-        axis.set_ticks(np.arange(-20, 21, 20))  # none at the corners, where labels would meet
-    space.view_init(elev=20, azim=-65)
-    above = fig.add_subplot(grid[1])
-    above.plot(others[:, 0], others[:, 2], ".", ms=2, color=COLORS["ink"], alpha=0.5)
-    half = _from_above(above, width, opening, covariance[::2, ::2], bias[::2])
-    return fig.saying(
-        f"A {width:g} mm cube between fingers that open {opening:g} mm, with the ellipsoid that "
-        f"holds its centre in 95 of 100 grasps, from above {half[0]:.1f} by {half[1]:.1f} mm to "
-        f"either side, its middle {np.linalg.norm(bias):.1f} mm off, {bias[0]:+.1f} mm of it "
-        f"along the closing axis; the room is ±{(opening - width) / 2:.1f} mm. {len(others)} dots: "
-        "the same for other rigs, without noise."
-    )
-
-
-def _from_above(ax: Any, width: float, opening: float, covariance: Floats, bias: Floats) -> Floats:
-    """Fingers, cube and the 95 % ellipse of (closing, lateral), mm; its half axes (2,)."""
     room, reach = (opening - width) / 2, opening / 2 + 10
-    for side in (-1, 1):
-        left = opening / 2 if side > 0 else -opening / 2 - 8
-        ax.add_patch(Rectangle((left, -8), 8, 16, color=COLORS["block"]))
-        ax.axvline(side * room, color=COLORS["ink"], ls="--", lw=1)
+    fig, ax = single(6.0, 4.8)
     ax.add_patch(Rectangle((-width / 2, -width / 2), width, width, fc=COLORS["cube"], alpha=0.25))
-    values, vectors = np.linalg.eigh(covariance)
-    half = np.sqrt(CHI2_95_IN_A_PLANE * np.clip(values, 0, None))[::-1]
+    for side in (-1, 1):
+        ax.bar(side * (opening / 2 + 4), 16, 8, -8, color=COLORS["block"])  # a finger
+        ax.axvline(side * room, color=COLORS["ink"], ls="--", lw=1)
+    ax.plot(others[:, 0], others[:, 2], ".", ms=2, color=COLORS["ink"], alpha=0.5)
+    values, vectors = np.linalg.eigh(flat)
+    long, short = half = np.sqrt(CHI2_95_IN_A_PLANE * np.clip(values, 0, None))[::-1]
     turn = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
-    middle = (float(bias[0]), float(bias[1]))
-    place = Ellipse(middle, 2 * half[0], 2 * half[1], angle=turn, fc=COLORS["measured"], alpha=0.5)
-    place.set(edgecolor=COLORS["measured"], lw=2)
-    ax.add_patch(place)
+    ax.add_patch(Ellipse((bias[0], bias[2]), 2 * long, 2 * short, angle=turn, alpha=0.5,
+                         fc=COLORS["measured"], ec=COLORS["measured"], lw=2))  # fmt: skip
     ax.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal",
            xlabel="closing (mm)", ylabel="lateral (mm)")  # fmt: skip
     ax.set_title(f"from above: its centre must stay within ±{room:.1f} mm")
-    return half
-
-
-def _surface(covariance: Floats, middle: Floats) -> Floats:
-    """The 95 % ellipsoid as x, y, z to plot, (3, 17, 25): closing, lateral, up (mm)."""
-    polar, around = np.meshgrid(np.linspace(0, np.pi, 17), np.linspace(0, 2 * np.pi, 25),
-                                indexing="ij")  # fmt: skip
-    sphere = np.stack([np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around),
-                       np.cos(polar)])  # fmt: skip
-    values, vectors = np.linalg.eigh(covariance)
-    root = vectors * np.sqrt(CHI2_95_SPACE * np.clip(values, 0, None))
-    closing, approach, lateral = np.tensordot(root, sphere, 1) + middle[:, None, None]
-    return np.stack([closing, lateral, -approach])  # the gripper comes from above
-
-
-def _box(ax: Any, middle: tuple[float, ...], size: tuple[float, ...], color: str,
-         alpha: float) -> None:  # fmt: skip
-    """A block in a 3-D axes, of `size` about `middle`, mm."""
-    corner = np.subtract(middle, np.divide(size, 2))
-    ax.bar3d(*corner, *size, color=color, alpha=alpha, shade=True)
+    return fig.saying(
+        f"A {width:g} mm cube between fingers that open {opening:g} mm, from above, with the "
+        f"ellipse that holds its centre in 95 of 100 grasps, {half[0]:.1f} by {half[1]:.1f} mm to "
+        f"either side, its middle {np.linalg.norm(bias):.1f} mm off, {bias[0]:+.1f} mm of it "
+        f"along the closing axis; the room is ±{room:.1f} mm. {len(others)} dots: the same for "
+        "other rigs, without noise."
+    )
 
 
 def misses(sets: Mapping[str, SimulatedMisses], times: float = 15.0) -> LessonFigure:
@@ -161,7 +92,7 @@ def misses(sets: Mapping[str, SimulatedMisses], times: float = 15.0) -> LessonFi
     fig, axes = panels(len(sets), 2, 9.6, 3.0, sharex=True, sharey=True)
     ends = [one.T_base_gripper[:, :2, 3] + times * one.misses[:, :2] for one in sets.values()]
     forward, left = np.concatenate(ends).T
-    wide = 1.05 * np.abs(left).max()
+    wide, texts = 1.05 * np.abs(left).max(), []
     for ax, (name, one) in zip(axes, sets.items(), strict=True):
         (x, y), (right, up) = one.T_base_gripper[:, :2, 3].T, times * one.misses[:, 1::-1].T
         ax.quiver(y, x, right, up, angles="xy", scale_units="xy", scale=1, width=0.006,
@@ -171,11 +102,8 @@ def misses(sets: Mapping[str, SimulatedMisses], times: float = 15.0) -> LessonFi
                aspect="equal", title=f"{name}, {len(one.misses)} trials",
                xlabel="y of the base, to the left (m)", ylabel="x, forward (m)")  # fmt: skip
         ax.label_outer()
+        mean_mm = 1000 * np.linalg.norm(one.misses.mean(axis=0))
+        texts.append(f"{name}, {len(one.misses)} trials, mean {mean_mm:.1f} mm")
     return fig.saying(
-        f"Misses from above, {times:g} times as long, where they happened: "
-        + "; ".join(
-            f"{name}, {len(one.misses)} trials, mean "
-            f"{1000 * np.linalg.norm(one.misses.mean(axis=0)):.1f} mm"
-            for name, one in sets.items()
-        )
+        f"Misses from above, {times:g} times as long, where they happened: {'; '.join(texts)}"
     )

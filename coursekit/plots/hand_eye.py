@@ -18,7 +18,6 @@ from coursekit.plots.style import (
     MARKERS,
     STYLES,
     LessonFigure,
-    cross,
     figure,
     panels,
     plain_ticks,
@@ -116,30 +115,6 @@ def _arrow(ax: Any, name: str, start: Floats, end: Floats, color: str, taken: Fl
     return place[None]
 
 
-def diversity(T_base_gripper: Floats) -> LessonFigure:
-    """Where the gripper was and how it was turned at poses (n, 4, 4).
-
-    Rotations are those from the session's mean, as rotation vectors along the gripper's axes.
-    """
-    fig, (places, *turns) = panels(3, 3, 10.0, 3.6)
-    R = Rotation.from_matrix(T_base_gripper[:, :3, :3])
-    vectors = np.degrees((R.mean().inv() * R).as_rotvec())
-    reach = 1.1 * np.abs(vectors).max() + 1
-    places.plot(T_base_gripper[:, 0, 3], T_base_gripper[:, 1, 3], "o", color=COLORS["measured"])
-    places.set(aspect="equal", xlabel="x of the base (m)", ylabel="y of the base (m)")
-    places.set_title("the gripper from above")
-    for ax, column in zip(turns, (0, 2), strict=True):
-        cross(ax)
-        ax.plot(vectors[:, column], vectors[:, 1], "o", color=COLORS["measured"])
-        ax.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal",
-               xlabel=f"about its {'xyz'[column]} (deg)", ylabel="about its y (deg)")  # fmt: skip
-        ax.set_title("turned, from the mean")
-    return fig.saying(
-        "Gripper places from above, and rotations from their mean, by up to "
-        f"{np.linalg.norm(vectors, axis=1).max():.0f} deg."
-    )
-
-
 def agreement(sessions: Mapping[str, HandEyeSession]) -> LessonFigure:
     """Three things that a session shows before anybody believes its X, a row for each session.
 
@@ -233,30 +208,6 @@ def more_poses(
     )
 
 
-def gaps(gap_mm: ArrayLike, held: ArrayLike) -> LessonFigure:
-    """How far the board is from where X says, (n,), mm; held (n,): which poses were held out.
-
-    >>> gaps([1.0, 2.0, 2.0], [False, False, True]).alt[:65]
-    'Gap between the board as seen and as predicted: rms 1.58 mm over '
-    """
-    gap, out = np.asarray(gap_mm, float), np.asarray(held, bool)
-    fig, ax = single(8.0, 3.2)
-    number = np.arange(1, len(gap) + 1)
-    for which, color, label in ((~out, "model", "fitted"), (out, "measured", "held out")):
-        ax.bar(number[which], gap[which], color=COLORS[color], label=label)
-    ax.set_xticks(number)
-    ax.set(xlabel="pose (number)", ylabel="gap at the board (mm)")
-    ax.legend(ncols=2)
-    return fig.saying(
-        f"Gap between the board as seen and as predicted: rms {_rms(gap[~out]):.2f} mm over "
-        f"{(~out).sum()} fitted poses, {_rms(gap[out]):.2f} mm over {out.sum()} held out."
-    )
-
-
-def _rms(values: Floats) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
 def touched(gap_mm: ArrayLike) -> LessonFigure:
     """Where corners are by camera, from several looks, and by fingertip: the gaps (n, 3), mm.
 
@@ -272,9 +223,7 @@ def touched(gap_mm: ArrayLike) -> LessonFigure:
     ax.set_xticks(places, [f"{n + 1}" for n in places])
     ax.set(xlabel="corner, look after look (number)", ylabel="camera - fingertip (mm)")
     ax.legend(ncols=3)
+    rows = (", ".join(map("{} {:+.1f}".format, "xyz", row)) for row in gap)
     return fig.saying(
-        "Camera minus fingertip, corner by corner and look by look, mm: "
-        + "; ".join(
-            ", ".join(f"{a} {v:+.1f}" for a, v in zip("xyz", row, strict=True)) for row in gap
-        )
+        f"Camera minus fingertip, corner by corner and look by look, mm: {'; '.join(rows)}"
     )

@@ -13,7 +13,7 @@ from matplotlib.patches import Polygon
 from matplotlib.patheffects import withStroke
 
 from coursekit.arrays import Floats
-from coursekit.boards import Board, Detection
+from coursekit.boards import Detection
 from coursekit.geometry import project, transform_points
 from coursekit.intrinsics import Comparison, IntrinsicsResult
 from coursekit.intrinsics.fit import tilts
@@ -80,29 +80,6 @@ def _best_rms(X: Floats, Y: Floats, seen: Floats) -> Floats:
 
 
 # --- board and views ---
-
-
-def board(board: Board) -> LessonFigure:
-    """The board's pattern with its frame and the numbers of a few corners."""
-    fig, ax = single(6.4, 4.4)
-    width, height = (1000 * s for s in board.size_m)
-    left, top = (1000 * (c - board.square_m) for c in board.points[0, :2])
-    ax.imshow(board.image(60), cmap="gray", vmin=0, vmax=255,
-              extent=(left, left + width, top + height, top))  # fmt: skip
-    points = 1000 * board.points
-    ax.plot(points[:, 0], points[:, 1], "o", ms=4, color=COLORS["measured"])
-    for name, tip, color in (("x", (1, 0), "measured"), ("y", (0, 1), "truth")):
-        arrow = {"arrowstyle": "-|>", "color": COLORS[color], "lw": 2.5}
-        ax.annotate("", (60 * tip[0], 60 * tip[1]), (0, 0), arrowprops=arrow)
-        ax.text(68 * tip[0], 68 * tip[1], name, color=COLORS[color], fontweight="bold",
-                ha="center", va="center", bbox={"fc": "white", "ec": "none", "pad": 1})  # fmt: skip
-    ax.set(xlabel="x (mm)", ylabel="y (mm)")
-    columns, rows = board.corners
-    return fig.saying(
-        f"The board: {board.squares[0]} x {board.squares[1]} squares of "
-        f"{1000 * board.square_m:g} mm, {columns} x {rows} inner corners marked, and its frame: "
-        "x to the right, y down, z into the board."
-    )
 
 
 def views(folder: str | Path, detections: Sequence[Detection]) -> LessonFigure:
@@ -183,7 +160,7 @@ def uncertainty(results: Mapping[str, IntrinsicsResult], range_m: float) -> Less
     maps = {name: r.uncertainty_map(range_m, (30, 40)) for name, r in results.items()}
     ends = [f([f(m) for m in maps.values()]) for f in (np.nanmin, np.nanmax)]  # a lens may fold
     fig, axes = panels(len(maps), len(maps), 3.1 * len(maps) + 0.7, 2.7)
-    edge = [withStroke(linewidth=2.5, foreground=COLORS["ink"])]
+    edge, texts = [withStroke(linewidth=2.5, foreground=COLORS["ink"])], []
     for ax, (name, sigma) in zip(axes, maps.items(), strict=True):
         width, height = results[name].intrinsics.size
         u, v = np.linspace(0, width - 1, sigma.shape[1]), np.linspace(0, height - 1, len(sigma))
@@ -199,14 +176,12 @@ def uncertainty(results: Mapping[str, IntrinsicsResult], range_m: float) -> Less
             text.set_path_effects(edge)
         image_axes(ax, width, height)
         ax.set_title(f"{name}: {np.nanmin(sigma):.2g} to {np.nanmax(sigma):.2g} px", fontsize=10)
+        texts.append(f"{name} from {np.nanmin(sigma):.3f} to {np.nanmax(sigma):.3f} px")
     bar = fig.colorbar(shown, ax=axes, label="σ of a projected pixel (px)", shrink=0.9)
     plain_ticks(bar.ax.yaxis, LEVELS_PX)
     return fig.saying(
         f"Standard deviation of a projected pixel over the image, for points {range_m:g} m away: "
-        + "; ".join(
-            f"{name} from {np.nanmin(m):.3f} to {np.nanmax(m):.3f} px" for name, m in maps.items()
-        )
-        + "."
+        f"{'; '.join(texts)}."
     )
 
 
@@ -214,6 +189,7 @@ def two_sessions(results: Mapping[str, IntrinsicsResult]) -> LessonFigure:
     """RMS of each view, and the outlines of the boards, of some sessions side by side."""
     n = len(results)
     fig, axes = panels(2 * n, n, 9.0, 2.8, height_ratios=(1, 1.5))
+    texts = []
     top = 1.3 * max(float(r.per_view_rms_px.max()) for r in results.values())
     for bars, image, (name, result) in zip(axes[:n], axes[n:], results.items(), strict=True):
         numbers = np.arange(1, len(result.detections) + 1)
@@ -224,13 +200,9 @@ def two_sessions(results: Mapping[str, IntrinsicsResult]) -> LessonFigure:
         for outline in outlines(result):
             image.add_patch(Polygon(outline, fill=False, ec=COLORS["measured"], lw=1))
         image_axes(image, *result.intrinsics.size)
-    return fig.saying(
-        "RMS of each view and the outlines of the boards: "
-        + "; ".join(
-            f"session {name} has RMS {r.rms_px:.3f} px and fx {r.intrinsics.fx:.1f} px"
-            for name, r in results.items()
-        )
-    )
+        fx = f"fx {result.intrinsics.fx:.1f} px"
+        texts.append(f"session {name} has RMS {result.rms_px:.3f} px and {fx}")
+    return fig.saying(f"RMS of each view and the outlines of the boards: {'; '.join(texts)}")
 
 
 def outlines(result: IntrinsicsResult) -> list[Floats]:

@@ -132,53 +132,6 @@ def _edges(scene: tuple[Box, ...]) -> list[Floats]:
     ]
 
 
-def field_of_view(depth: Intrinsics, color: Intrinsics | None, distance_m: float) -> LessonFigure:
-    """What the depth and the colour camera see, from above, and how wide that is at a distance."""
-    fig, ax = single(8.0, 4.0)
-    texts = []
-    cameras = [("depth", depth)] + ([("color", color)] if color else [])
-    for (name, camera), label in zip(cameras, ("depth", "colour"), strict=False):
-        edges = np.array([[-0.5, camera.cy], [camera.width - 0.5, camera.cy]])
-        left, right = geometry.deproject(edges, distance_m, camera.K)[:, 0]
-        width = 1000 * (right - left)
-        text = f"{label}: {camera.hfov_deg:.1f}°, {width:.0f} mm wide at {distance_m:.2f} m"
-        far = 1.25
-        wedge = [0, left * far, right * far], [0, distance_m * far, distance_m * far]
-        ax.fill(*wedge, color="white")  # or the inner wedge would have the colours of both
-        ax.fill(*wedge, color=COLORS[name], alpha=0.35, label=text)
-        texts.append(text)
-    ax.axhline(distance_m, color=COLORS["ink"], lw=1, ls="--", label=f"Z = {distance_m:.2f} m")
-    ax.plot([0, 0], [0, 1.25 * distance_m], color=COLORS["ink"], lw=1, label="optical axis")
-    ax.set(xlabel="X (m)", ylabel="Z (m)", aspect="equal", ylim=(0, 1.25 * distance_m))
-    fig.legend(loc="outside lower center", ncols=2)
-    return fig.saying("Fields of view from above. " + "; ".join(texts) + ".")
-
-
-def same_pixel(near_m: float, near_size_m: float, far_m: float, K: Floats) -> LessonFigure:
-    """A small near and a large far object that cover the same pixels; K is (3, 3), px.
-
-    >>> same_pixel(0.5, 0.02, 1.0, np.diag([400.0, 400.0, 1.0])).axes[0].get_title()
-    'both are 16.0 px wide in the image'
-    """
-    far_size = near_size_m * far_m / near_m
-    pixels = K[0, 0] * near_size_m / near_m
-    fig, ax = single(8.0, 3.2)
-    for z, size, name in ((near_m, near_size_m, "cube"), (far_m, far_size, "block")):
-        ax.plot([z, z], [-size / 2, size / 2], color=COLORS[name], lw=6,
-                label=f"{1000 * size:.0f} mm at {z:.4g} m")  # fmt: skip
-    reach = far_m * 1.15
-    for sign in (-1, 1):
-        ax.plot([0, reach], [0, sign * far_size / 2 * reach / far_m], color=COLORS["model"], lw=1.5)
-    ax.plot(0, 0, "o", color=COLORS["ink"])
-    ax.set(xlabel="Z (m)", ylabel="X (m)", title=f"both are {pixels:.1f} px wide in the image")
-    ax.invert_yaxis()  # from above, the camera's right hand is towards the bottom
-    fig.legend(loc="outside lower center", ncols=2)
-    return fig.saying(
-        f"Two objects between the same two rays: {1000 * near_size_m:.0f} mm wide at {near_m:.4g} m"
-        f" and {1000 * far_size:.0f} mm wide at {far_m:.4g} m; both are {pixels:.1f} px wide."
-    )
-
-
 def displacement(lenses: Mapping[str, Intrinsics]) -> LessonFigure:
     """How far distortion moves each pixel, in px, one map a lens, all to one scale."""
     fig, axes = panels(len(lenses), 2, 8.5, 3.1)
@@ -266,7 +219,7 @@ def point_cloud(points: NDArray[np.float32]) -> LessonFigure:
     some = np.random.default_rng(0).permutation(len(near))[:30_000]  # a stride makes moiré
     fig = figure(9.0, 3.9)
     fig.set_layout_engine("none")  # the 3-D axes reserve far more room than they use
-    colors = {"vmin": cloud[:, 2].min(), "vmax": cloud[:, 2].max()}
+    colors: dict[str, Any] = {"vmin": cloud[:, 2].min(), "vmax": cloud[:, 2].max()}
     _solid(fig.add_axes((0.05, 0.0, 0.45, 0.94), projection="3d"), near[some], colors)
     above = fig.add_axes((0.55, 0.15, 0.34, 0.75))
     flat = cloud[np.abs(cloud[:, 1]) < SLICE_M]

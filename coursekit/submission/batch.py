@@ -1,6 +1,7 @@
 """Grades a folder of bundles in a pool of warm processes, which outlives what a bundle does to one.
 
-A bundle that hangs is ended at its time limit, one that kills its process or wants too much memory
+A bundle that computes for longer than its limit is ended (by the wall's clock it has SLOWER times
+that, so that a busy machine fails nobody), one that kills its process or wants too much memory
 becomes a row with its reason; the batch goes on. Each process is replaced after MAX_TASKS bundles,
 so whatever it gathers is given back. Windows has no limit on a process's memory that it could set
 itself (no module `resource`), and macOS does not enforce it: there the caps of the reader, which
@@ -53,8 +54,10 @@ from coursekit.words import counted
 TIMEOUT_S = 10.0
 MEMORY_BYTES = 512 * 2**20  # above what a warm process has
 MAX_TASKS = 40  # bundles, then a process is replaced
-PATIENCE_S = 60.0  # beyond the time limit; a pool from which nothing comes so long is replaced
+SLOWER = 6.0  # by the wall's clock a bundle may take so many times its limit: others compute, too
+PATIENCE_S = 60.0  # beyond that; a pool from which nothing comes so long is replaced
 AHEAD = 3  # bundles a worker that wait in the pool
+MAX_LEVELS = 100  # of folders in an LMS's zip
 HASHED_BYTES = 6 * 2**20  # of a file; larger ones are refused anyway
 
 FAILED = ("timeout", "died", "memory", "error", "lost")  # tried anew by the next run
@@ -165,7 +168,6 @@ def grade_folder(
     out: str | os.PathLike[str] | None = None,
     workers: int | None = None,
     timeout_s: float = TIMEOUT_S,
-    memory_bytes: int = MEMORY_BYTES,
     progress: bool = True,
     overwrite: bool = False,
     choices: Choices = Choices(),
@@ -174,9 +176,9 @@ def grade_folder(
 
     folder: or the zip that an LMS makes of all that was handed in. out: a folder for the report:
     new, empty, or one that holds a report; default NAME_report, here. workers: processes,
-    default one a core. timeout_s: for a bundle. memory_bytes: for a process, above
-    its resting size. overwrite: replace a finished report; what was graded and has not changed is
-    not graded again, unless the grader has changed. An unfinished one is gone on with in any case.
+    default one a core. timeout_s: of computing, for a bundle. overwrite: replace a finished report;
+    what was graded and has not changed is not graded again, unless the grader has changed. An
+    unfinished one is gone on with in any case.
     Raises ValueError for a folder that will not do, before any work, Stopped on Ctrl-C, and
     ChildProcessError when no process can be started.
     """
@@ -186,12 +188,11 @@ def grade_folder(
     if workers is None:
         free = getattr(os, "sched_getaffinity", None)  # what this process may use
         workers = len(free(0)) if free else os.cpu_count() or 1
-    for name, value in (("workers", workers), ("timeout_s", timeout_s), ("memory", memory_bytes)):
-        positive(name, value)
+    positive("workers", workers)
+    limits = Limits(workers, positive("timeout_s", timeout_s))
     roster = Roster(class_table(Path(choices.roster)) if choices.roster else ())
     _own_points(out / OWN_POINTS)
     _check_out(out, overwrite)
-    limits = Limits(workers, timeout_s, memory_bytes)
     if not folder.is_file():
         return _grade(folder, out, limits, progress, roster, choices)
     with tempfile.TemporaryDirectory() as scratch:
@@ -372,6 +373,8 @@ def _unpack(archive: Path, into: Path) -> None:
                 target = into.joinpath(*parts)
                 if member.is_dir() or is_junk(member.filename):
                     continue
+                deep = f"at most {MAX_LEVELS} folders in each other"
+                want(len(parts) <= MAX_LEVELS, archive.name, len(parts), deep)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 with packed.open(member) as file:
                     target.write_bytes(file.read(HASHED_BYTES))
@@ -419,7 +422,7 @@ def printable(text: str) -> str:
 
 @dataclass(frozen=True)
 class Limits:
-    """Processes, seconds a bundle, and bytes a process above its resting size."""
+    """Processes, seconds of computing a bundle, and bytes a process above its resting size."""
 
     workers: int
     timeout_s: float = TIMEOUT_S
@@ -450,7 +453,8 @@ def work_through(
                     running[_scheduled(pool, work, bundle, limits)] = bundle
                 if not running:
                     return
-                done, _ = wait(running, limits.timeout_s + PATIENCE_S, FIRST_COMPLETED)
+                patience = SLOWER * limits.timeout_s + PATIENCE_S
+                done, _ = wait(running, patience, FIRST_COMPLETED)
                 if not done:
                     break
                 for future in done:
@@ -467,12 +471,23 @@ def work_through(
 def _scheduled(pool: ProcessPool, work: Work, bundle: Bundle, limits: Limits) -> Future[Graded]:
     """A bundle given to the pool; its future is broken where the pool is no more."""
     try:
-        arguments = (str(bundle.path), bundle.name, bundle.page)
-        return pool.schedule(work, arguments, timeout=limits.timeout_s)
+        arguments = (work, limits.timeout_s, str(bundle.path), bundle.name, bundle.page)
+        return pool.schedule(_in_time, arguments, timeout=SLOWER * limits.timeout_s)
     except RuntimeError as error:  # the pool is no more; the bundle is lost with it
         lost: Future[Graded] = Future()
         lost.set_exception(BrokenProcessPool(str(error)))
         return lost
+
+
+def _in_time(work: Work, timeout_s: float, *bundle: str) -> Graded:
+    """`work` of a bundle, in a process that SIGPROF ends when it has computed for so long."""
+    if not hasattr(signal, "setitimer"):  # Windows: the wall's clock alone
+        return work(*bundle)
+    signal.setitimer(signal.ITIMER_PROF, timeout_s)
+    try:
+        return work(*bundle)
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
 
 
 def _outcome(future: Future[Graded], bundle: Bundle, limits: Limits) -> Graded:
@@ -482,11 +497,12 @@ def _outcome(future: Future[Graded], bundle: Bundle, limits: Limits) -> Graded:
         return future.result()
     if isinstance(error, BrokenProcessPool):
         raise error
-    if isinstance(error, TimeoutError):
+    ending = _ending(error.exitcode) if isinstance(error, ProcessExpired) else ""
+    if isinstance(error, TimeoutError) or ending == "SIGPROF":
         says = f"It took longer than {limits.timeout_s:g} s. Grade it with a longer --timeout."
         return _failed(bundle, "timeout", says)
-    if isinstance(error, ProcessExpired):
-        says = f"It ended the process that graded it ({_ending(error.exitcode)}). Look inside."
+    if ending:
+        says = f"It ended the process that graded it ({ending}). Look inside."
         return _failed(bundle, "died", says)
     if isinstance(error, MemoryError):
         return report.out_of_memory(bundle.name), ""

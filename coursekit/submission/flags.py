@@ -14,12 +14,15 @@ import json
 import math
 import re
 import unicodedata
+import zlib
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
-from functools import lru_cache
+from functools import lru_cache, partial
+from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,7 +30,7 @@ from coursekit import specifications
 from coursekit.arrays import Floats, NDArray
 from coursekit.checks import want
 from coursekit.submission.format import CameraFacts, Stack, Submission
-from coursekit.submission.recompute import SEEN, Recomputed, grading_rules
+from coursekit.submission.recompute import HEADINGS, SEEN, Recomputed, grading_rules
 
 LARGEST_WAVE = 6  # so many of them across a window; finer ones hold what was added
 N_WAVES = (
@@ -39,19 +42,16 @@ FRAME_LIKENESS = (
 COMPARED, MOST_FRAMES = 150_000, 40_000  # pairs of stacks in all, and frames for each, at most
 FRAMES_ASKED = 12  # frames of a stack that are looked for in others
 FRAMES_FOUND = 9  # of these, for the stacks to be the same measurement
+DIFFERENT = 5  # steps between values of a frame that is told by its values alone
 STRANGERS, STANDS_OUT = 0.55, 0.3  # second look: a likeness worth it, and the lead (atanh) it asks
+LEAST_FRAMES, LEAST_PIXELS, LEAST_COUNTS = 30, 100, 0.5  # to tell even noise from uneven
 PERFECT_CLOCK_S = 1e-8  # no real clock keeps step so well
 WORDS_IN_A_ROW = 3  # words in a row, by which paragraphs are compared
 MOODLE = re.compile(
     r"(?:^|/)(?P<at>(?P<name>[^/]+?)_(?P<id>\d+)_assignsubmission_(?:file|onlinetext)_?)"
 )
 CANVAS = re.compile(r"(?:^|/)(?P<name>[^/_]+)(?P<late>_LATE)?_(?P<id>\d{2,})_\d{2,}_[^/]+$")
-NAME_COLUMNS = ("name", "full name", "student", "student name")  # columns of a roster
-FIRST_AND_LAST = ("first name", "last name", "surname")
-IDS = (
-    *("id", "identifier", "student id", "id number", "number", "sis user id", "sis login id"),
-    *("login", "username", "email", "email address", "e-mail"),
-)
+NAME_COLUMNS, FIRST_AND_LAST, IDS = (HEADINGS[k] for k in ("names", "parts_of_names", "ids"))
 SHARED_RUNS = 0.7  # part of the runs of the shorter of two paragraphs that the other one has too
 
 
@@ -75,7 +75,7 @@ def data_flags(submission: Submission, found: Recomputed, prints: Fingerprint) -
     return (
         *_too_clean(submission.camera, found, limits),
         *_flat(found, limits),
-        *_random_numbers(found, limits),
+        *_invented(found, limits),
         *_simulated(submission),
         *_times(submission, limits),
         *_one_stack_twice(prints.stacks),
@@ -110,30 +110,54 @@ def _flat(found: Recomputed, limits: dict[str, float]) -> Iterator[Flag]:
         yield _flag("not_distance_dependent", exponent=free.exponent, most=most)
 
 
-def _random_numbers(found: Recomputed, limits: dict[str, float]) -> Iterator[Flag]:
-    """Noise that neighbouring pixels do not share, and a mean without a pattern.
+def _invented(found: Recomputed, limits: dict[str, float]) -> Iterator[Flag]:
+    """Noise that lacks what matching windows of a real pattern of dots leaves in it.
 
-    A stereo camera matches windows, so neighbours share their noise, and its error of a place stays
-    in every frame. Stacks whose noise is rounded away, or of a few frames, are not looked at.
+    Neighbours share their window, so they share noise; the error of a place stays in every frame;
+    each place sees other dots, so some are noisier than others; and at another distance the dots
+    are others, and so is what stays. Stacks whose noise is rounded away, or of a few frames, are
+    not looked at. FORMAT.md says how often invented and honest data are flagged.
     """
-    pairs = [
-        _space(m.stack.counts)
+    looks = [
+        (m.distance_m, look)
         for m in found.at
         if m.std is not None
         and m.std.value >= 0.35e3 * m.scale_m  # else rounded away
         and m.stats.n_frames >= 8
+        and (look := _look(m.stack.counts)) is not None
     ]
-    likeness = max((pair[0] for pair in pairs if pair), default=math.inf)
-    pattern = max((pair[1] for pair in pairs if pair), default=math.inf)
+    likeness = max((look.likeness for _, look in looks), default=math.inf)
+    pattern = max((look.pattern for _, look in looks), default=math.inf)
+    uneven = max((look.uneven for _, look in looks if look.uneven is not None), default=math.inf)
     if likeness < limits["white"]:
         yield _flag("white_in_space", likeness=likeness)
     if pattern < limits["pattern"]:
         yield _flag("no_pattern", times=pattern)
+    if uneven < limits["uneven"]:
+        yield _flag("even_noise", part=uneven)
+    for (one, first), (two, second) in combinations(looks, 2):
+        likeness = _correlation(first.stays, second.stays)
+        if likeness > limits["same_pattern"]:
+            yield _flag("same_pattern", one=one, two=two, likeness=likeness)
 
 
-def _space(counts: NDArray[np.uint16]) -> tuple[float, float] | None:
-    """Correlation of neighbours' noise in time, and the pattern in the mean, in units of what
-    averaging leaves of noise; None where too few pixels are valid."""
+class _Look(NamedTuple):
+    """What the noise of a stack is like.
+
+    likeness: correlation of neighbours over time. pattern: what stays in the mean, in units of what
+    averaging leaves of noise. uneven: by which part the stds of pixels differ beyond chance; None
+    where frames or pixels are too few, or counts too coarse, to tell. stays
+    (h, w): what stays in the mean, less a twisted plane, NaN where pixels are not always valid.
+    """
+
+    likeness: float
+    pattern: float
+    uneven: float | None
+    stays: Floats
+
+
+def _look(counts: NDArray[np.uint16]) -> _Look | None:
+    """See `_Look`; None where too few pixels are valid."""
     n, height, width = counts.shape
     good = (counts > 0).all(axis=0)
     if good.sum() < 25 or height < 4 or width < 4:
@@ -141,8 +165,7 @@ def _space(counts: NDArray[np.uint16]) -> tuple[float, float] | None:
     mean = counts.mean(axis=0)
     deviation = (counts - mean).astype(np.float32)
     typical = float(np.sqrt(np.square(deviation[:, good]).mean()))
-    wild = np.abs(deviation).max(axis=0) > 8 * max(typical, 1.0)
-    good &= ~wild
+    good &= np.abs(deviation).max(axis=0) <= 8 * max(typical, 1.0)
     if good.sum() < 25 or typical == 0:
         return None
     deviation *= good
@@ -154,12 +177,37 @@ def _space(counts: NDArray[np.uint16]) -> tuple[float, float] | None:
     ):
         if ok.any():
             rho.append(float(np.einsum("nij,nij->", one, two)) / int(ok.sum()) / float(power))
+    inner = good.copy()  # a filter is uneven where a window ends
+    for edge in (inner, inner.T):
+        edge[: len(edge) // 5], edge[-(len(edge) // 5) - 1 :] = False, False
+    uneven = None
+    if n >= LEAST_FRAMES and typical >= LEAST_COUNTS and inner.sum() >= LEAST_PIXELS:
+        apart = deviation[:, inner] - deviation[:, inner].mean(axis=1, keepdims=True)
+        variances = np.maximum(apart.var(axis=0), 1e-6 * typical**2)
+        beyond = float(np.log(variances).var()) - 2 / (n - 1)  # of a variance: twice that of a std
+        uneven = math.sqrt(max(beyond, 0.0)) / 2
     rows, columns = np.nonzero(good)
     design = np.stack([np.ones(len(rows)), columns, rows, columns * rows], axis=-1)
-    values = mean[good]
-    residual = values - design @ np.linalg.lstsq(design, values, rcond=None)[0]
+    stays = np.full((height, width), np.nan)
+    stays[good] = mean[good] - design @ np.linalg.lstsq(design, mean[good], rcond=None)[0]
     left = math.sqrt(float(power) / n / max(n - 1, 1))
-    return max(rho, default=1.0), float(residual.std()) / left
+    return _Look(max(rho, default=1.0), float(stays[good].std()) / left, uneven, stays)
+
+
+def _correlation(one: Floats, two: Floats) -> float:
+    """Correlation of two maps laid corner on corner or middle on middle; of these the larger."""
+    shape = np.minimum(one.shape, two.shape)
+    found = [0.0]
+    for part in (0, 0.5):
+        maps = []
+        for values in (one, two):
+            top, left = (part * (values.shape - shape)).astype(int)
+            maps.append(values[top : top + shape[0], left : left + shape[1]])
+        ok = np.isfinite(maps[0]) & np.isfinite(maps[1])
+        a, b = (values[ok] - values[ok].mean() for values in maps) if ok.sum() > 25 else (0, 0)
+        size = float(np.sqrt(np.vdot(a, a) * np.vdot(b, b)))
+        found.append(float(np.vdot(a, b)) / size if size else 0.0)
+    return max(found)
 
 
 def _simulated(submission: Submission) -> Iterator[Flag]:
@@ -244,17 +292,19 @@ class StackPrint:
 
     digest: of its bytes. level (27,): the mean spectrum. frames (N, 27): of each frame what
     is not in that, scaled to a largest value of 127. The order of frames does not matter.
+    values: a hash of each frame's values, whatever place they are moved to, if they differ enough.
     """
 
     distance_m: float
     digest: str
     level: tuple[float, ...]
     frames: NDArray[np.int8]
+    values: tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Fingerprint:
-    """What is remembered of a bundle's raw data to tell whether another one shares it: some 12 kB.
+    """What is remembered of a bundle's raw data to tell whether another one shares it: some 15 kB.
 
     `as_json` and `from_dict` take it through JSON.
     """
@@ -272,7 +322,7 @@ class Fingerprint:
             return np.frombuffer(base64.b64decode(text), np.int8).reshape(-1, N_WAVES)
 
         stacks = tuple(
-            StackPrint(s["distance_m"], s["digest"], tuple(s["level"]), rows(s["frames"]))
+            StackPrint(**{**s, "level": tuple(s["level"]), "frames": rows(s["frames"])})
             for s in data["stacks"]
         )
         return cls(**{**data, "stacks": stacks})
@@ -315,8 +365,14 @@ def _stack_print(stack: Stack) -> StackPrint:
     counts = np.ascontiguousarray(stack.counts)
     _, height, width = counts.shape
     digest = hashlib.blake2b(repr(counts.shape).encode() + counts.tobytes(), digest_size=16)
+    values = tuple(
+        zlib.crc32(values.tobytes())
+        for values in np.sort(counts.reshape(len(counts), -1), axis=1)
+        if np.count_nonzero(np.diff(values)) >= DIFFERENT  # else strangers may have the same
+    )
+    named = partial(StackPrint, stack.distance_m, digest.hexdigest(), values=values)
     if min(height, width) <= 2 * LARGEST_WAVE:
-        return StackPrint(stack.distance_m, digest.hexdigest(), (), np.zeros((0, N_WAVES), np.int8))
+        return named((), np.zeros((0, N_WAVES), np.int8))
     valid = counts > 0
     mean = counts.sum(axis=0) / np.maximum(valid.sum(axis=0), 1)
     off = (counts - mean.astype(np.float32)) * valid
@@ -331,7 +387,7 @@ def _stack_print(stack: Stack) -> StackPrint:
     spectra = power[:, LARGEST_WAVE + down[1:], LARGEST_WAVE + across[1:]] ** 0.25
     level = spectra.mean(axis=0)
     rounded = tuple(round(float(value), 3) for value in level)
-    return StackPrint(stack.distance_m, digest.hexdigest(), rounded, _bytes(spectra - level))
+    return named(rounded, _bytes(spectra - level))
 
 
 def _bytes(values: NDArray[Any]) -> NDArray[np.int8]:
@@ -391,7 +447,10 @@ def copies(prints: Mapping[str, Fingerprint]) -> list[Copy]:
         digests = tuple(sorted(stack.digest for stack in fingerprint_of.stacks))
         if digests and first.setdefault(digests, key) != key:
             pairs[first[digests], key] = {s.distance_m: True for s in fingerprint_of.stacks}
-    alone = {*first.values()}
+    alone = dict.fromkeys(first.values())
+    for (one, other, z), n in _same_values({key: prints[key] for key in alone}).items():
+        if n >= FRAMES_FOUND:
+            pairs.setdefault((min(one, other), max(one, other)), {})[z] = False
     for i, (key, stack) in enumerate(stacks):
         if key not in alone:
             continue
@@ -406,6 +465,19 @@ def copies(prints: Mapping[str, Fingerprint]) -> list[Copy]:
                 part = pairs.setdefault((min(key, other), max(key, other)), {})
                 part[stack.distance_m] = exact or part.get(stack.distance_m, False)
     return [_copy(keys, pairs, prints) for keys in _groups(list(prints), list(pairs))]
+
+
+def _same_values(prints: Mapping[str, Fingerprint]) -> Counter[tuple[str, str, float]]:
+    """How many frames with values of the first bundle that has them are in another one, and at
+    which distance."""
+    first: dict[int, str] = {}
+    shared: Counter[tuple[str, str, float]] = Counter()
+    for key, its in prints.items():
+        for stack in its.stacks:
+            for value in {*stack.values}:
+                if first.setdefault(value, key) != key:
+                    shared[first[value], key, stack.distance_m] += 1
+    return shared
 
 
 def _groups(keys: Sequence[Any], pairs: Sequence[tuple[Any, Any]]) -> list[list[Any]]:
@@ -639,14 +711,9 @@ def _alike(texts: Sequence[tuple[str, ...]], least: int) -> list[list[tuple[str,
     has = csr_array((ones, (rows, columns)), shape=(len(texts), len(number)))
     several = np.flatnonzero(has.sum(axis=0) > 1)
     size = np.maximum(np.bincount(rows, minlength=len(texts)), least)
-    has = has[:, several]
-    pairs = []
-    for start in range(0, len(texts), 256):  # so that a class that says the same fits the memory
-        shared = coo_array(has[start : start + 256] @ has.T)
-        one, two = shared.row + start, shared.col
-        near = shared.data >= SHARED_RUNS * np.minimum(size[one], size[two])
-        pairs.append(np.stack([one[near], two[near]]))
-    one, two = np.concatenate(pairs, axis=1)
+    shared = coo_array(has[:, several] @ has[:, several].T)
+    near = shared.data >= SHARED_RUNS * np.minimum(size[shared.row], size[shared.col])
+    one, two = shared.row[near], shared.col[near]
     groups = _groups(range(len(texts)), list(zip(one.tolist(), two.tolist(), strict=True)))
     single = {*range(len(texts))} - {i for group in groups for i in group}
     return [[texts[i] for i in group] for group in [*groups, *([i] for i in single)]]

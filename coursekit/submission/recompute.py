@@ -29,10 +29,19 @@ MISTAKES: dict[str, str] = WORDS["mistakes"]
 WHY: dict[str, str] = WORDS["why"]  # a number that a mistake explains is wrong, by its code
 SAYS: dict[str, str] = WORDS["says"]  # longer sentences of the rubric
 SEEN: dict[str, str] = WORDS["seen"]  # what a flag says, by its code
+HEADINGS: dict[str, list[str]] = WORDS["columns"]  # of tables that are read or written
 REPEAT: dict[str, str] = WORDS["repeat"]  # by topic: the section of notebook 02 to repeat
 EXERCISE = ("distances_m", "slack_m", "frames", "window_px", "words", "tape_at_most_m")
 TOLERANCES = ("standard_errors", "error_of_an_error", "prediction", "prediction_factor", "near")
-FLAGS = ("least_sigma_d_px", "flat_exponent", "white", "pattern", "fastest_hz")
+FLAGS = (
+    "least_sigma_d_px",
+    "flat_exponent",
+    "white",
+    "pattern",
+    "uneven",
+    "same_pattern",
+    "fastest_hz",
+)
 KEYS: dict[str, tuple[float, Collection[str]]] = {  # of rubric.toml: the largest value, the keys
     "exercise": (2000, EXERCISE),
     "points": (1000, LABELS),

@@ -40,28 +40,12 @@ from coursekit.submission.flags import (
     words_of,
 )
 from coursekit.submission.format import Plot, Refused, Submission, TableRow, read_bundle
-from coursekit.submission.recompute import LABELS, MISTAKES, REPEAT, SEEN, Recomputed
+from coursekit.submission.recompute import HEADINGS, LABELS, MISTAKES, REPEAT, SEEN, Recomputed
 from coursekit.submission.rubric import Grade, Item, grade
 from coursekit.words import counted
 
-HEADER = (
-    *("file", "student", "who", "name in it", "status", "counts", "late", "made", "handed in"),
-    *("points", "of", "percent", *LABELS, "total", "comment", "lost", "flags", "says"),
-    *("page", "code"),
-)
-MOODLE_COLUMNS = (
-    *("Identifier", "Full name", "Email address", "Grade", "Maximum Grade"),
-    *("Last modified (grade)", "Feedback comments"),
-)
-CANVAS_COLUMNS = ("Student", "ID", "SIS User ID", "SIS Login ID", "Section", "Studio exercise 1")
-OWN_COLUMNS = (
-    "who",
-    "student",
-    "paragraph",
-    "late",
-    "overrule",
-    "comment",
-)
+HEADER = (*HEADINGS["first"], *LABELS, *HEADINGS["last"])  # of grades.csv
+MOODLE_COLUMNS, CANVAS_COLUMNS, OWN_COLUMNS = (HEADINGS[k] for k in ("moodle", "canvas", "own"))
 FORMULA = tuple("=+-@\t\r\n＝＋－＠")  # what makes a spreadsheet calculate a cell
 HERE = Path(__file__).parent
 

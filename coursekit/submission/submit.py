@@ -8,11 +8,12 @@ grader look at it, and packs.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
 from functools import wraps
 from pathlib import Path
-from typing import Any, Literal, ParamSpec, TypeVar, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 
@@ -58,23 +59,15 @@ class CannotHandIn(ValueError):
         return [str(self)]
 
 
-P = ParamSpec("P")
-Returned = TypeVar("Returned")
-
-
-def _in_one_line(function: Callable[P, Returned]) -> Callable[P, Returned]:
-    """The function, with its ValueErrors turned into `CannotHandIn`."""
-
-    @wraps(function)
-    def wrapped(*args: P.args, **kwargs: P.kwargs) -> Returned:
-        try:
-            return function(*args, **kwargs)
-        except Refused as refused:  # what is wrong; the cure is for whoever grades
-            raise CannotHandIn(refused.wrong) from refused
-        except ValueError as error:
-            raise CannotHandIn(str(error)) from error
-
-    return wrapped
+@contextmanager
+def _in_one_line() -> Iterator[None]:
+    """ValueErrors become `CannotHandIn`."""
+    try:
+        yield
+    except Refused as refused:  # what is wrong; the cure is for whoever grades
+        raise CannotHandIn(refused.wrong) from refused
+    except ValueError as error:
+        raise CannotHandIn(str(error)) from error
 
 
 @dataclass(frozen=True, repr=False)
@@ -157,7 +150,7 @@ def measured(
     )
 
 
-@_in_one_line
+@_in_one_line()
 @wraps(measured, assigned=())  # its arguments
 def keep(*arguments: Any, **named: Any) -> Path:
     """Keep a measured studio exercise in `results/`, for `submit`; returns the file.
@@ -169,7 +162,7 @@ def keep(*arguments: Any, **named: Any) -> Path:
     return path
 
 
-@_in_one_line
+@_in_one_line()
 def submit(
     student: str = "",
     distance_m: float | None = None,

@@ -7,28 +7,23 @@ import json
 import numpy as np
 import pytest
 import yaml
-from scipy.spatial.transform import Rotation
 
 from coursekit.formats import poses
-from coursekit.geometry import Intrinsics, make_transform
+from coursekit.geometry import Intrinsics
 from coursekit.hand_eye import HandEyeSession
 
 pytestmark = pytest.mark.real
 
 
 @pytest.fixture(scope="module")
-def dobot(real_data):
+def dobot(real_data, song_poses):
     """The poses of a Dobot CR5, where its camera saw the board, and what its owner published."""
     folder = real_data / "song_dobot_cr5"
-    arm, camera, known = (
+    arm, known = (
         json.loads((folder / f"{name}.json").read_text("utf-8"))
-        for name in ("arm_data", "camera_data", "handeye_result")
+        for name in ("arm_data", "handeye_result")
     )
-    seen = [
-        make_transform(Rotation.from_rotvec(np.ravel(p["rvec"])), 1e-3 * np.ravel(p["tvec"]))
-        for p in camera["poses"]
-    ]
-    return arm, np.stack(seen), np.array(known["matrix_4x4"])
+    return arm, song_poses[1], np.array(known["matrix_4x4"])
 
 
 @pytest.mark.parametrize(("mark", "decimal"), [(",", "."), (";", ",")])
