@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
@@ -348,9 +349,9 @@ def placement(result: Any) -> Placement:
 
 
 def _verdict(result: Any) -> str:
-    """How the verdict on a result begins, in one line; "" for what has none."""
+    """The first sentence of the verdict on a result, in one line; "" for what has none."""
     verdict = getattr(result, "verdict", None)
-    return " ".join(verdict().split("\n- ")[0].split()) if callable(verdict) else ""
+    return re.split(r"(?<=\.) ", " ".join(verdict().split()))[0] if callable(verdict) else ""
 
 
 def _exportable(what: Any) -> Intrinsics | Placement:

@@ -1,6 +1,8 @@
 """What is made once a run for the tests of several modules."""
 
+import signal
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
@@ -45,6 +47,14 @@ def small_cameras():
 def plug_in(monkeypatch, tmp_path):
     """Plug in a fake D435 that behaves as the arguments say."""
     return partial(plugged_in, monkeypatch, tmp_path)
+
+
+@pytest.fixture
+def ctrl_c_is_heard() -> Iterator[None]:
+    """A shell lets what it starts in the background, and its children, ignore SIGINT."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture

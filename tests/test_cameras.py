@@ -16,13 +16,7 @@ import coursekit as ck
 from coursekit.boards import Board, detect
 from coursekit.cameras import Camera, CameraError, Frame, Frames, open_camera
 from coursekit.cameras.simulated import SimulatedCamera
-from coursekit.geometry import (
-    Intrinsics,
-    deproject,
-    make_transform,
-    project,
-    transform_points,
-)
+from coursekit.geometry import Intrinsics, deproject, make_transform, project, transform_points
 from coursekit.simulation import wall_scene
 
 CALIBRATION_TOLERANCE = 1e-6  # the recorder writes extrinsics with six decimals
@@ -367,7 +361,8 @@ def test_every_device_sees_the_block(device):
 
 
 def test_simulated_depth_beyond_16_bits_is_invalid():
-    with SimulatedCamera(scene=wall_scene(9.0, tilt_deg=0.0)) as camera:
+    with SimulatedCamera() as camera:
+        camera.scene = wall_scene(9.0, tilt_deg=0.0)
         assert np.nanmedian(middle_mm(camera.frames(1))) == pytest.approx(9000, rel=0.1)
         camera.set(depth_scale_m=1e-4)
         assert np.isnan(middle_mm(camera.frames(1))).mean() > 0.95

@@ -106,18 +106,6 @@ def test_a_camera_that_does_not_start_is_never_replaced(plug_in, which, error, a
     assert f"the RealSense {SERIAL} does not start" in str(caught.value)
 
 
-def test_plugged_in_but_invisible_to_the_library_is_not_simulated(plug_in, tmp_path):
-    plug_in().serials = []
-    assert open_camera().source == "simulated"
-    product = tmp_path / "1-2" / "product"
-    product.parent.mkdir()
-    product.write_text("USB Keyboard\n", encoding="utf-8")
-    assert open_camera().source == "simulated"
-    product.write_text("Intel(R) RealSense(TM) Depth Camera 435\n", encoding="utf-8")
-    with pytest.raises(CameraError, match=r"a RealSense is plugged in, .* udev rules"):
-        open_camera()
-
-
 def test_another_colour_format_is_refused_with_the_camera_closed(plug_in):
     rs = plug_in(color_format="raw16")
     with pytest.raises(CameraError, match="colour is stored as raw16, want rgb8"):

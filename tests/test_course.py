@@ -206,7 +206,7 @@ def test_interrupted_set_up_is_made_anew(project: Path, end: signal.Signals) -> 
 
 
 @posix
-def test_an_interrupted_step_throws_no_finished_one_away(project: Path) -> None:
+def test_an_interrupted_step_throws_no_finished_one_away(project: Path, ctrl_c_is_heard) -> None:
     child = start(project, WAIT="requirements-camera.txt")
     os.kill(pip_waiting(project, child), signal.SIGINT)  # a terminal's Ctrl-C reaches both
     os.kill(child.pid, signal.SIGINT)

@@ -139,7 +139,7 @@ def test_two_mistakes_are_both_named() -> None:
 CANDIDATES = ("inverted_poses", "inverted_detections", "wrong_mount")
 
 
-@pytest.mark.parametrize(("seed", "kind"), enumerate(CANDIDATES, start=FIRST_SEED))
+@pytest.mark.parametrize(("seed", "kind"), list(enumerate(CANDIDATES, start=FIRST_SEED)))
 def test_candidates_are_listed_and_the_true_one_has_the_true_X(seed: int, kind: str) -> None:
     given, truth = session(seed, M(**{kind: True}), arm_errors=None)
     [finding] = diagnose(given)

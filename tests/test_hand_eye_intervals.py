@@ -77,7 +77,7 @@ def test_intervals_hold_whatever_the_arm_does_at_each_pose(kind, n, mount):
         for found, errors in ((result.X, off), (session.solve("park").X, park)):
             errors.append(np.linalg.norm((found - X) @ USED_AT_M))
         assert result.judgement.trusted
-        assert repr(result).count("(95 %)") == 2
+        assert repr(result).count("(95 %") == 2
     least, most = (0.92, 0.98) if n == 8 else (0.93, 0.97)
     if kind.startswith("zeros"):
         least, most = 0.90, 0.98

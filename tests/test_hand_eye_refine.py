@@ -230,7 +230,7 @@ def test_an_arm_that_errs_is_in_the_intervals():
     known = arm_session(14, errors=ArmErrors())
     plain, weighed, usual = known.solve(fk=None), known.solve(fk=known.fk), known.solve()
     for result in (plain, weighed, usual):
-        assert "(95 %)" in repr(result)
+        assert "(95 %" in repr(result)
         assert result.judgement.trusted
         assert "errs" not in result.verdict()
     assert plain.spread_gripper_mm > 1.0

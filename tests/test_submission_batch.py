@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from datetime import datetime
@@ -31,6 +31,7 @@ from coursekit.submission.format import Claims, bundle_bytes, zip_bytes
 from coursekit.submission.recompute import grading_rules
 from coursekit.submission.report import ReportLine, not_graded
 
+pytestmark = pytest.mark.usefixtures("ctrl_c_is_heard")
 NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 USUAL = {"impossible_times", "not_distance_dependent"}  # of the small bundle
 SAMPLES = DATA / "sample_bundles"
@@ -60,14 +61,6 @@ def quick(folder: Path, names: Iterable[str]) -> Path:
 def graded(folder: Path, out: Path, workers: int = 1, **options) -> batch.Summary:
     """`grade_folder` with one process and without a progress bar."""
     return batch.grade_folder(folder, out, workers, progress=False, **options)
-
-
-@pytest.fixture(autouse=True)
-def ctrl_c_is_heard() -> Iterator[None]:
-    """A shell lets what it starts in the background, and its children, ignore SIGINT."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture(scope="module")

@@ -184,8 +184,8 @@ def test_every_item_has_one_sentence():
 
 
 def test_the_sentence_of_a_turned_sign():
-    says = item(with_row(honest(11), 2, depth_bias_mm=2.05), "bias", 2).says
-    assert says.startswith("Bias at 0.60 m: you say +2.05 mm, your raw depths say -2.05 mm (±")
+    says = item(with_row(honest(11), 2, depth_bias_mm=2.06), "bias", 2).says
+    assert says.startswith("Bias at 0.60 m: you say +2.06 mm, your raw depths say -2.06 mm (±")
     assert says.endswith("wrong because its sign is turned: bias is measured minus true.")
 
 
@@ -196,11 +196,12 @@ def test_the_grader_leaves_out_the_mismatches_that_the_notebook_leaves_out_and_s
     _, spiked = MISTAKEN["mismatches"]
     stack = spiked.stacks[1]
     stats = window_stats(stack.counts, (0, 0, 40, 40), spiked.camera.depth_scale_m)
-    assert stats.n_mismatches == 12
-    assert "it holds 12 mismatches" in item(spiked, "std", 1).says
+    left_out = stats.n_mismatches
+    assert 12 <= left_out < 24  # 12 are made; of 160,000 honest samples a few are in the tails
+    assert f"it holds {left_out} mismatches" in item(spiked, "std", 1).says
     right = with_row(spiked, 1, depth_std_mm=1e3 * stats.pixel_std_m)
     assert item(right, "std", 1).verdict == "right"
-    assert item(right, "std", 1).says.endswith("right (12 mismatches left out).")
+    assert item(right, "std", 1).says.endswith(f"right ({left_out} mismatches left out).")
     noise, without = (recompute(s).at[1].noise_of_mean_mm(100) for s in (spiked, HOLED))
     assert noise == pytest.approx(without, rel=0.02)
 
@@ -510,7 +511,10 @@ def test_many_bundles_of_one_camera_are_compared():
     for i in range(40 * MANY):
         stacks = tuple(
             replace(
-                s, digest=f"{i} {k}", frames=random.integers(-127, 127, s.frames.shape, np.int8)
+                s,
+                digest=f"{i} {k}",
+                frames=random.integers(-127, 127, s.frames.shape, np.int8),
+                values=tuple(range(100 * i, 100 * i + len(s.values))),
             )
             for k, s in enumerate(base.stacks)
         )

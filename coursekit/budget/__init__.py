@@ -21,13 +21,7 @@ from coursekit.budget.grasp import (
     success_probability,
     with_gripper,
 )
-from coursekit.budget.handover import (
-    HandOver,
-    hand_over,
-    lesson_budget,
-    lesson_view,
-    wrist_budget,
-)
+from coursekit.budget.handover import HandOver, hand_over, lesson_budget, lesson_view, wrist_budget
 from coursekit.budget.propagation import (
     Chain,
     Covariances,

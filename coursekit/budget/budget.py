@@ -441,11 +441,7 @@ class ErrorBudget:
     # how often
 
     def draw(
-        self,
-        n: int = 1_000_000,
-        seed: int = 0,
-        directions: Directions = "own",
-        noise: bool = False,
+        self, n: int = 1_000_000, seed: int = 0, directions: Directions = "own", noise: bool = False
     ) -> Draws:
         """n rigs: each bias with a magnitude from its range and a direction, all independent.
 

@@ -132,10 +132,7 @@ def propagate(chain: Chain, covariances: Covariances) -> Floats:
 
 
 def monte_carlo(
-    chain: Chain,
-    covariances: Covariances,
-    n: int = 1_000_000,
-    seed: int = 0,
+    chain: Chain, covariances: Covariances, n: int = 1_000_000, seed: int = 0
 ) -> Floats:
     """n draws of the point's error in the base through the exact chain, (n, 3), m.
 
@@ -186,10 +183,7 @@ class FirstOrderCheck:
 
 
 def check_first_order(
-    chain: Chain,
-    covariances: Covariances,
-    n: int = 1_000_000,
-    seed: int = 0,
+    chain: Chain, covariances: Covariances, n: int = 1_000_000, seed: int = 0
 ) -> FirstOrderCheck:
     """Compare `propagate` with `monte_carlo`; n samples tell variances to sqrt(2 / n).
 

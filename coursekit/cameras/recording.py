@@ -22,11 +22,7 @@ from coursekit.cameras.librealsense import load_librealsense
 from coursekit.geometry import Intrinsics
 from coursekit.words import say
 
-FILE_STARTS = {
-    ".db3": b"SQLite format 3\0",
-    ".bag": b"#ROSBAG V2.0\n",
-    ".mcap": b"\x89MCAP0\r\n",
-}
+FILE_STARTS = {".db3": b"SQLite format 3\0", ".bag": b"#ROSBAG V2.0\n", ".mcap": b"\x89MCAP0\r\n"}
 EYES = ("left", "right")
 STREAMS = {  # by our name: librealsense's kind and format, bytes a pixel, index and id
     "depth": ("depth", "z16", 2, 0, 0),

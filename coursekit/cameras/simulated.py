@@ -7,7 +7,7 @@ import zlib
 from collections.abc import Callable, Generator
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -78,9 +78,9 @@ class SimulatedCamera(Camera):
     `show_board`), and its true lens is not quite the one that the camera reports.
 
     device: a name of data/devices.toml. seed: names the unit, so its hidden truth, its pattern of
-    speckle and its noise; None for `my_unit()`. scene: in the depth camera's frame. ambient,
-    exposure, depth_scale_m: see `set`; None for the device's own depth unit. advice: the last
-    sentence of the description. Raises ValueError for an unknown device and a bad figure.
+    speckle and its noise; None for `my_unit()`. depth_scale_m: see `set`; None for the device's own
+    depth unit. advice: the last sentence of the description. Raises ValueError for an unknown
+    device and a bad figure.
 
     The same calls give the same bytes. `place` and `set` start a stream of random numbers that is
     named by seed, scene, distance, ambient light and exposure, and the drift somewhere of its own,
@@ -95,9 +95,6 @@ class SimulatedCamera(Camera):
         self,
         device: str = "D435",
         seed: int | None = REFERENCE_UNIT,
-        scene: Scene | None = None,
-        ambient: float = 0.01,
-        exposure: float | Literal["auto"] = "auto",
         depth_scale_m: float | None = None,
         advice: str = say("cameras.plug_in"),
     ) -> None:
@@ -119,13 +116,10 @@ class SimulatedCamera(Camera):
             disparity_offset_px=truth.disparity_offset_px,
             drift_px=truth.drift_px,
             drift_time_s=truth.drift_time_s,
-            ambient=ambient,
-            exposure=exposure,
             seed=self.seed,
         )
-        self._place_name, self._distance_m = ("60 mm block", 0.45) if scene is None else ("", 0.0)
-        self.scene = _scene(self._place_name, self._distance_m) if scene is None else scene
         self._shown: tuple[Board, Floats] | None = None
+        self.place("60 mm block", 0.45)
         self.set(depth_scale_m=depth_scale_m)
 
     def __repr__(self) -> str:

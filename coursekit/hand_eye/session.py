@@ -856,7 +856,13 @@ class HandEyeResult(Estimate):
     @property
     def _level(self) -> str:
         """What an interval holds, said only where it does."""
-        return " (95 %)" if self.judgement.trusted else ""
+        held = " (95 % of what the poses show)" if self._of_poses_alone else " (95 %)"
+        return held if self.judgement.trusted else ""
+
+    @property
+    def _of_poses_alone(self) -> bool:
+        """Whether nothing allows for what an arm errs by in every pose."""
+        return self._fit.problem.fk is None and not self.session.has_its_joints
 
     @property
     def _untold(self) -> str:
@@ -868,7 +874,7 @@ class HandEyeResult(Estimate):
         judged = self.judgement
         reasons = [*([judged.large] if judged.large else []), *judged.broken, *judged.weak]
         told = self.refined is not None and judged.trusted and math.isfinite(judged.worst_mm)
-        if told and self._fit.problem.fk is None and not self.session.has_its_joints:
+        if told and self._of_poses_alone:
             reasons.append(SENTENCES.words["poses_alone"])
         return "\n".join(map(wrapped, [self._head(), *(f"- {reason}" for reason in reasons)]))
 

@@ -52,6 +52,7 @@ BARE_MARGIN, BARE_SIDES, ONE_BARE_MARGIN = 0.125, 2, 0.25
 # and a board held "still" moves 5 mm/s for the 20 ms that an image takes.
 NORMAL_BOW_M, NORMAL_DRIFT, NORMAL_MOTION_M = 1e-4, 2e-3, 1e-4
 RIVAL_LEVEL = 0.04  # of a fisheye with fewer coefficients: to lenses of this model it loses
+FISHEYE_SHARE = 0.2  # of what the residuals hold beyond noise: else it explains nothing
 NORMAL_LENS_PX = 0.05  # no measurement with the camera notices less
 NORMAL_SHIFT_PX = 1.0  # of the centre over a session
 UNEXPLAINED = 0.8  # of the corners' noise: what neighbours share in any JPEG stays below
@@ -266,7 +267,9 @@ def _wrong_lens(start: Calibration) -> Finding | None:
             model = start.with_cause(heights.tested())
         rival, p_value = causes.as_fisheye(model)
         gain = model.left_px**2 - rival.left_px**2
-        if p_value < RIVAL_LEVEL and gain > causes.LEAST_GAIN * model.noise_px**2:
+        held = max(model.left_px**2 - model.noise_px**2, 0.0)
+        least = max(causes.LEAST_GAIN * model.noise_px**2, FISHEYE_SHARE * held)
+        if p_value < RIVAL_LEVEL and gain > least:
             figures = {"rival": _flat(rival.left_px), "noise": _flat(rival.noise_px)}
             return _TEXTS.finding("lens_is_fisheye", p_value, rms=_flat(model.left_px), **figures)
     step = causes.search_lens(start)

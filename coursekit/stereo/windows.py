@@ -492,13 +492,7 @@ def averaging_curve(series_m: ArrayLike) -> AveragingCurve:
         own = deviation - deviation.mean(axis=1, keepdims=True)  # without the drift all share
         noise = np.square(own).sum() / own.shape[1] / (n - 1) / (n / _correlation_time(own))
         floor = math.sqrt(max(off_plane(values.mean(axis=0)[None]) ** 2 - noise, 0.0))
-    return AveragingCurve(
-        n_frames=n,
-        effective_frames=effective,
-        effective_frames_interval=interval,
-        gain=math.sqrt(effective),
-        floor_m=floor,
-    )
+    return AveragingCurve(n, effective, interval, math.sqrt(effective), floor)
 
 
 # --- means, planes and errors, where NaN is invalid ---
