@@ -4,6 +4,7 @@ import json
 import os
 import symtable
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,14 @@ CHECKERBOARD = Board("checkerboard", (10, 7), 0.025)  # 9 x 6 inner corners
 WIDE = Intrinsics(
     848, 480, 430.0, 432.0, 421.0, 243.0, "brown_conrady", (-0.05, 0.06, -8e-4, 1.4e-3, -0.02)
 )
+
+
+def case(name):
+    """The folder of a shared case; the test is skipped where these are not beside the real data."""
+    folder = Path(os.environ.get("COURSEKIT_REAL_DATA", "none")).parent / "cases" / name
+    if not folder.is_dir():
+        pytest.skip("the cases are not beside the real data")
+    return folder
 
 
 def derivative(function, step, n):

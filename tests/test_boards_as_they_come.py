@@ -7,7 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from common import CHARUCO, CHECKERBOARD, NIGHTLY
+from common import CHARUCO, CHECKERBOARD, NIGHTLY, case
 from PIL import Image
 from test_boards import not_found, photograph, random_poses, shot, view, write
 
@@ -345,3 +345,27 @@ def test_nothing_but_board_not_found(tmp_path):
         for one in seen:
             assert on_plane(one.ids, one.pixels, one.size, board, 0.2).mean() > 0.8
         assert all(len(skip.reason) > 10 for skip in seen.skipped)
+
+
+def test_the_grids_of_tags_of_the_case():
+    folder = case("04_grid_of_tags_taken_for_charuco")
+    asked = (Board("checkerboard", (7, 7), 0.02), CHARUCO)
+    asked += (Board("charuco", (7, 7), 0.025, dictionary=APRIL),)
+    for board in asked:
+        seen = detect_all([folder / "photo_crop.png", folder / "drawn.png"], board)
+        assert len(seen) == 0
+        for skip in seen.skipped:
+            assert "but a grid of tags (AprilGrid, GridBoard), no ChArUco board: n" in skip.reason
+
+
+def test_the_mirrored_picture_of_the_case():
+    seen = detect_all([case("24_mirrored_image") / "mirrored.png"], CHARUCO)
+    assert "27 markers, all mirrored: switch the camera's mirror off" in seen.skipped[0].reason
+
+
+def test_the_depths_of_the_case():
+    names = ("mono8.png", "mono10.png", "mono12.png")
+    seen = detect_all([case("11_ten_bit_png_called_blank") / name for name in names], CHARUCO)
+    assert [len(one) for one in seen] == [40, 40, 40]
+    for one in seen[1:]:
+        np.testing.assert_allclose(one.pixels, seen[0].pixels, atol=0.05)

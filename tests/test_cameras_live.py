@@ -297,3 +297,22 @@ def test_without_the_library_nothing_is_recorded(no_library, tmp_path):
     with open_camera("simulated") as camera, pytest.raises(LibraryMissing):
         camera.record(tmp_path / "a.db3", 2)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_plugged_in_but_invisible_to_the_library_is_not_simulated(plug_in, tmp_path):
+    plug_in().serials = []
+    assert open_camera().source == "simulated"
+    product = tmp_path / "1-2" / "product"
+    product.parent.mkdir()
+    product.write_text("USB Keyboard\n", encoding="utf-8")
+    assert open_camera().source == "simulated"
+    product.write_text("Intel(R) RealSense(TM) Depth Camera 435\n", encoding="utf-8")
+    with pytest.raises(CameraError, match=r"a RealSense is plugged in, .* udev rules"):
+        open_camera()
+
+
+def test_ctrl_c_while_waiting_for_a_frame(plug_in, capsys):
+    plug_in(frames=30 + 4, then=KeyboardInterrupt())
+    camera = open_camera()
+    assert len(camera.frames(100)) == 4
+    assert capsys.readouterr().out == "Stopped after 4 of 100 frames; they are kept.\n"

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from common import nightly, refusals
+from common import case, nightly, refusals
 from scipy.spatial.transform import Rotation
 from simulated_hand_eye import arm_session
 
@@ -964,3 +964,8 @@ def test_formats_need_neither_opencv_nor_the_rest(tmp_path) -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
+
+
+def test_case_05_as_it_came(few) -> None:
+    folder = case("05_poses_csv_names_a_subfolder")
+    assert len(HandEyeSession.from_folder(folder, progress=False)) == 4

@@ -152,3 +152,19 @@ def test_published_noise_implies_the_published_exponents() -> None:
     implied = std / depth_noise(z, model["fx_baseline_px_m"], 1.0, 1.0)
     np.testing.assert_allclose(model["sigma_d_px"], implied, atol=6e-4)
     assert implied == pytest.approx([0.147, 0.083, 0.045, 0.055, 0.061], abs=0.003)
+
+
+def test_the_848_crop_follows_the_rule_that_published_units_follow():
+    """(f, cx, cy) at 640x480 and 848x480 of two units, librealsense 3474, realsense-ros 2788."""
+    depths = (device("D435").unit.depth, device("D455").unit.depth)
+    d435, d455 = ((depth.fx, depth.cx, depth.cy) for depth in depths)
+    for small, large, tolerance in (
+        ((382.918884, 321.015106, 235.879822), (422.806274, 425.120850, 235.450638), 1e-4),
+        ((384.207489, 319.480408, 236.351501), (424.229095, 423.426300, 236.046249), 0.08),
+        ((390.43145751953125, 331.38787841796875, 242.18734741210938), d435, 1e-4),
+        ((387.543, 324.224, 237.357), d455, 1e-3),
+    ):
+        centred = np.array(small) - (0, 320, 240)
+        predicted = centred * (848 / 1280) / (480 / 800) + (0, 424, 240)
+        assert predicted[0] == pytest.approx(large[0], abs=min(tolerance, 1e-3))
+        assert predicted[1:] == pytest.approx(large[1:], abs=tolerance)
