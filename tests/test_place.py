@@ -189,6 +189,7 @@ def test_a_bad_setting_is_refused_and_changes_nothing(change, message):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        *BAD_SETTINGS[3:],
         ({"device": "D999"}, "D999"),
         ({"seed": -1}, "^seed: got -1"),
         ({"seed": 1.5}, "^seed: got 1.5"),
