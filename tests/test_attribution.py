@@ -192,15 +192,6 @@ def test_the_numbers_are_those_of_the_textbook():
     np.testing.assert_allclose(found.scatter_m, x.std(0, ddof=1), rtol=1e-12)
 
 
-def test_the_interval_of_the_mean_covers_it():
-    inside = []
-    for i in range(200):
-        made = simulate_misses("calibration", 10, FIRST_SEED + i)
-        low, high = attribute(made.misses).interval_m.T
-        inside.extend((low <= made.constant_m) & (made.constant_m <= high))
-    assert common.least(0.95, 600) <= np.mean(inside) <= common.most(0.95, 600)
-
-
 # --- repeats ---
 
 
@@ -415,14 +406,6 @@ def test_the_power_for_even_scatter_is_the_noncentral_f():
         wanted = ncf.sf(f.isf(LEVEL, used, left), used, left, 22.5)
         assert power(0.003, S, 3.0, 10, used, columns, LEVEL) == pytest.approx(wanted)
     assert power(0.003, S, 3.0, 3, 7, 3, LEVEL) == 0.0
-
-
-def test_the_number_of_axes_is_that_of_the_covariance():
-    rng = np.random.default_rng(FIRST_SEED)
-    C = np.diag([1.0, 1.0, 4.0])
-    rows = rng.standard_normal((400, 400, 3)) * np.sqrt(np.diag(C))
-    axes = [significance.effective_axes(np.cov(row.T), 400) for row in rows]
-    assert np.mean(axes) == pytest.approx(2.0, abs=0.03)  # 6^2 / 18
 
 
 def test_the_regression_names_the_group_that_made_the_misses():

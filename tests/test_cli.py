@@ -2,15 +2,9 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 from fake_realsense import real_library
 
-import coursekit
 from coursekit import cli
 from coursekit.boards import Board, save_sheet
 from coursekit.cameras import CameraError, open_camera
@@ -111,16 +105,3 @@ def test_a_camera_that_fails_at_once(error, code, tmp_path, monkeypatch, capsys)
     assert cli.main([*arguments, "--camera", "simulated"]) == code
     assert capsys.readouterr().err.startswith("coursekit: ")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_runs_as_a_module_and_shows_help():
-    root = Path(coursekit.__file__).parents[1]
-    result = subprocess.run(
-        [sys.executable, "-m", "coursekit.cli", "record", "--help"],
-        env=os.environ | {"PYTHONPATH": str(root)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert "--out FILE" in result.stdout
-    assert result.stderr == ""

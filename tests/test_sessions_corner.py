@@ -16,7 +16,6 @@ from coursekit.simulation.corner_sessions import (
     Effects,
     bowed,
     corner_session,
-    ordinary,
     rolling_shutter,
 )
 
@@ -231,17 +230,6 @@ def rays_of(truth) -> np.ndarray:
     """Where the corners of all poses are in the camera's frame, (n, 3)."""
     R, t = truth.T_camera_board[:, :3, :3], truth.T_camera_board[:, None, :3, 3]
     return (truth.points @ np.swapaxes(R, 1, 2) + t).reshape(-1, 3)
-
-
-def test_an_ordinary_session_has_no_mistake() -> None:
-    """No seed draws a fault, and another seed draws other sizes."""
-    drawn = [ordinary(seed) for seed in range(20)]
-    assert len({effects.wave_m for effects in drawn}) == 20
-    for effects in drawn:
-        mistakes = {"bow_m", "blur_px", "spoiled_px", "bad_corners", "inner_only"}
-        assert not any(getattr(effects, name) for name in mistakes)
-        assert effects.readout_s * effects.speed_m_s < 1e-4
-        assert effects.focus_drift < 1e-3
 
 
 FAR, FAST = np.array([[0.0, 0.1, 0.5]]), np.array([0.0, 500.0, 0.0])

@@ -1,7 +1,5 @@
 """Rendered scenes against geometry done another way: triangles, planes, counting pixels."""
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
@@ -129,16 +127,6 @@ def test_both_cameras_see_the_whole_of_both_objects():
                 assert (pixels < np.array(intrinsics.size) - 20).all()
 
 
-def test_moving_the_camera_is_moving_the_scene_the_other_way():
-    T_scene_camera = pose((-8, 12, 20), (0.03, -0.10, -0.05))
-    T_camera_scene = np.linalg.inv(T_scene_camera)
-    moved = tuple(replace(b, T_scene_box=T_camera_scene @ b.T_scene_box) for b in tabletop())
-    camera_moved = render(tabletop(), UNIT.color, T_scene_camera)
-    scene_moved = render(moved, UNIT.color)
-    np.testing.assert_allclose(camera_moved.depth_m, scene_moved.depth_m, atol=1e-12)
-    assert (np.abs(camera_moved.color.astype(int) - scene_moved.color) <= 1).all()
-
-
 def test_nothing_hit_is_depth_0_and_index_minus_1():
     one = (Box("far left", (0.1, 0.1, 0.1), pose((0, 0, 0), (-0.3, 0, 1.0)), (1, 0, 0)),)
     result = render(one, UNIT.depth)
@@ -160,15 +148,6 @@ def test_a_pixel_past_the_fold_of_the_distortion_hits_nothing():
     index = render(tabletop(), folds).object_index
     assert index[120, 160] == BLOCK
     assert index[0, 0] == -1
-
-
-def test_shapes_types_and_repeatability():
-    first, second = (render(tabletop(), UNIT.color) for _ in range(2))
-    assert (first.depth_m.dtype, first.depth_m.shape) == (np.float64, (480, 640))
-    assert (first.object_index.dtype, first.object_index.shape) == (np.int16, (480, 640))
-    assert (first.color.dtype, first.color.shape) == (np.uint8, (480, 640, 3))
-    for name in ("depth_m", "object_index", "color"):
-        assert np.array_equal(getattr(first, name), getattr(second, name))
 
 
 def test_colours_tell_the_objects_apart():
