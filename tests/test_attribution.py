@@ -21,7 +21,6 @@ from common import NIGHTLY, each, named, refusals
 from scipy.spatial.transform import Rotation
 from scipy.stats import f, f_oneway, ncf, t
 
-from coursekit.arm import widowx
 from coursekit.attribution import (
     Entry,
     Ledger,
@@ -424,18 +423,6 @@ def test_the_regression_names_the_group_that_made_the_misses():
 
 
 # --- simulated misses ---
-
-
-def test_the_same_seed_gives_the_same_misses_and_the_truth_adds_up():
-    for kind in ("calibration", "perception", "pose_dependent", "cannot_tell_yet"):
-        one, two = (simulate_misses(kind, 15, FIRST_SEED) for _ in range(2))
-        np.testing.assert_array_equal(one.misses, two.misses)
-        still = resized(one, scatter=0.0)
-        np.testing.assert_allclose(still.misses, still.constant_m + still.by_pose_m, atol=1e-15)
-        np.testing.assert_allclose(widowx().forward(one.q), one.T_base_gripper, atol=1e-8)
-        own = one.misses - one.constant_m - one.by_pose_m
-        std = 0.006 if kind == "cannot_tell_yet" else 0.002
-        assert own.std() == pytest.approx(std, rel=0.4)  # of 45 numbers
 
 
 def test_each_unit_has_four_sets_of_its_own_one_of_each_kind():

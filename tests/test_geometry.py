@@ -119,16 +119,6 @@ def test_invalid_depth_has_no_point() -> None:
 # --- Intrinsics ---
 
 
-def test_intrinsics_round_trip() -> None:
-    camera = Intrinsics(640, 480, 612.5, 598.0, 331.4, 236.8, "brown_conrady", tuple(DIST))
-    assert Intrinsics.from_dict(camera.to_dict()) == camera
-    assert camera.to_dict()["coeffs"] == DIST.tolist()
-    assert np.array_equal(camera.K, K)
-    assert np.array_equal(camera.dist, DIST)
-    assert LESSON.dist is None
-    assert camera.size == (640, 480)
-
-
 def test_field_of_view() -> None:
     # 848 px at fx 447 in a symmetric camera is 87 degrees: the datasheet's figure (claim P1).
     centred = Intrinsics(848, 480, 447.0, 447.0, 423.5, 239.5)

@@ -146,25 +146,6 @@ def test_the_limits_of_tilt_and_of_the_image_hold() -> None:
     assert (pixels <= np.array(LENS.size) - margin).all()
 
 
-def test_blurred_views_have_the_covariance_of_a_uniform_motion() -> None:
-    session, truth = corner_session(CHARUCO, LENS, seed=10, views=30, effects=Effects(blur_px=3.0))
-    assert len(truth.blurred) == 10
-    for i, view in enumerate(session):
-        wanted = 0.666**2 + 9 / 12 * (i in truth.blurred)
-        assert np.linalg.eigvalsh(view.blur)[1] == pytest.approx(wanted, rel=0.25)
-
-
-def test_single_bad_corners_are_off_by_what_was_asked_for() -> None:
-    effects = Effects(bad_corners=4, bad_corner_px=5.0)
-    healthy, _ = corner_session(CHARUCO, LENS, seed=11)
-    session, truth = corner_session(CHARUCO, LENS, seed=11, effects=effects)
-    assert len(truth.bad_corners) == 4
-    found = []
-    for i, (a, b) in enumerate(zip(healthy, session, strict=True)):
-        found += [(i, corner) for corner in a.ids[np.abs(a.pixels - b.pixels).max(axis=1) > 1]]
-    assert set(found) == set(truth.bad_corners)
-
-
 def session(board=CHARUCO, **changes):
     return corner_session(board, LENS, seed=0, **changes)
 

@@ -101,21 +101,6 @@ def test_front_face_has_the_asked_depth_and_size(distance):
     np.testing.assert_array_equal(face, covered)
 
 
-@pytest.mark.parametrize("distance", [0.30, 0.45, 0.60])
-def test_table_and_wall_have_the_depth_of_their_planes(distance):
-    result = render(tabletop(distance, wall_behind_m=0.4), UNIT.depth)
-    wall = result.object_index == WALL
-    np.testing.assert_allclose(result.depth_m[wall], distance + 0.4, atol=1e-12)
-    v, u = np.nonzero(result.object_index == TABLE)
-    depth = result.depth_m[v, u]
-    front = depth.min()
-    top = depth > front + 1e-9  # the table's own front face is the nearest part of it
-    wanted = UNIT.depth.fy * 0.030 / (v[top] - UNIT.depth.cy)
-    np.testing.assert_allclose(depth[top], wanted, rtol=1e-12)
-    assert front < distance - 0.1
-    assert top.mean() > 0.4
-
-
 def test_both_cameras_see_the_whole_of_both_objects():
     for distance in (0.30, 0.45, 0.60):
         scene = tabletop(distance)
