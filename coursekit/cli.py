@@ -13,10 +13,15 @@ import tomllib
 from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import coursekit as ck
 from coursekit import doctor
-from coursekit.words import say
+from coursekit.boards import Board
+from coursekit.boards.board import Skipped
+from coursekit.words import Estimate, Findings, say, wrapped
+
+SHOWN = 3  # images that were not used
 
 OPTIONS = {"path": "--out", "n": "--frames", "which": "--camera", "distance_m": "--distance"}
 OPTIONS |= {f"{name}_m": f"--{name}-mm (here in m)" for name in ("square", "marker")}
@@ -62,8 +67,11 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     table = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
     table["export"]["options"]["--to"]["help"] = "/".join(ck.results.EXPORTS)
+    shared = table.pop("shared")
     for name, about in table.items():
         options, either = about.pop("options"), about.pop("either", [])
+        for group in about.pop("with", []):
+            options |= shared[group]
         if "epilog" in about:  # whose lines stay as they are
             about["formatter_class"] = argparse.RawDescriptionHelpFormatter
         command = commands.add_parser(name, **about)
@@ -90,15 +98,55 @@ def _record(options: argparse.Namespace) -> None:
     print(f"Wrote {path}. Play it with ck.open_camera({str(path)!r}).")
 
 
-def _board(options: argparse.Namespace) -> None:
+def _described(options: argparse.Namespace) -> Board:
+    """The board that --kind, --squares and the sizes say."""
     fields = {"dictionary": options.dictionary} if options.dictionary else {}
     if options.marker_mm is not None:
         fields["marker_m"] = options.marker_mm / 1000
-    board = ck.boards.Board(options.kind, options.squares, options.square_mm / 1000, **fields)
+    return ck.boards.Board(options.kind, options.squares, options.square_mm / 1000, **fields)
+
+
+def _board(options: argparse.Namespace) -> None:
+    board = _described(options)
     path = ck.boards.save_sheet(board, options.out, options.paper, overwrite=options.overwrite)
     print(f"Wrote {path}: {ck.boards.caption(board)}.")
     print("Print at 100 %, check that the bar measures 100 mm, and glue it flat to glass.")
     print(f"In Python: {board!r}")
+
+
+def _calibrate(options: argparse.Namespace) -> None:
+    board = _described(options)
+    views = ck.boards.detect_all(options.folder, board)
+    lens = ck.intrinsics.calibrate(views, board)
+    _say_how_good(lens, views.skipped, ck.intrinsics.diagnose(views, board), options.details)
+    print(ck.export(lens, options.to, options.out, overwrite=options.overwrite))
+
+
+def _hand_eye(options: argparse.Namespace) -> None:
+    lens = ck.geometry.Intrinsics.from_file(options.lens)
+    said = {name: getattr(options, name) for name in ("rotation", "length", "angle", "in_order")}
+    what = options.folder, options.mount, _described(options), lens
+    session = ck.hand_eye.HandEyeSession.from_folder(*what, **said)
+    place = session.solve()
+    _say_how_good(place, session.skipped, ck.hand_eye.diagnose(session), options.details)
+    _export_place(place, options)
+
+
+def _say_how_good(
+    result: Estimate, skipped: Sequence[Skipped], findings: Findings, details: bool
+) -> None:
+    """What was not used, how far to trust the result, and what to do first."""
+    for skip in skipped if details else skipped[:SHOWN]:
+        print(f"not used: {skip!r}")
+    if details:
+        print(result, result.verdict(), findings, sep="\n")
+        return
+    if len(skipped) > SHOWN:
+        print(f"not used: {len(skipped) - SHOWN} more")
+    for number, finding in enumerate(findings, 1):
+        print(wrapped(f"{number}. {finding.title}: {finding.says}"))
+    print(wrapped(f"Do first: {findings[0].remedy}") if findings else result.verdict())
+    print("Numbers, evidence, and what else there is to do: the same with --details.")
 
 
 def _submit(options: argparse.Namespace) -> None:
@@ -126,10 +174,15 @@ def _grade(options: argparse.Namespace) -> None:
 
 
 def _export(options: argparse.Namespace) -> None:
+    _export_place(options.what, options)
+
+
+def _export_place(what: Any, options: argparse.Namespace) -> None:
+    """A place, with the frames that were named; or a lens, which has none."""
     names = ("parent", "optical", "link", "T_link_optical", "overwrite")
     frames = {name: getattr(options, name) for name in names}
     given = {name: value for name, value in frames.items() if value is not None}
-    print(ck.export(options.what, options.to, options.out, **given))
+    print(ck.export(what, options.to, options.out, **given))
 
 
 def _doctor(options: argparse.Namespace) -> int:
@@ -144,6 +197,8 @@ TYPES = {
     "squares": _squares,
 }
 RUN: dict[str, Callable[[argparse.Namespace], int | None]] = {
+    "calibrate": _calibrate,
+    "hand-eye": _hand_eye,
     "record": _record,
     "board": _board,
     "submit": _submit,

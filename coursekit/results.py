@@ -312,12 +312,12 @@ def export(
     frame has one parent only: name the `link` and give T_link_optical, (4, 4) in m, "turn" where
     both have one origin, or "x y z qx qy qz qw" as tf2_echo says it.
 
-    What the result's `verdict` begins with is said, and stands in the file where it may hold a
-    comment. Raises ValueError for what a format cannot hold, FileExistsError for a file that is
-    there.
+    What the result's `verdict` begins with is said, as is a parent that nobody named, and both
+    stand in the file where it may hold a comment. Raises ValueError for what a format cannot
+    hold, FileExistsError for a file that is there.
     """
     found = _exportable(what)
-    verdict = _verdict(what)
+    verdict, unsaid = _verdict(what), ""
     if isinstance(found, Intrinsics):
         checks.choice("to (of a lens)", to, lens_files.LENS_FORMATS)
         xml = out is not None and to == "opencv" and os.fspath(out).endswith(".xml")
@@ -326,12 +326,12 @@ def export(
         checks.choice("to (of a camera's place)", to, (*pose_files.PLACE_FORMATS, "json"))
         placed = replace(found, parent=parent or found.parent, child=optical)
         text, notes = _place_text(placed, to, link, T_link_optical)
-        verdict = found.verdict
-        if parent is None:
-            notes += (UNSAID_PARENT.format(parent=found.parent),)
-    if verdict:
-        text = COMMENTS.get(to, "").format(verdict.replace("--", "-")) + text
-        notes = (verdict, *notes)
+        verdict, unsaid = found.verdict, "" if parent else UNSAID_PARENT.format(parent=found.parent)
+    comment = COMMENTS.get(to, "")
+    text = (
+        "".join(comment.format(one.replace("--", "-")) for one in (verdict, unsaid) if one) + text
+    )
+    notes = tuple(note for note in (verdict, *notes, unsaid) if note)
     path = None if out is None else Path(out)
     if path is not None:
         if path.exists() and not overwrite:

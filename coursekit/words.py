@@ -232,6 +232,10 @@ class Estimate:
         """Degrees of freedom that sigma rests on; infinite where the noise was known before."""
         raise NotImplementedError
 
+    def verdict(self) -> str:
+        """In words: how far to trust it, and what to do about what is weak."""
+        raise NotImplementedError
+
     def quantile(self, level: float = 0.95) -> float:
         """How many sigmas an interval of probability `level` reaches to either side.
 

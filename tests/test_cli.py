@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
+from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 from fake_realsense import real_library
 
@@ -15,6 +18,8 @@ from coursekit import cli
 from coursekit.boards import Board, save_sheet
 from coursekit.cameras import CameraError, open_camera
 from coursekit.cameras.simulated import SimulatedCamera
+from coursekit.results import ROOT
+from coursekit.simulation.arm_sessions import truth_of
 
 CHARUCO = Board("charuco", (9, 6), 0.025)
 
@@ -111,6 +116,23 @@ def test_a_camera_that_fails_at_once(error, code, tmp_path, monkeypatch, capsys)
     assert cli.main([*arguments, "--camera", "simulated"]) == code
     assert capsys.readouterr().err.startswith("coursekit: ")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_photographs_become_a_lens_and_a_place(tmp_path, capsys):
+    board = "--squares 9x6 --square-mm 25 --kind charuco"
+    lens, urdf = tmp_path / "camera_info.yaml", tmp_path / "camera.urdf"
+    session = ROOT / "data" / "hand_eye_in_hand"
+    assert cli.main(f"calibrate {session} {board} --out {lens}".split()) == 0
+    said = capsys.readouterr().out
+    assert re.search("(?s)not used: poses.csv: .*Wrote camera_info.yaml", said)
+    assert len(said.split()) < 150
+    place = f"--lens {lens} --mount eye_in_hand --parent tool0 --out {urdf}"
+    assert cli.main(f"hand-eye {session} {board} {place}".split()) == 0
+    assert len(capsys.readouterr().out.split()) < 150
+    written = ElementTree.fromstring(f"<robot>{urdf.read_text()}</robot>").find("joint")
+    xyz = [float(number) for number in written.find("origin").get("xyz").split()]
+    assert written.find("parent").get("link") == "tool0"
+    assert np.linalg.norm(xyz - truth_of(session).X[:3, 3]) < 0.01
 
 
 def test_runs_as_a_module_and_shows_help():

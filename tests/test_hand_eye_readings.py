@@ -110,7 +110,7 @@ KINDS: dict[str, tuple[str, str, Mistake]] = {
     "a body frame of the camera": (
         "inconsistent_convention", "x forward, y left, z up",
         lambda s, i: replace(s, seen=TO_BODY @ s.seen)),
-    "a slow drift": ("slow_drift", "Camera or board moved slowly", drifting),
+    "a slow drift": ("slow_drift", "camera or board moved slowly", drifting),
 }  # fmt: skip
 
 

@@ -49,8 +49,10 @@ def test_commands_of_coursekit_are_understood(line: str) -> None:
 def test_each_subcommand_is_in_the_readme(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         cli.main(["--help"])
-    commands = re.findall(r"^    (\w+) ", capsys.readouterr().out, re.MULTILINE)
-    assert {"record", "board", "submit", "grade", "doctor"} <= set(commands)
+    commands = re.findall(r"^    ([\w-]+)\s", capsys.readouterr().out, re.MULTILINE)
+    assert {"calibrate", "hand-eye", "record", "board", "submit", "grade", "doctor"} <= set(
+        commands
+    )
     for command in commands:
         assert f"coursekit {command}" in TEXT, command
 
