@@ -255,21 +255,6 @@ def test_the_refit_without_causes_is_opencvs_minimum() -> None:
 # --- sessions that nobody here made, and lenses beyond the model ---
 
 
-def test_ordinary_sessions_get_no_wrong_cause() -> None:
-    """At most 8 of 400 (nightly); of 4 none. That paper is no plane is true, and is named."""
-    wrong = {
-        "spoiled_view", "bad_corners", "steady_drift", "focus_drift", "rolling_shutter",
-        "lens_model",
-    }  # fmt: skip
-    count, most = (400, 8) if NIGHTLY else (4, 0)
-    found: Counter[tuple[str, ...]] = Counter()
-    for seed in range(FIRST_SEED + 5000, FIRST_SEED + 5000 + count):
-        detections, _, board = session(seed, ordinary(seed))
-        found[diagnose(detections, board).names] += 1
-    print("ordinary", dict(found))
-    assert sum(n for names, n in found.items() if wrong & set(names)) <= most
-
-
 def fisheye_views(focal: float, seed: int) -> Detections:
     """25 views of a board out to 80 deg from the axis of a lens that grows with the angle."""
     rng, views = np.random.default_rng(seed), []
