@@ -302,10 +302,3 @@ def test_plugged_in_but_invisible_to_the_library_is_not_simulated(plug_in, tmp_p
     product.write_text("Intel(R) RealSense(TM) Depth Camera 435\n", encoding="utf-8")
     with pytest.raises(CameraError, match=r"a RealSense is plugged in, .* udev rules"):
         open_camera()
-
-
-def test_ctrl_c_while_waiting_for_a_frame(plug_in, capsys):
-    plug_in(frames=30 + 4, then=KeyboardInterrupt())
-    camera = open_camera()
-    assert len(camera.frames(100)) == 4
-    assert capsys.readouterr().out == "Stopped after 4 of 100 frames; they are kept.\n"

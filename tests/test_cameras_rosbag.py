@@ -221,6 +221,10 @@ def test_a_recording_plays_where_librealsense_is_not_installed(tabletop, tmp_pat
 def test_damaged_messages_are_an_error_of_the_camera(tmp_path):
     data = Driver(tmp_path / "a.bag").write(depth=raw).read_bytes()
     rng, path, failed = np.random.default_rng(5), tmp_path / "b.bag", 0
+    for size in (120, len(data) // 2, len(data) - 3):
+        path.write_bytes(data[:size])
+        with pytest.raises(CameraError, match=r"b\.bag is damaged .* copy it again or"):
+            open_camera(path)
     for at in (100, len(data) // 3, len(data) // 2):
         path.write_bytes(data[:at] + bytes(rng.integers(0, 256, 3000, np.uint8)) + data[at:])
         with pytest.raises(CameraError, match=r"b\.bag is damaged"):
