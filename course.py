@@ -35,7 +35,7 @@ import urllib.request
 import webbrowser
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO, Any, NamedTuple
 
 MINIMUM, BELOW = (3, 11), (3, 15)
 RECOMMENDED = "3.12"
@@ -438,20 +438,34 @@ def run_python(*arguments: str) -> int:
     return finish(subprocess.Popen([str(PYTHON), *arguments], cwd=ROOT, env=environment()))
 
 
-def address_when_ready(child: subprocess.Popen, runtime: Path, page: str) -> str:
-    """Wait until JupyterLab answers; empty when it ends before that."""
+def ask(server: dict[str, Any], path: str, data: bytes | None = None) -> None:
+    """Send a request to JupyterLab; no proxy is between."""
+    headers = {"Authorization": f"token {server['token']}"}
+    request = urllib.request.Request(f"{server['url']}api/{path}", data, headers)
     opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+    opener.open(request, timeout=5).close()
+
+
+def server_when_ready(child: subprocess.Popen, runtime: Path) -> dict[str, Any]:
+    """Wait until JupyterLab answers; empty when it ends before that."""
     while child.poll() is None:
         time.sleep(0.1)
         for file in runtime.glob("jpserver-*.json"):
             try:
                 server = json.loads(file.read_text(encoding="utf-8"))
                 if not server["secure"]:  # a certificate of one's own would not be trusted here
-                    opener.open(server["url"] + "api", timeout=5).close()
+                    ask(server, "")
             except (OSError, ValueError):
                 continue  # half-written, or not answering yet
-            return f"{server['url']}{page}?token={server['token']}"
-    return ""
+            return dict(server)
+    return {}
+
+
+def start_kernel(server: dict[str, Any], notebook: str) -> None:
+    """Ask for what the page will ask for: it starts while the page is loaded."""
+    wanted = {"path": notebook, "type": "notebook", "name": "", "kernel": {"name": "python3"}}
+    with contextlib.suppress(OSError):  # then the page does
+        ask(server, "sessions", json.dumps(wanted).encode())
 
 
 def jupyter_command(page: str, arguments: list[str]) -> list[str]:
@@ -480,7 +494,8 @@ def lab(arguments: list[str]) -> int:
     from tools import copies
 
     print(copies.older_ones(copies.make()), end="")
-    page = f"lab/tree/notebooks/my/{copies.unfinished()}"
+    notebook = f"notebooks/my/{copies.unfinished()}"
+    page = f"lab/tree/{notebook}"
     print("Starting JupyterLab ...")
     screen = sys.platform != "linux" or {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ)
     with tempfile.TemporaryDirectory(prefix="coursekit-", ignore_cleanup_errors=True) as runtime:
@@ -491,11 +506,13 @@ def lab(arguments: list[str]) -> int:
         try:
             if pending(read_state() or {}, ("test",)):
                 threading.Thread(target=finish_set_up).start()
-            address = address_when_ready(child, Path(runtime), page)
-            if address:
+            server = server_when_ready(child, Path(runtime))
+            if server:
+                address = f"{server['url']}{page}?token={server['token']}"
                 print(f"\nThe course is at\n\n    {address}\n\nCtrl-C here ends it.")
-            if address and screen and "CI" not in os.environ and "--no-browser" not in arguments:
-                open_browser(address)
+                if screen and "CI" not in os.environ and "--no-browser" not in arguments:
+                    open_browser(address)
+                start_kernel(server, notebook)
             return finish(child)
         except KeyboardInterrupt:
             stop(child)
