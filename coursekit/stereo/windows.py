@@ -195,7 +195,8 @@ def window_stats(depth: Any, window: Window, depth_scale_m: float | None = None)
 def without_mismatches(z: Floats, step: float | None) -> tuple[Floats, int]:
     """The stack (N, h, w) with NaN for mismatches, and their number.
 
-    A mismatch is far from its pixel's median, or this median is far off the window's plane.
+    A mismatch is far from its pixel's median, by the noise of the window and by that of the pixel,
+    for some places are noisier than others; or this median is far off the window's plane.
 
     >>> z = np.full((5, 3, 3), 0.45)
     >>> z[2, 1, 1] = 0.52
@@ -203,10 +204,12 @@ def without_mismatches(z: Floats, step: float | None) -> tuple[Floats, int]:
     1
     """
     middle = valid_median(z)
-    jumps = _far(z - middle, step)
+    off = np.abs(z - middle)
+    jumps = _far(off, step)
+    at = jumps.any(axis=0) & (np.isfinite(z).sum(axis=0) >= 8)  # fewer say nothing of a pixel
+    jumps[:, at] &= off[:, at] > JUMP_SIGMAS * 1.4826 * valid_median(off[:, at])
     for _ in range(2):  # the second plane is free of what the first one throws out
-        off, _level = about_plane(middle)
-        middle = np.where(_far(off, step), np.nan, middle)
+        middle = np.where(_far(about_plane(middle)[0], step), np.nan, middle)
     jumps |= np.isfinite(z) & np.isnan(middle)
     return np.where(jumps, np.nan, z), int(jumps.sum())
 
