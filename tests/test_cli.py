@@ -20,6 +20,7 @@ from coursekit.simulation.arm_sessions import truth_of
 CHARUCO = Board("charuco", (9, 6), 0.025)
 
 
+@pytest.mark.usefixtures("small_cameras")
 def test_record_writes_a_recording_and_says_how_to_play_it(tmp_path, capsys):
     real_library()
     path = tmp_path / "a.db3"
