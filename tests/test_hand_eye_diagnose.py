@@ -235,6 +235,3 @@ def test_velocities_come_from_the_times_of_small_steps() -> None:
     assert finding.name == "late_time_stamps"
     delay = float(finding.evidence.split()[0])
     assert delay == pytest.approx(50, abs=4)
-
-
-# --- the parts ---
