@@ -97,13 +97,6 @@ def test_a_camera_that_does_not_start_is_never_replaced(plug_in, which, error, a
     assert f"the RealSense {SERIAL} does not start" in str(caught.value)
 
 
-def test_another_colour_format_is_refused_with_the_camera_closed(plug_in):
-    rs = plug_in(color_format="raw16")
-    with pytest.raises(CameraError, match="colour is stored as raw16, want rgb8"):
-        open_camera()
-    assert rs.stops == 1
-
-
 def test_unplugged_while_the_exposure_settles(plug_in):
     rs = plug_in(frames=12, then=RuntimeError("Device disconnected"))
     with pytest.raises(CameraError, match=r"stopped giving frames \(Device disconnected\)"):

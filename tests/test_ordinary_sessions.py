@@ -46,9 +46,12 @@ def test_a_lens_beyond_the_model_is_named_alone() -> None:
     assert found[("lens_model",)] >= 95
 
 
-@pytest.mark.parametrize("seed", [FIRST_SEED, FIRST_SEED + 8])
+@pytest.mark.parametrize("seed", [FIRST_SEED, FIRST_SEED + 8, 700_032, 700_056])
 def test_a_fisheye_and_a_quotient_are_wrong_lenses_and_nothing_else(seed: int) -> None:
-    """One fisheye, one rational lens; paper, print and noise as everywhere."""
+    """Fisheyes and rational lenses; paper, print and noise as everywhere.
+
+    In the third OpenCV's own start arrives nowhere, in the last boards are turned over.
+    """
     detections, _, board = beyond_session(seed)
     findings = intrinsics.diagnose(detections, board)
     assert findings.names == ("lens_model",)

@@ -572,6 +572,7 @@ GOOD_MM, USABLE_MM = 2.0, 5.0  # 95 %, worst direction, lever arm included
 # Between arm and images, rms over the poses: more than arms that stand still are off, and more than
 # any that works.
 LARGE_MM, LARGE_DEG, BROKEN_MM, BROKEN_DEG = 5.0, 1.0, 20.0, 3.0
+LARGE_SIGMAS = 2.0  # that an rms over these poses must stand out: few poses scatter more by chance
 FAR_OUT = 10.0  # times the typical pose's error: no tail of a working arm reaches there
 UNKNOWN_DEG, UNKNOWN_MM = 90.0, 1e3  # what is known no better is not known
 GOOD_POSES = 15
@@ -787,7 +788,9 @@ class HandEyeResult(Estimate):
     def _disagreement(self) -> str:
         """That arm and images disagree by more than arms that stand still do, or ""."""
         mm, deg = self.spread_gripper_mm, self.spread_gripper_deg
-        large = mm > LARGE_MM or deg > LARGE_DEG
+        dof = max(3 * len(self.session) - 6, 1)  # X and Y take six of each kind
+        chance = 1.0 + LARGE_SIGMAS / math.sqrt(2.0 * dof)
+        large = mm > chance * LARGE_MM or deg > chance * LARGE_DEG
         return SENTENCES.words["large"].format(mm=mm, deg=deg) if large else ""
 
     def _broken(self) -> Iterator[str]:

@@ -53,6 +53,7 @@ MODELS = {
 }
 MIN_VIEWS = 3
 MIN_CORNERS = 6
+WIDE_FOCAL = 0.5  # of the width: 90 deg across
 LEAST_FOCAL = 0.05  # of the image's width: a field of view of 170 deg, no pinhole camera
 ITERATIONS = 1000  # nearly parallel boards need hundreds; OpenCV's own limit of 30 ends far away
 ARRIVED_SIGMAS = 0.1  # no combination of parameters would move more in the next step,
@@ -409,8 +410,8 @@ def calibrate(
 
     model: which distortion coefficients are estimated, one of `MODELS`; the others are held at 0.
     same_focal: holds fx = fy. guess: where to start; None lets OpenCV find a start, and where that
-    leads nowhere takes a focal length as long as the image is wide. points (N, 3): where the
-    board's corners really are, m, in place of `board.points` (a measured or bowed board).
+    leads nowhere takes a focal length as long as the image is wide, then half that. points (N, 3):
+    where the board's corners really are, m, in place of `board.points` (a measured or bowed board).
     One thread, so that a second run gives the same bits.
     Raises ValueError that names the view for fewer than 3 views, fewer than 6 corners or all of
     them on a line, corners that the board does not have, NaN, and images of different sizes; and
@@ -435,9 +436,10 @@ def calibrate(
         want(guess.size == size, "guess", guess.size, f"the images' size, {size} px")
     names = (*(("f",) if same_focal else ("fx", "fy")), "cx", "cy", *MODELS[model])
     # OpenCV's own start can lie at the far end of the valley in which focal length and distance
-    # trade against each other, where its steps go nowhere; then once more from a plain camera.
-    plain = Intrinsics(width, height, width, width, (width - 1) / 2, (height - 1) / 2)
-    starts = [None, plain] if guess is None else [guess]
+    # trade against each other, where its steps go nowhere; then once more from plain cameras.
+    centre = (width - 1) / 2, (height - 1) / 2
+    plain = [Intrinsics(width, height, f, f, *centre) for f in (width, WIDE_FOCAL * width)]
+    starts = [None, *plain] if guess is None else [guess]
     fits: list[IntrinsicsResult] = []
     for start in starts:
         try:
