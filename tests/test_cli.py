@@ -129,7 +129,7 @@ def test_photographs_become_a_lens_and_a_place(tmp_path, capsys):
     place = f"--lens {lens} --mount eye_in_hand --parent tool0 --out {urdf}"
     assert cli.main(f"hand-eye {session} {board} {place}".split()) == 0
     assert len(capsys.readouterr().out.split()) < 150
-    written = ElementTree.fromstring(f"<robot>{urdf.read_text()}</robot>").find("joint")
+    written = ElementTree.fromstring(f"<robot>{urdf.read_text('utf-8')}</robot>").find("joint")
     xyz = [float(number) for number in written.find("origin").get("xyz").split()]
     assert written.find("parent").get("link") == "tool0"
     assert np.linalg.norm(xyz - truth_of(session).X[:3, 3]) < 0.01
