@@ -241,11 +241,11 @@ class Estimate:
 
         Student's t. Raises ValueError for a level that is not between 0 and 1.
         """
-        from scipy.stats import t
+        from scipy.special import stdtrit
 
         inside = is_number(level) and 0 < level < 1
         want(inside, "level", level, "a probability between 0 and 1")
-        return float(t(self.dof).ppf((1 + level) / 2))
+        return float(stdtrit(self.dof, (1 + level) / 2))
 
     def interval(self, name: str, level: float = 0.95) -> Interval:
         """The interval that holds the number of this name with probability `level`."""

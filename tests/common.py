@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 from scipy.stats import binom
 
 from coursekit.boards import Board
@@ -57,6 +58,14 @@ def check_named(found, name, label):
     count = sum(found.values())
     assert sum(n for names, n in found.items() if name in names) >= count - count // 20
     assert sum(n for names, n in found.items() if set(names) - {name}) <= count // 20
+
+
+def contrast(one, other):
+    """Of two colours such as #222 or #595959, as WCAG 2.2 counts it."""
+    rgb = np.array([to_rgb(one), to_rgb(other)])
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    dark, light = sorted(linear @ (0.2126, 0.7152, 0.0722))
+    return (light + 0.05) / (dark + 0.05)
 
 
 def refusals(*cases):

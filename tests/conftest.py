@@ -50,6 +50,14 @@ def plug_in(monkeypatch, tmp_path):
 
 
 @pytest.fixture
+def own_results(monkeypatch, tmp_path):
+    """Where results go: a folder that is not there yet, in the one that is worked in."""
+    monkeypatch.setenv("COURSEKIT_RESULTS", str(tmp_path / "results"))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "results"
+
+
+@pytest.fixture
 def ctrl_c_is_heard() -> Iterator[None]:
     """A shell lets what it starts in the background, and its children, ignore SIGINT."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -121,10 +121,9 @@ class FakeRealSense:
         frames: int = 10**9,
         then: BaseException | None = None,
         color_late: bool = False,
-        color_format: str = "rgb8",
     ) -> None:
         self.start_error, self.limit, self.then = start_error, frames, then
-        self.color_late, self.color_format = color_late, color_format
+        self.color_late = color_late
         self.serials = [SERIAL]
         self.noise: float | None = None
         self.filled, self.frames_per_s = 1.0, 30
@@ -146,7 +145,6 @@ class FakeRealSense:
         self.motion_sensor = FakeSensor(False, {})
         for group in ("stream", "format", "option", "camera_info", "frame_metadata_value"):
             setattr(self, group, _Names())
-        self.playback_status = _Names()
 
     # module level
     def context(self) -> Any:
@@ -186,7 +184,7 @@ class _Pipeline:
             raise RuntimeError(self._rs.start_error)
         streams = [
             FakeProfile("depth", "z16", 848, 480, 426.0),
-            FakeProfile("color", self._rs.color_format, 640, 480, 613.0),
+            FakeProfile("color", "rgb8", 640, 480, 613.0),
         ]
         device = _Device(self._rs)
         return SimpleNamespace(get_device=lambda: device, get_streams=lambda: streams)

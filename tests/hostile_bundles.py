@@ -14,10 +14,12 @@ import json
 import os
 import pickle
 import struct
+import tomllib
 import zipfile
 import zlib
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -26,6 +28,7 @@ import numpy as np
 from coursekit.submission import format as bundle
 from coursekit.submission.format import Outcome, Stack, TableRow, array_bytes, zip_bytes
 
+BUNDLES = tomllib.loads(Path(__file__).with_name("bundles.toml").read_text(encoding="utf-8"))
 LENS = (848, 480, 425.0, 425.5, 424.0, 240.0, "none", (0.0,) * 5)
 CAMERA = bundle.CameraFacts("Simulated D435", "seed-7", "simulated", *LENS, 0.05, 0.001)
 Parts = dict[str, bytes]
@@ -321,29 +324,7 @@ def _headers() -> Kinds:
 
 
 def _names() -> Kinds:
-    names = {
-        "an absolute path": "/etc/passwd",
-        "a Windows path": "C:\\Windows\\system.ini",
-        "a network path": "\\\\server\\share",
-        "path traversal": "../../.bashrc",
-        "path traversal inside": "raw/../../facts.json",
-        "path traversal, Windows": "..\\facts.json",
-        "a backslash": "raw\\facts.json",
-        "a folder": "raw/",
-        "a bundle in a folder": "studio_1_Ada/manifest.json",
-        "a Mac's zip of a bundle": "__MACOSX/._manifest.json",
-        "a Mac's view of a folder": ".DS_Store",
-        "a nested archive": "more.zip",
-        "a nested archive, NumPy's": "depth.NPZ",
-        "a program": "setup.py",
-        "a Mac's leftovers": "__MACOSX",
-        "another case": "Facts.json",
-        "a line end in a name": "facts.json\n",
-        "other digits in a name": "depth_٣.npy",
-        "a long name": "a" * 60_000,
-        "a formula for a name": '=HYPERLINK("http://x")',
-        "a NUL in a name": "facts.json?",
-    }
+    names = BUNDLES["names"] | {"a long name": "a" * 60_000}
     kinds = {kind: zip_bytes(MEMBERS | {name: b""}) for kind, name in names.items()}
     return {k: ("unknown_member", data.replace(b"json?", b"json\0")) for k, data in kinds.items()}
 
@@ -409,70 +390,9 @@ def _jsons() -> Kinds:
     }
 
 
-# What is put where in a JSON member: the path, and last the value.
-WRONG_VALUES = {
-    "facts.json": {
-        "a negative focal length": ("camera", "fx", -425),
-        "text for a number": ("camera", "fx", "425"),
-        "True for a number": ("camera", "fx", True),
-        "a huge focal length": ("camera", "fx", 1e300),
-        "an integer of 39 digits": ("camera", "width", 10**38),
-        "half a pixel": ("camera", "width", 848.5),
-        "an unknown source": ("camera", "source", "stolen"),
-        "a list for a source": ("camera", "source", ["live"]),
-        "three coefficients": ("camera", "coeffs", [0, 0, 0]),
-        "a block of no width": ("caliper_m", 0),
-        "a version that is a list": ("versions", "numpy", [2]),
-        "a window outside": ("stacks", 0, "window", [846, 238, 5, 4]),
-        "a window of another size": ("stacks", 0, "window", [420, 238, 4, 5]),
-        "a negative window": ("stacks", 0, "window", [-1, 238, 5, 4]),
-        "a huge window": ("stacks", 0, "window", [0, 0, 10**9, 10**9]),
-        "a negative distance": ("stacks", 0, "distance_m", -0.3),
-        "a distance twice": ("stacks", 0, "distance_m", 0.6),
-        "13 stacks": ("stacks", [{}] * 13),
-    },
-    "manifest.json": {
-        "no name": ("student", "   "),
-        "an invisible name": ("student", "\u200b\u2060"),
-        "a name of two lines": ("student", "Zoë\nsecond line"),
-        "a name with a NUL": ("student", "Zo\0"),
-        "a name that runs backwards": ("student", "\u202ezoe"),
-        "half a character": ("student", "Zo\ud83d"),
-        "a long name of a student": ("student", "Z" * 101),
-        "a list for a name": ("student", ["Zoë"]),
-        "another exercise": ("exercise", "../studio_9"),
-        "no such day": ("made", "2026-02-30T12:00:00+00:00"),
-        "no time zone": ("made", "2026-02-03T12:00:00"),
-        "Arabic digits in a date": ("made", "٢٠٢٦-02-03T12:00:00+00:00"),
-        "a later format": ("format", 3),
-        "no format": ("format", GONE),
-        "True for a format": ("format", True),
-        "members is a list": ("members", [1]),
-    },
-    "claims.json": {
-        "a claim of 1e200": ("rows", 0, "depth_std_mm", 1e200),
-        "an interval of three": ("exponent_interval", [1, 2, 3]),
-        "an interval upside down": ("exponent_interval", [2, 1]),
-        "a plot of unequal lists": ("plot", "measured_mm", [1]),
-        "a row twice": ("rows", 1, "distance_m", 0.3),
-        "13 rows": ("rows", [{}] * 13),
-        "an unknown key": ("bonus", 5),
-        "mismatches of another kind": ("mismatches", "both"),
-        "a method's name for a key": ("__class__", "x"),
-        "a key missing": ("sigma_d_px", GONE),
-        "a key of a row missing": ("rows", 0, "depth_std_mm", GONE),
-    },
-    "conclusion.json": {
-        "minus 3 frames": ("frames", -3),
-        "a verdict of its own": ("dominates", "both"),
-        "a long paragraph": ("paragraph", "a b " * 1_300),
-    },
-    "outcomes.json": {
-        "a path for an outcome": ("../../x", {"right": True, "attempts": 1}),
-        "minus 3 attempts": ("depth_std", "attempts", -3),
-        "1 for True": ("depth_std", "right", 1),
-    },
-}
+WRONG_VALUES = BUNDLES["wrong_values"]
+WRONG_VALUES["manifest.json"]["half a character"] = ["student", "Zo\ud83d"]  # no TOML holds it
+WRONG_VALUES["conclusion.json"]["a long paragraph"] = ["paragraph", "a b " * 1_300]
 
 
 def _values() -> Kinds:

@@ -503,21 +503,6 @@ def class_zip(whole: Submission, n: int, of: Callable[[str, int, str], str]) -> 
     return buffer.getvalue()
 
 
-HOSTILE_TEXTS = (
-    "<script>alert(1)</script>",
-    "<img src=x onerror=alert(1)>",
-    "\"><svg onload='alert(1)'>",
-    '=HYPERLINK("http://example.org";"x")',
-    "+1+1",
-    "-2+3",
-    "@SUM(A1)",
-    "../../etc/passwd",
-    "C:\\Windows\\system32",
-    "{{7*7}} ${7*7} <%= 7*7 %>",
-    "&lt;b&gt; &amp; ]]> <!-- -->",
-)
-
-
 def injecting(text: str, seed: int = 0) -> Submission:
     """A student whose name, camera and paragraph are `text`."""
     good = with_part(honest(seed), "conclusion", paragraph=f"{text} " + "word " * 20)

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 
 import numpy as np
 import pytest
-from scipy.linalg import block_diag, expm
+from common import NIGHTLY
+from scipy.linalg import block_diag
 
 from coursekit import arm as arms
 from coursekit.arm import ArmErrors, SimulatedArm, fk_covariance, widowx
 from coursekit.boards import Board
 from coursekit.geometry import pose_difference
 
-NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 UNITS = 400 if NIGHTLY else 60
 NONE = ArmErrors(0.0, 0.0, 0.0, 0.0)
 BOARD = Board("charuco", (9, 6), 0.025)
@@ -250,18 +249,3 @@ def test_covariance_is_that_of_many_units() -> None:
     separate = np.linalg.slogdet(joint)[1]
     alone = sum(np.linalg.slogdet(c)[1] for c in model.covariance)
     assert separate < alone - 3  # the poses' errors are correlated: they do not average
-
-
-def test_forward_is_the_product_of_exponentials(anywhere: np.ndarray) -> None:
-    arm = widowx()
-    home = arm.link_frames(np.zeros(6))
-    at_zero = arm.forward(np.zeros(6))
-    for q, T in zip(anywhere[:50], arm.forward(anywhere[:50]), strict=True):
-        product = np.eye(4)
-        for j in range(6):
-            axis = home[j + 1, :3, :3] @ arm.axes[j]
-            xi = np.zeros((4, 4))
-            xi[:3, :3] = np.cross(axis, np.eye(3)).T
-            xi[:3, 3] = -np.cross(axis, home[j + 1, :3, 3])
-            product = product @ expm(q[j] * xi)
-        assert np.abs(product @ at_zero - T).max() < 1e-13

@@ -125,15 +125,6 @@ def test_points_are_opencvs_and_lie_on_the_corners_of_the_picture():
             assert (both, others) == ((8 * 255, 0) if falling else (0, 8 * 255))
 
 
-def test_the_old_origin_is_at_the_bottom_left_with_y_up():
-    top_down = OLD.image_from_board(10) @ [0, 0, 1]
-    np.testing.assert_allclose(top_down, [-0.5, 60 - 0.5, 1])
-    assert (OLD.image_from_board(10) @ [0, 0.01, 1])[1] < top_down[1]
-    assert OLD.image(1)[0, 0] != CHARUCO.image(1)[0, 0]  # an even number of rows
-    odd, old_odd = (replace(board, squares=(5, 7)) for board in (CHARUCO, OLD))
-    np.testing.assert_array_equal(odd.image(20), old_odd.image(20))
-
-
 # --- detection ---
 
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
 import coursekit.budget as eb
-from coursekit.geometry import Intrinsics, deproject, project
+from coursekit.geometry import Intrinsics, deproject
 from coursekit.stereo import depth_noise
 
 TURNED = np.eye(4)
@@ -99,13 +99,6 @@ def test_matrix_is_the_derivative(view: eb.View, along: str, k: int) -> None:
     term = eb.ErrorTerm("x", "bias", 0.0, 1.0, along, "test", factor=factor)  # type: ignore[arg-type]
     numerical = derivative(lambda change: exact(view, along, change), 1e-5, k)
     assert term.matrix(view) == pytest.approx(numerical, rel=1e-5, abs=1e-8)
-
-
-def test_a_view_sees_its_point() -> None:
-    point = SOMEWHERE.point_camera
-    seen = project(point, LENS.K, LENS.dist)
-    assert seen == pytest.approx([SOMEWHERE.u, SOMEWHERE.v], abs=1e-9)
-    assert point[2] == SOMEWHERE.distance_m
 
 
 # --- how things add ---

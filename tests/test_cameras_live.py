@@ -106,13 +106,6 @@ def test_a_camera_that_does_not_start_is_never_replaced(plug_in, which, error, a
     assert f"the RealSense {SERIAL} does not start" in str(caught.value)
 
 
-def test_another_colour_format_is_refused_with_the_camera_closed(plug_in):
-    rs = plug_in(color_format="raw16")
-    with pytest.raises(CameraError, match="colour is stored as raw16, want rgb8"):
-        open_camera()
-    assert rs.stops == 1
-
-
 def test_unplugged_while_the_exposure_settles(plug_in):
     rs = plug_in(frames=12, then=RuntimeError("Device disconnected"))
     with pytest.raises(CameraError, match=r"stopped giving frames \(Device disconnected\)"):
@@ -309,10 +302,3 @@ def test_plugged_in_but_invisible_to_the_library_is_not_simulated(plug_in, tmp_p
     product.write_text("Intel(R) RealSense(TM) Depth Camera 435\n", encoding="utf-8")
     with pytest.raises(CameraError, match=r"a RealSense is plugged in, .* udev rules"):
         open_camera()
-
-
-def test_ctrl_c_while_waiting_for_a_frame(plug_in, capsys):
-    plug_in(frames=30 + 4, then=KeyboardInterrupt())
-    camera = open_camera()
-    assert len(camera.frames(100)) == 4
-    assert capsys.readouterr().out == "Stopped after 4 of 100 frames; they are kept.\n"

@@ -17,8 +17,6 @@ from scipy.spatial.transform import Rotation
 
 import coursekit
 from coursekit.cameras import CameraError, open_camera
-from coursekit.cameras.files import RosBag
-from coursekit.cameras.realsense import RealSense
 from coursekit.geometry import make_transform
 
 HEIGHT, WIDTH, N = 48, 64, 12
@@ -157,7 +155,6 @@ def test_a_ros_drivers_recording_is_a_camera(tmp_path, name, depth):
             assert (frame.color == bgr(k)[..., ::-1]).all()  # 5 ms away, not the 28 ms before
             assert [eye[0, 0] for eye in frame.infrared] == [10 * k + 10, 10 * k]
         assert len(camera.frames(N)) == N  # from its start again
-        assert "read by rosbags" in repr(camera)
 
 
 def depth_m(depth, k):
@@ -186,19 +183,6 @@ def test_a_lens_that_the_course_does_not_have_is_named(tmp_path, model, message)
     else:
         with pytest.raises(CameraError, match="model: got 'equidistant'"):
             open_camera(path)
-
-
-def test_rosbags_gives_what_librealsense_gives(tabletop):
-    with RealSense(path=tabletop) as played, RosBag(tabletop) as read:
-        for name in ("name", "serial", "depth", "color", "baseline_m", "depth_scale_m"):
-            assert getattr(read, name) == getattr(played, name)
-        assert read.T_color_depth == pytest.approx(played.T_color_depth, abs=2e-6)  # its decimals
-        pairs = list(zip(played.frames(20), read.frames(20), strict=True))
-    assert len(pairs) == 12
-    for a, b in pairs:
-        assert (a.depth == b.depth).all()
-        assert (a.color == b.color).all()
-        assert (a.number, a.time_s) == (b.number, pytest.approx(b.time_s, abs=1e-9))
 
 
 WITHOUT = """
@@ -237,9 +221,13 @@ def test_a_recording_plays_where_librealsense_is_not_installed(tabletop, tmp_pat
 def test_damaged_messages_are_an_error_of_the_camera(tmp_path):
     data = Driver(tmp_path / "a.bag").write(depth=raw).read_bytes()
     rng, path, failed = np.random.default_rng(5), tmp_path / "b.bag", 0
-    for at in (100, len(data) // 3, len(data) // 2):  # librealsense would read on for ever
+    for size in (120, len(data) // 2, len(data) - 3):
+        path.write_bytes(data[:size])
+        with pytest.raises(CameraError, match=r"b\.bag is damaged .* copy it again or"):
+            open_camera(path)
+    for at in (100, len(data) // 3, len(data) // 2):
         path.write_bytes(data[:at] + bytes(rng.integers(0, 256, 3000, np.uint8)) + data[at:])
-        with pytest.raises(CameraError, match=r"b\.bag is (damaged inside|truncated)"):
+        with pytest.raises(CameraError, match=r"b\.bag is damaged"):
             open_camera(path)
     for _ in range(60):
         changed = bytearray(data)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import pickle
 import zlib
 from functools import lru_cache
@@ -18,6 +17,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from common import NIGHTLY
 from scipy.spatial.transform import Rotation
 
 from coursekit.boards import Board, Detection, detect, detect_all
@@ -29,7 +29,6 @@ from coursekit.cameras.capture import (
     Sight,
     capture,
     guidance,
-    is_new,
     is_still,
     outline,
 )
@@ -41,7 +40,6 @@ from coursekit.simulation.corner_sessions import corner_session
 BOARD = Board("charuco", (9, 6), 0.025)
 CHECKERS = Board("checkerboard", (10, 7), 0.025)
 LENS = Intrinsics(640, 480, 613.2, 613.4, 319.9, 239.2)
-NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 DEPTH = np.zeros((480, 848), np.uint16)
 
 
@@ -347,17 +345,6 @@ def test_a_slow_motion_is_not_still():
     assert not is_still(moving((0, 0), module.STILL_FRAMES - 1))
 
 
-def test_a_view_is_new_where_the_board_is_elsewhere():
-    one, *_, near, far = moving((13, 0), 3)
-    assert is_new(one, [])
-    assert not is_new(near, [one])  # 13 of 640 px
-    assert is_new(far, [one])  # 26
-    assert not is_new(far, [one, near])
-    other_part = Detection(np.arange(20), one.pixels[:20], LENS.size)
-    rest = Detection(np.arange(20, 40), one.pixels[20:], LENS.size)
-    assert is_new(other_part, [rest])
-
-
 # --- what to take next ---
 
 
@@ -378,11 +365,6 @@ def test_an_empty_session_lacks_everything_and_the_first_view_is_one_that_can_be
     assert kinds == ["coverage", "tilt", "tilt", "tilt", "tilt", "distance"]
     image = render_board(board, guide.target, LENS, np.random.default_rng(0))
     assert len(detect(image, board)) >= 0.4 * len(board.points)
-
-
-def test_a_careful_session_lacks_nothing():
-    views, _ = corner_session(BOARD, LENS, seed=1, views=40)
-    assert guidance(views, BOARD, LENS).missing == ()
 
 
 def test_flat_views_lack_all_tilts():

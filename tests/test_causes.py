@@ -38,22 +38,6 @@ def test_the_f_test_and_the_likelihood_ratio_are_the_textbooks() -> None:
     assert known.covariance == pytest.approx(inverse[3:, 3:], rel=1e-9)
 
 
-def test_own_columns_of_parts_are_those_of_one_dense_matrix() -> None:
-    rng = np.random.default_rng(1)
-    shared, own, r = rng.normal(size=(30, 2)), rng.normal(size=(30, 3)), rng.normal(size=30)
-    parts = [np.arange(3 * i, 30, 9) + np.arange(3)[:, None] for i in range(3)]
-    parts = [np.unique(rows[rows < 30]) for rows in parts]
-    weights = rng.uniform(0.5, 2.0, 30)
-    projection = Projection(r, shared, [(rows, own[rows]) for rows in parts], weights)
-    dense = np.zeros((30, 9))
-    for i, rows in enumerate(parts):
-        dense[rows, 3 * i : 3 * i + 3] = own[rows]
-    A = np.concatenate([shared, dense], axis=1) * weights[:, None]
-    left = r * weights - A @ np.linalg.lstsq(A, r * weights, rcond=None)[0]
-    assert projection.residuals == pytest.approx(left, abs=1e-12)
-    assert projection.rank == 11
-
-
 @dataclass(frozen=True, eq=False)
 class Means:
     """Numbers in groups; a group may have a mean of its own. `stubborn` groups refuse a refit."""

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from common import NIGHTLY
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -18,7 +19,7 @@ from coursekit.geometry import Intrinsics
 
 pytest.importorskip("pyrealsense2", reason="no pyrealsense2 for this platform")
 
-CAMERAS = 1000 if os.environ.get("COURSEKIT_NIGHTLY") == "1" else 200
+CAMERAS = 1000 if NIGHTLY else 200
 
 RANGES = ((350, 900), (0.9, 1.1), (290, 350), (210, 270))  # f, aspect, cx, cy
 COEFFS = (0.3, 0.1, 0.003, 0.003, 0.05)  # k1, k2, p1, p2, k3, of either sign

@@ -187,11 +187,6 @@ def test_the_kernel(monkeypatch, command, verdict):
     monkeypatch.setattr(kernelspec.KernelSpecManager, "get_kernel_spec", lambda self, name: spec)
     remedy = "jupyter kernelspec remove python3" if verdict == "problem" else ""
     expect(doctor._kernel(), verdict, remedy=remedy)
-
-
-def test_no_kernel(monkeypatch):
-    from jupyter_client import kernelspec
-
     missing = partial(stop, kernelspec.NoSuchKernel("python3"))
     monkeypatch.setattr(kernelspec.KernelSpecManager, "get_kernel_spec", lambda *_: missing())
     expect(doctor._kernel(), "problem", "there is no kernel python3")
@@ -220,13 +215,11 @@ def test_results_that_cannot_be_written(monkeypatch, tmp_path):
     with monkeypatch.context() as patch:
         patch.setattr(tempfile, "TemporaryFile", lambda dir: refuse())
         expect(doctor._results(), "problem", "(Permission denied)", "COURSEKIT_RESULTS")
+    with monkeypatch.context() as patch:
+        patch.setattr(doctor.shutil, "disk_usage", lambda path: SimpleNamespace(free=2_000_000))
+        expect(doctor._results(), "problem", "only 2 MB")
     (tmp_path / "results").write_text("a file", encoding="utf-8")
     assert doctor._results().verdict == "problem"
-
-
-def test_a_full_disk(monkeypatch):
-    monkeypatch.setattr(doctor.shutil, "disk_usage", lambda path: SimpleNamespace(free=2_000_000))
-    expect(doctor._results(), "problem", "only 2 MB")
 
 
 # --- nothing stops it ---

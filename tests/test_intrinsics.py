@@ -171,15 +171,6 @@ def test_jacobian_is_the_numerical_derivative_of_opencvs_projection(result):
     assert rows.stop == len(shared) == 2 * result.corners
 
 
-def test_a_shared_focal_length_has_one_column():
-    fit = intrinsics.calibrate(VIEWS, CHARUCO, same_focal=True, model="k1")
-    points = np.array([[0.1, -0.05, 0.5], [-0.2, 0.1, 0.6]])
-    _, by_parameter, _ = derivatives.project_with_derivatives(points, fit.intrinsics)
-    by_names = by_parameter @ derivatives.selection(fit.names)
-    assert fit.names == ("f", "cx", "cy", "k1")
-    np.testing.assert_allclose(by_names[..., 0], by_parameter[..., 0] + by_parameter[..., 1])
-
-
 def test_joint_covariance_is_the_inverse_of_the_whole_normal_matrix(result):
     """The Schur complements against one dense inverse of the whole, 177 x 177."""
     whole = dense_jacobian(result)
@@ -195,19 +186,6 @@ def test_joint_covariance_is_the_inverse_of_the_whole_normal_matrix(result):
     np.testing.assert_allclose(result.joint_covariance[:9, :9], result.covariance, rtol=1e-9)
     k1, k2 = np.sqrt(np.diag(result.covariance))[4:6]
     assert result.covariance[4, 5] / (k1 * k2) < -0.9  # they pull against each other
-
-
-def test_the_step_leads_back_to_the_minimum_from_beside_it(result):
-    at_minimum, _ = result.equations.step()
-    assert np.abs(at_minimum / np.sqrt(np.diag(result.covariance))).max() < 0.01
-    detections, truth = corner_session(CHARUCO, LENS, seed=1, noise_px=0.0)
-    change = np.array([0.1, -0.1, 0.1, 0.1, 1e-3, -2e-3, 1e-4, 1e-4, 1e-3])
-    lens = derivatives.with_parameters(LENS, parameter_vector(LENS) + change)
-    given = (CHARUCO, CHARUCO.points, result.names, "brown_conrady")
-    beside = intrinsics.fit.evaluate(lens, truth.T_camera_board, detections, *given)
-    assert not beside.converged
-    back, _ = beside.equations.step()
-    np.testing.assert_allclose(back, -change, rtol=0.02)
 
 
 def test_a_direction_without_data_gets_a_huge_variance():

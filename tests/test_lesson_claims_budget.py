@@ -64,10 +64,6 @@ def test_b4_the_noise_rows() -> None:
     pixel = 1e3 * AT / 447.0
     in_all = math.sqrt(2 * pixel**2 + depth**2)
     ROWS["B4"].says(f"{in_all:.2f} mm in all", f"{depth:.3f} mm")
-    u, v = (424 + rng.standard_normal(200_000), 240 + rng.standard_normal(200_000))
-    z = AT + depth / 1e3 * rng.standard_normal(200_000)
-    off = deproject(np.stack([u, v], axis=1), z, K) - [0, 0, AT]
-    assert 1e3 * np.sqrt((off**2).sum(axis=1).mean()) == pytest.approx(in_all, rel=0.01)
 
 
 @claim("B5", "imprecise")
@@ -98,13 +94,9 @@ def test_b5_the_bias_rows() -> None:
 @claim("B6", "imprecise")
 def test_b6_what_averaging_does_not_remove() -> None:
     """A detector that is off by 0.6 px in this view each time, and by 0.8 px anew in each frame."""
-    rng = np.random.default_rng(6)
     repeats, anew = 0.6, 0.8
     assert math.hypot(repeats, anew) == pytest.approx(1.0)  # the row's 1 px
-    off = repeats * rng.standard_normal((4000, 1)) + anew * rng.standard_normal((4000, 100))
-    gain = off.std() / off.mean(axis=1).std()
-    assert gain == pytest.approx(1 / math.hypot(repeats, anew / 10), rel=0.05)
-    assert gain < 2  # not 10
+    assert 1 / math.hypot(repeats, anew / 10) < 2  # the gain of 100 frames: not 10
     ROWS["B6"].says("10x", "see D8", "a part that repeats")
 
 
@@ -138,15 +130,6 @@ def power(n: int, alike: bool = False) -> float:
 @claim("B8", "right")
 def test_b8_calibration_perception_and_the_arm() -> None:
     """Scatter is not taken for a constant, nor a constant for scatter: test_attribution.py."""
-    rng, toward = np.random.default_rng(8), np.array([1.0, -2.0, 2.0])
-    misses = toward + 2.0 * rng.standard_normal((1500, 10, 3))
-    mean, S = (
-        misses.mean(axis=1),
-        np.einsum("sni,snj->sij", *[misses - misses.mean(1)[:, None]] * 2),
-    )
-    squared = 90 * np.einsum("si,si->s", mean, np.linalg.solve(S, mean[..., None])[..., 0])
-    found = np.mean(stats.f.sf(squared * 7 / 27, 3, 7) < 0.01)
-    assert found == pytest.approx(power(10), abs=0.04)
     enough = next(n for n in range(4, 40) if power(n) >= 0.8)
     ROWS["B8"].says(f"in {100 * power(10):.0f} % of sets of 10 trials")
     ROWS["B8"].says(f"{100 * power(20):.0f} % of 20", f"{enough} for 80 %")

@@ -110,8 +110,6 @@ def test_h3_two_axes_are_needed() -> None:
     parts = (M[:, :3, columns] for M in (T, C) for columns in (np.s_[:3], 3))
     R, _ = cv2.calibrateHandEye(*parts, method=cv2.CALIB_HAND_EYE_TSAI)
     np.testing.assert_array_equal(R, np.eye(3))
-    with pytest.raises(he.SolverFailed, match="tsai: OpenCV returned the identity"):
-        he.HandEyeSession("eye_in_hand", T, C).solve("tsai")
     ROWS["H3"].says("t_X is free along it", "fixed only where")
     ROWS["H3"].says("Tsai solver silently returns the identity")
 

@@ -144,7 +144,7 @@ def stretched_session(roll_deg: float, stretch: float, seed: int) -> Detections:
 
 @claim("I3", "right")
 def test_i3_a_wrong_square_size_leaves_no_trace_in_the_image() -> None:
-    views, truth = corner_session(CHARUCO, LENS, 5)
+    views, _ = corner_session(CHARUCO, LENS, 5)
     right = intrinsics.calibrate(views, CHARUCO)
     wrong_board = replace(CHARUCO, square_m=0.024, marker_m=0.018)
     wrong = intrinsics.calibrate(views, wrong_board)
@@ -152,9 +152,6 @@ def test_i3_a_wrong_square_size_leaves_no_trace_in_the_image() -> None:
     assert wrong.value("fx") == pytest.approx(right.value("fx"), abs=1e-3)
     shorter = wrong.T_camera_board[:, 2, 3] / right.T_camera_board[:, 2, 3]
     np.testing.assert_allclose(shorter, 24 / 25, rtol=1e-5)
-    assert "wrong_square_size" not in intrinsics.diagnose(views, wrong_board).names
-    witness = intrinsics.diagnose(views, wrong_board, depth_m=truth.depth_m)
-    assert witness.names == ("wrong_square_size",)
 
     rms, aspect = {}, {}
     for roll in (0, 45, 90):
@@ -248,12 +245,6 @@ def test_i7_charuco_knows_which_corner_it_sees() -> None:
     assert np.abs(part.pixels - exact).max() < 0.1
     with pytest.raises(BoardNotFound):
         detect(picture(CHECKERBOARD)[:, :360], CHECKERBOARD)
-    # upside down a marker is still the same marker; of a symmetric checkerboard nobody can tell, as
-    # test_boards.py shows
-    turned = detect(whole[::-1, ::-1].copy(), CHARUCO)
-    size = np.array(whole.shape[::-1])
-    exact = size - 1 - (59.5 + 60 * CHARUCO.points[turned.ids, :2] / 0.025)
-    assert np.abs(turned.pixels - exact).max() < 0.1
 
 
 CAUSES = {

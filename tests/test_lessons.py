@@ -6,33 +6,26 @@ import dataclasses
 import itertools
 import json
 import math
-import os
 import re
 import sys
 from functools import partial
-from inspect import signature
 from pathlib import Path
 from statistics import mean
 
 import cv2
 import numpy as np
 import pytest
+from common import NIGHTLY
 
 from coursekit import lessons
 from coursekit.lessons import CHECKPOINTS, EXERCISES, questions
 from coursekit.lessons.exercises import Exercise, Model
 from coursekit.lessons.questions import EXAMPLES, Choice, Number, Verdict, panel
 
-NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 FILES = [Path(lessons.__file__).with_name(f"{lesson}.toml") for lesson in lessons.LESSONS]
+pytestmark = pytest.mark.usefixtures("own_results")
 each_exercise = pytest.mark.parametrize("exercise", EXERCISES.values(), ids=EXERCISES.keys())
 each_checkpoint = pytest.mark.parametrize("checkpoint", CHECKPOINTS.values(), ids=CHECKPOINTS)
-
-
-@pytest.fixture(autouse=True)
-def own_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("COURSEKIT_RESULTS", str(tmp_path))
-    return tmp_path
 
 
 # --- every exercise ---
@@ -157,7 +150,7 @@ def same_numbers(exercise: Exercise, one: np.ndarray, other: np.ndarray) -> bool
 def test_a_near_match_is_not_named(exercise: Exercise) -> None:
     for mistake in exercise.mistakes[:: 1 if NIGHTLY else 8]:
         model = exercise.model(mistake)
-        verdict = exercise.judge(lambda *args, model=model: model(*args) + 0.02)
+        verdict = exercise.judge(lambda *args, f=model: f(*args) + 0.02 * (1 + abs(f(*args))))
         assert verdict.kind == "wrong"
         assert verdict.named in (None, "runs_away")
 
@@ -193,6 +186,10 @@ def recursion(points, K, dist=None):
 
 def core_only(points, K, dist=None):
     return right(points, K)
+
+
+def only_one_point(points, K, dist=None):
+    return core_only(points, K) if len(points) == 1 else None
 
 
 def core_in_place(points, K, dist=None):
@@ -231,11 +228,7 @@ IN_PLACE_CORE = (
         (core_in_place, "wrong", IN_PLACE_CORE),
         (lambda *args: core_only(*args)[:, ::-1].T, "wrong", "more than one mistake"),
         (lambda *args: np.c_[core_only(*args), [0] * len(args[0])], "wrong", "wrong shape"),
-        (
-            lambda *args: core_only(*args) if len(args[0]) == 1 else None,
-            "wrong",
-            "`return` missing",
-        ),
+        (only_one_point, "wrong", "`return` missing"),
         (lambda *args: "pixels", "wrong", "a str"),
         (lambda *args: {1: 2}, "wrong", "a dict"),
         (lambda *args: [[1, 2], [3]], "wrong", "a list"),
@@ -255,53 +248,6 @@ def test_odd_functions(function, kind: str, says: str) -> None:
     assert verdict.kind == kind
     assert says in repr(verdict)
     assert verdict._repr_html_().count("<div") >= 1
-
-
-def by_opencv(points, K, dist=None):
-    return cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, dist)[0][:, 0]
-
-
-def homogeneous(points, K, dist=None):
-    rays = np.c_[by_opencv(points, np.eye(3), dist), np.ones(len(points))]
-    uvw = np.einsum("ij,nj->ni", K, rays)
-    return uvw[:, :2] / uvw[:, 2:]
-
-
-def in_float32(points, K, dist=None):
-    return right(points.astype(np.float32), K, dist).astype(np.float32)
-
-
-def undistorted_by_opencv(pixels, depth, K, dist=None):
-    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 500, 1e-14)
-    dist = np.zeros(5) if dist is None else dist
-    rays = cv2.undistortPointsIter(pixels[:, None], K, dist, None, None, criteria)[:, 0]
-    return depth[:, None] * np.column_stack([rays, np.ones(len(rays))])
-
-
-def twenty_rounds_of_division(pixels, depth, K, dist=None):
-    k1, k2, p1, p2, k3 = (0, 0, 0, 0, 0) if dist is None else dist
-    out = []
-    for (u, v), z in zip(pixels.tolist(), depth.tolist(), strict=True):
-        xd, yd = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
-        x, y = xd, yd
-        for _ in range(20):
-            r2 = x * x + y * y
-            radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-            dx = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-            dy = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-            x, y = (xd - dx) / radial, (yd - dy) / radial
-        out.append((x * z, y * z, z))
-    return out
-
-
-@pytest.mark.parametrize(
-    "function",
-    [by_opencv, homogeneous, in_float32, undistorted_by_opencv, twenty_rounds_of_division],
-)
-def test_right_answers_in_other_styles_are_not_blamed(function) -> None:
-    projects = "points" in signature(function).parameters
-    verdict = EXERCISES["pinhole.project" if projects else "pinhole.deproject"].judge(function)
-    assert verdict.kind == "right", verdict
 
 
 def test_the_counterexample_of_the_design() -> None:
@@ -370,11 +316,6 @@ def test_values_that_show_their_working(path: Path) -> None:
             assert float(found[1]) == pytest.approx(eval(found[2], vars(math).copy()), rel=1e-12)
         else:
             assert "# =" not in line
-
-
-def test_values_are_computed_in_four_lessons() -> None:
-    counts = [path.read_text(encoding="utf-8").count("# = ") for path in FILES]
-    assert counts == [1, 2, 0, 1, 3]
 
 
 @pytest.mark.parametrize("lesson", lessons.LESSONS)
@@ -508,6 +449,7 @@ def test_evidence_of_the_core() -> None:
 
 
 def test_a_damaged_record_is_set_aside(own_results: Path) -> None:
+    own_results.mkdir()
     (own_results / "progress.json").write_text("{half", encoding="utf-8")
     PITCH.answer(2000)
     assert len(questions.read_attempts()["pinhole.pitch"]) == 1

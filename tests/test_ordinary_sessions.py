@@ -24,15 +24,15 @@ FIRST_SEED = 200_000
 TRUE = {"bowed_board", "uneven_print", "unexplained", "halves_disagree"}
 
 
-@nightly
 def test_ordinary_sessions_are_accused_of_nothing() -> None:
-    """At most 8 of 400 with a cause that is not there."""
+    """At most 8 of 400 with a cause that is not there (nightly); of 4 none."""
+    count, most = (400, 8) if NIGHTLY else (4, 0)
     found: Counter[tuple[str, ...]] = Counter()
-    for seed in range(FIRST_SEED, FIRST_SEED + 400):
+    for seed in range(FIRST_SEED, FIRST_SEED + count):
         detections, _, board = ordinary_session(seed)
         found[intrinsics.diagnose(detections, board).names] += 1
     print(dict(found))
-    assert sum(n for names, n in found.items() if set(names) - TRUE) <= 8
+    assert sum(n for names, n in found.items() if set(names) - TRUE) <= most
 
 
 @nightly
@@ -46,9 +46,12 @@ def test_a_lens_beyond_the_model_is_named_alone() -> None:
     assert found[("lens_model",)] >= 95
 
 
-@pytest.mark.parametrize("seed", [FIRST_SEED, FIRST_SEED + 8])
+@pytest.mark.parametrize("seed", [FIRST_SEED, FIRST_SEED + 8, 700_032, 700_056])
 def test_a_fisheye_and_a_quotient_are_wrong_lenses_and_nothing_else(seed: int) -> None:
-    """One fisheye, one rational lens; paper, print and noise as everywhere."""
+    """Fisheyes and rational lenses; paper, print and noise as everywhere.
+
+    In the third OpenCV's own start arrives nowhere, in the last boards are turned over.
+    """
     detections, _, board = beyond_session(seed)
     findings = intrinsics.diagnose(detections, board)
     assert findings.names == ("lens_model",)

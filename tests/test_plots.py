@@ -217,16 +217,6 @@ def depth_noise_figures() -> dict[str, plots.LessonFigure]:
     }  # fmt: skip
 
 
-def test_technologies_at_one_and_two_metres(figures) -> None:
-    """Claims D2 and D10: 3.6 and 14.3 mm for stereo, Z^2 for both triangulating cameras."""
-    assert "active stereo 3.6 mm at 1 m and 14.3 mm at 2 m" in figures["technologies"].alt
-    stereo, light, flight = (line.get_ydata() for line in figures["technologies"].axes[0].lines)
-    ratio = (depth_noise.RANGE_M[-1] / depth_noise.RANGE_M[0]) ** 2
-    assert stereo[-1] / stereo[0] == pytest.approx(ratio)
-    assert light[-1] / light[0] == pytest.approx(ratio)
-    assert flight.min() == flight.max() == 17.0
-
-
 def test_reciprocal_is_the_derivative() -> None:
     z, fb, sigma = 0.8, 21.6, 0.08
     slope = (fb / (fb / z - 1e-6) - fb / (fb / z + 1e-6)) / 2e-6
@@ -267,15 +257,6 @@ def intrinsics_figures() -> dict[str, plots.LessonFigure]:
         "power": intrinsics.power(stored_power()),
         "difference": intrinsics.difference(compare(two["Q"], D435.color)),
     }
-
-
-def test_square_on_every_focal_length_fits_and_tilted_only_one() -> None:
-    X, Y, flat = toy(0)
-    flat_alt = intrinsics.best_fits(X, Y, {"flat": flat}, 600.0).alt
-    assert "from 300 to 1200 px" in flat_alt
-    tilted = intrinsics.best_fits(X, Y, {"tilted": toy(45)[2]}, 600.0).axes[0].lines[0]
-    best = tilted.get_xdata()[np.argmin(tilted.get_ydata())]
-    assert best == pytest.approx(600, abs=10)
 
 
 def test_outlines_are_opencvs() -> None:

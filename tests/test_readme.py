@@ -94,19 +94,16 @@ def test_folders_are_those_that_are_there() -> None:
         assert (ROOT / line.split()[0]).exists(), line
 
 
-def test_minutes_are_those_of_the_notebooks() -> None:
+def test_minutes_are_those_of_the_notebooks_as_computed_and_not_too_many() -> None:
     said = dict(re.findall(r"^\| `(\w+)` \| (\d+) min \|", TEXT, re.MULTILINE))
-    paths = sorted((ROOT / "notebooks").glob("[0-9]*.ipynb"))
+    paths = find([])
     assert [path.stem for path in paths] == list(said)
     for path in paths:
         minutes = re.search(r"Core: about (\d+) minutes", path.read_text(encoding="utf-8"))
         assert minutes, path
         assert minutes.group(1) == said[path.stem]
 
-
-def test_minutes_are_as_computed_and_not_too_many() -> None:
-    computed = {path.stem: core_minutes(read(path)) for path in find([])}
-    said = dict(re.findall(r"^\| `(\w+)` \| (\d+) min \|", TEXT, re.MULTILINE))
+    computed = {path.stem: core_minutes(read(path)) for path in paths}
     assert said == {name: f"{minutes:.0f}" for name, minutes in computed.items()}
     assert max(computed.values()) <= MOST
     assert sum(computed.values()) <= MOST_OF_ALL

@@ -11,13 +11,8 @@ from common import named, refusals
 from coursekit import results
 from coursekit.results import Covariance, Quantity
 
+pytestmark = pytest.mark.usefixtures("own_results")
 CAMERA = SimpleNamespace(source="simulated", name="Simulated D435")
-
-
-@pytest.fixture(autouse=True)
-def own_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("COURSEKIT_RESULTS", str(tmp_path / "results"))
-    return tmp_path / "results"
 
 
 def test_round_trip(own_results: Path) -> None:

@@ -16,7 +16,6 @@ from coursekit.simulation.corner_sessions import (
     Effects,
     bowed,
     corner_session,
-    ordinary,
     rolling_shutter,
 )
 
@@ -147,25 +146,6 @@ def test_the_limits_of_tilt_and_of_the_image_hold() -> None:
     assert (pixels <= np.array(LENS.size) - margin).all()
 
 
-def test_blurred_views_have_the_covariance_of_a_uniform_motion() -> None:
-    session, truth = corner_session(CHARUCO, LENS, seed=10, views=30, effects=Effects(blur_px=3.0))
-    assert len(truth.blurred) == 10
-    for i, view in enumerate(session):
-        wanted = 0.666**2 + 9 / 12 * (i in truth.blurred)
-        assert np.linalg.eigvalsh(view.blur)[1] == pytest.approx(wanted, rel=0.25)
-
-
-def test_single_bad_corners_are_off_by_what_was_asked_for() -> None:
-    effects = Effects(bad_corners=4, bad_corner_px=5.0)
-    healthy, _ = corner_session(CHARUCO, LENS, seed=11)
-    session, truth = corner_session(CHARUCO, LENS, seed=11, effects=effects)
-    assert len(truth.bad_corners) == 4
-    found = []
-    for i, (a, b) in enumerate(zip(healthy, session, strict=True)):
-        found += [(i, corner) for corner in a.ids[np.abs(a.pixels - b.pixels).max(axis=1) > 1]]
-    assert set(found) == set(truth.bad_corners)
-
-
 def session(board=CHARUCO, **changes):
     return corner_session(board, LENS, seed=0, **changes)
 
@@ -231,17 +211,6 @@ def rays_of(truth) -> np.ndarray:
     """Where the corners of all poses are in the camera's frame, (n, 3)."""
     R, t = truth.T_camera_board[:, :3, :3], truth.T_camera_board[:, None, :3, 3]
     return (truth.points @ np.swapaxes(R, 1, 2) + t).reshape(-1, 3)
-
-
-def test_an_ordinary_session_has_no_mistake() -> None:
-    """No seed draws a fault, and another seed draws other sizes."""
-    drawn = [ordinary(seed) for seed in range(20)]
-    assert len({effects.wave_m for effects in drawn}) == 20
-    for effects in drawn:
-        mistakes = {"bow_m", "blur_px", "spoiled_px", "bad_corners", "inner_only"}
-        assert not any(getattr(effects, name) for name in mistakes)
-        assert effects.readout_s * effects.speed_m_s < 1e-4
-        assert effects.focus_drift < 1e-3
 
 
 FAR, FAST = np.array([[0.0, 0.1, 0.5]]), np.array([0.0, 500.0, 0.0])

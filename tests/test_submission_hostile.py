@@ -18,6 +18,7 @@ from pathlib import Path
 import hostile_bundles as bundles
 import numpy as np
 import pytest
+from common import NIGHTLY
 from hostile_bundles import GONE, HONEST, MEMBERS, hashed, parts
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -25,7 +26,6 @@ from hypothesis import strategies as st
 from coursekit.submission import format as bundle_format
 from coursekit.submission.format import Refused, Submission, bundle_bytes, read_bundle, zip_bytes
 
-NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 STRUCTURED = 5_000 if NIGHTLY else 200
 MUTATED = 200_000 if NIGHTLY else 1_000
 KINDS = bundles.hostile()

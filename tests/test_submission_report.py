@@ -13,6 +13,8 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 import sample_submissions as samples
+from common import contrast
+from hostile_bundles import BUNDLES
 from sample_submissions import PARAGRAPH, honest, with_part, with_row
 
 from coursekit.submission import report
@@ -175,7 +177,7 @@ def test_odd_depths_give_a_page(unit, frames):
     page_of(with_part(replace(GOOD, stacks=stacks), "camera", depth_scale_m=unit))
 
 
-@pytest.mark.parametrize("text", samples.HOSTILE_TEXTS)
+@pytest.mark.parametrize("text", BUNDLES["hostile_texts"])
 def test_a_students_text_stays_text(text):
     submission = samples.injecting(text)
     some = [line_of(submission, text + ".zip", "x.html"), report.not_graded(text, text, text)]
@@ -397,15 +399,6 @@ def test_a_line_goes_through_json(lines):
     assert report.grades_csv(back) == report.grades_csv(lines)
 
 
-def luminance(colour: str) -> float:
-    """That of WCAG, of a colour such as #222 or #595959."""
-    digits = colour.lstrip("#")
-    digits = "".join(2 * digit for digit in digits) if len(digits) == 3 else digits
-    parts = [int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4)]
-    linear = [p / 12.92 if p <= 0.04045 else ((p + 0.055) / 1.055) ** 2.4 for p in parts]
-    return float(np.dot(linear, (0.2126, 0.7152, 0.0722)))
-
-
 def test_ink_on_paper_has_contrast():
     """WCAG AA: 4.5 to 1 for text."""
     style = (report.HERE / "report.css").read_text(encoding="utf-8")
@@ -413,5 +406,4 @@ def test_ink_on_paper_has_contrast():
     pairs += [(ink, "#fff") for ink in ("#222", "#595959", "#00538a", "#444")]
     assert len(pairs) >= 8
     for ink, paper in pairs:
-        dark, light = sorted((luminance(ink), luminance(paper)))
-        assert (light + 0.05) / (dark + 0.05) >= 4.5, (ink, paper)
+        assert contrast(ink, paper) >= 4.5, (ink, paper)

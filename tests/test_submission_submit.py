@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import nbformat
 import numpy as np
 import pytest
+from common import NIGHTLY
 from sample_submissions import PARAGRAPH, honest
 
 import coursekit as ck
@@ -24,14 +24,6 @@ from coursekit.submission.submit import MEASURED, keep, load_measured, relative,
 from tools import build_notebooks
 
 RIGHT = asdict(honest(seed=3).conclusion)
-
-
-@pytest.fixture
-def own_results(tmp_path, monkeypatch):
-    folder = tmp_path / "results"
-    monkeypatch.setenv("COURSEKIT_RESULTS", str(folder))
-    monkeypatch.chdir(tmp_path)
-    return folder
 
 
 @pytest.fixture
@@ -356,17 +348,16 @@ def textbook(z, at):
 def test_the_studio_cells_of_the_notebook_hand_in_what_they_say(own_results, capsys):
     """A textbook's analysis gets 95 points, untouched defaults at most 30; a dozen frames stand for
     a hundred, but at night."""
-    nightly = os.environ.get("COURSEKIT_NIGHTLY") == "1"
     notebook = nbformat.read(build_notebooks.NOTEBOOKS / "02_depth_noise.ipynb", as_version=4)
     sources = {cell.id: cell.source for cell in notebook.cells} | FILLED_IN
     names = {"textbook": textbook}
     for cell in CELLS:
-        frames = "camera.frames(100" if nightly else "camera.frames(12"
+        frames = "camera.frames(100" if NIGHTLY else "camera.frames(12"
         exec(sources[cell].replace("camera.frames(100", frames), names)
     packed = read_bundle(own_results / "studio_1_Ada.zip")
     found = grade(packed)
     wrong = {(item.topic, item.mistake) for item in found.items if item.verdict != "right"}
-    few = 0 if nightly else 9 - 9 * 12 / 100  # of the points for raw depths
+    few = 0 if NIGHTLY else 9 - 9 * 12 / 100  # of the points for raw depths
     assert found.points >= 95 - few
     assert wrong <= {("data", "incomplete"), ("bias_se", "independent"), ("std_se", "one_pixel")}
     empty = replace(packed.claims, rows=()), replace(packed.plot, predicted_mm=None)

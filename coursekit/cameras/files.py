@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import re
+import tempfile
 from collections.abc import Collection, Generator, Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +21,7 @@ from coursekit.boards.detector import natural
 from coursekit.cameras import recording
 from coursekit.cameras.camera import Camera, camera_line
 from coursekit.cameras.frames import FRAMES_PER_S, NO_DEPTH, CameraError, Description, Frame
-from coursekit.cameras.librealsense import LibraryMissing
-from coursekit.cameras.realsense import RealSense, shortest_decimal
+from coursekit.cameras.realsense import shortest_decimal
 from coursekit.geometry import Intrinsics, invert_transform, make_transform
 from coursekit.words import counted, say
 
@@ -34,17 +36,28 @@ MOST_WAITING = 60  # depth images that wait for the colour image after them, whe
 
 
 def play(path: Path) -> Camera:
-    """A recording: by librealsense where it is installed and made it, else by `RosBag`.
-
-    Raises CameraError for what neither can play.
-    """
+    """A recording, read by `RosBag`; CameraError for a file that is none."""
     recording.check_recording(path)
-    if recording.is_of_ros(path):
-        return RosBag(path)
-    try:
-        return RealSense(path=path)
-    except LibraryMissing:
-        return RosBag(path)
+    return RosBag(path)
+
+
+@contextlib.contextmanager
+def _plainly_named(path: Path) -> Iterator[Path]:
+    """The path, or a link to it where rosbags would misread its name as more of an address."""
+    if not set("?#%") & set(os.fspath(path)):
+        yield path
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        link = Path(folder) / f"recording{path.suffix}"
+        link.symlink_to(path.resolve())
+        yield link
+
+
+@cache
+def _ros_types() -> Any:
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_HUMBLE)
 
 
 # --- messages -------------------------------------------------------------------------------------
@@ -60,8 +73,8 @@ class _Shot:
 
 
 class RosBag(Camera):
-    """The messages of a recording, read by rosbags, which is pure Python: what a ROS driver of any
-    depth camera recorded, and what librealsense did, where that is not installed.
+    """The messages of a recording, read by rosbags, which is pure Python: what librealsense
+    recorded, or a ROS driver of any depth camera.
 
     Depth comes from images of 16UC1 (mm, or as librealsense says) or 32FC1 (m; counts are 0.1 mm
     then) with `depth` in their topic and a camera_info beside it; colour and the infrared pair
@@ -70,23 +83,24 @@ class RosBag(Camera):
     """
 
     def __init__(self, path: Path) -> None:
-        self._path, self._what = path, f"the recording {path.name}"
+        self._path, self._what, self._closed = path, f"the recording {path.name}", False
         self.source, self.serial, self.name = "recorded", "", "Depth camera"
         self.depth_scale_m, self.baseline_m, self.T_color_depth = 0.001, None, None
         with self._reader() as reader:
             self._describe(reader)
 
     def __repr__(self) -> str:
-        return camera_line(self, f"recording {self._path.name}, read by rosbags", "unknown")
+        return camera_line(self, f"recording {self._path.name}", "unknown")
 
     @contextlib.contextmanager
     def _reader(self) -> Iterator[Any]:
         from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
 
-        store = get_typestore(Stores.ROS2_HUMBLE)
         try:
-            with AnyReader([self._path], default_typestore=store) as reader:
+            with (
+                _plainly_named(self._path) as path,
+                AnyReader([path], default_typestore=_ros_types()) as reader,
+            ):
                 yield reader
         except CameraError:
             raise
@@ -126,6 +140,8 @@ class RosBag(Camera):
             name: [] for name in self._names.values() if name != "depth"
         }
         waiting: list[_Shot] = []
+        if self._closed:
+            raise CameraError(say("cameras.closed", what=self._what))
         with self._reader() as reader:
             for name, shot in self._shots(reader):
                 (waiting if name == "depth" else others[name]).append(shot)
@@ -136,17 +152,18 @@ class RosBag(Camera):
 
     def _shots(self, reader: Any) -> Iterator[tuple[str, _Shot]]:
         """The images of all streams in the order of their times, each with its stream's name."""
-        numbered = {}  # librealsense's own numbers and times: by stream and time in the file
-        for topic, at_ns, message in self._messages(reader, self._numbers):
-            if pairs := _pairs(message):
-                numbered[topic.partition("/image")[0], at_ns] = pairs
+        numbered: dict[str, list[dict[str, str]]] = {}  # librealsense's own numbers and times
+        for topic, _, message in self._messages(reader, self._numbers):
+            if {"Frame number", "timestamp"} <= (pairs := _pairs(message)).keys():
+                numbered.setdefault(topic.partition("/image")[0], []).append(pairs)
         counts = dict.fromkeys(self._names.values(), 0)
-        for topic, at_ns, message in self._messages(reader, self._names.keys()):
+        for topic, _, message in self._messages(reader, self._names.keys()):
             name, stamp = self._names[topic], message.header.stamp
+            ours = numbered.get(topic.partition("/image")[0], [])
             counts[name] += 1
             number, time_s = counts[name], stamp.sec + 1e-9 * stamp.nanosec
-            said = numbered.get((topic.partition("/image")[0], at_ns), {})
-            if "Frame number" in said:
+            if number <= len(ours):
+                said = ours[number - 1]
                 number, time_s = int(said["Frame number"]), float(said["timestamp"]) / 1000.0
             elif topic.startswith("/device_"):
                 number = message.header.seq
@@ -173,7 +190,7 @@ class RosBag(Camera):
         return say("cameras.as_recorded")
 
     def close(self) -> None:
-        pass  # the file is open only while frames are read
+        self._closed = True  # the file is open only while frames are read
 
 
 class _Facts:

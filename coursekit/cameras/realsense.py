@@ -1,21 +1,19 @@
-"""RealSense cameras on USB and recordings of them: one class, because librealsense plays both."""
+"""RealSense cameras on USB, in librealsense's hands."""
 
 from __future__ import annotations
 
 import contextlib
-import functools
 import itertools
 import re
 import threading
 import weakref
-from collections.abc import Callable, Generator, Iterator
-from pathlib import Path
-from typing import Any, NamedTuple
+from collections.abc import Generator
+from typing import Any
 
 import numpy as np
 
 from coursekit import specifications
-from coursekit.arrays import AnyArray, Image
+from coursekit.arrays import Image
 from coursekit.cameras import recording
 from coursekit.cameras.camera import Camera, camera_line
 from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Frame
@@ -26,7 +24,7 @@ from coursekit.words import ROOM_TEXTS, say
 DEPTH_SIZE, COLOR_SIZE = (848, 480), (640, 480)
 WARM_UP_FRAMES = 30  # automatic exposure settles in about a second
 SETTLE_FRAMES = 6  # a new exposure shows up to five frames later (librealsense issue 11228)
-POLL_MS = 50  # a recording's last wait always runs out, so it is short
+POLL_MS = 50
 # Without a frame in so many waits (5 s) the camera is gone. Waits are counted, because a busy
 # computer can let any time pass between two of them.
 MOST_POLLS = 100
@@ -35,36 +33,28 @@ _live_cameras: weakref.WeakValueDictionary[str, RealSense] = weakref.WeakValueDi
 
 
 class RealSense(Camera):
-    """A RealSense on USB (by serial number) or a recording (by path) in librealsense's hands.
+    """A RealSense on USB, by its serial number.
 
-    infrared: whether a live camera is to give both infrared images too; a recording gives them if
-    it holds them. Raises LibraryMissing without pyrealsense2, and CameraError for a camera or file
-    that does not open. All attributes are what the device or recording reports about itself.
+    infrared: whether it is to give both infrared images too. Raises LibraryMissing without
+    pyrealsense2, and CameraError for a camera that does not open. All attributes are what the
+    device reports about itself.
     """
 
-    def __init__(
-        self, serial: str | None = None, path: Path | None = None, infrared: bool = False
-    ) -> None:
-        if (serial is None) == (path is None):
-            raise ValueError("serial, path: got both or neither, want exactly one")
+    source, can_place = "live", True
+
+    def __init__(self, serial: str, infrared: bool = False) -> None:
         self._rs = load_librealsense()
         self._running = _Running()
         weakref.finalize(self, self._running.leave)
-        self._path, self._infrared = path, infrared
+        self._infrared, self.serial = infrared, serial
         self._what = f"the RealSense {serial}"
-        self.source, self.serial, self.can_place = "live", serial or "", path is None
-        if path is not None:
-            self._what = f"the recording {path.name}"
-            self.source = "recorded"
-            recording.check_recording(path)
-        elif self.serial in _live_cameras:  # the setup cell was run again
-            _live_cameras[self.serial].close()
+        if serial in _live_cameras:  # the setup cell was run again
+            _live_cameras[serial].close()
         self._start()
         try:
             self._query()
-            if self.source == "live":
-                _live_cameras[self.serial] = self
-                self._skip(WARM_UP_FRAMES)
+            _live_cameras[self.serial] = self
+            self._skip(WARM_UP_FRAMES)
         except CameraError:
             self.close()
             raise
@@ -75,27 +65,18 @@ class RealSense(Camera):
     # --- opening and closing -------------------------------------------------------------------
 
     def _start(self) -> None:
-        """Start streaming; of a recording from its beginning."""
+        """Start streaming."""
         with self._running.turn:
             if self._running.left:
                 raise CameraError(say("cameras.closed_meanwhile", what=self._what))
             try:
                 pipeline = self._rs.pipeline()
-                config = self._playback_config(pipeline) if self._path else self._live_config()
-                self._profile = pipeline.start(config)
-                playback = self._profile.get_device().as_playback() if self._path else None
-            except CameraError:
-                raise
+                self._profile = pipeline.start(self._config())
             except RuntimeError as error:
-                if self._path is None:
-                    raise CameraError(start_problem(self._what, error)) from error
-                reason = str(error).rsplit("Reason: ", maxsplit=1)[-1]
-                raise CameraError(
-                    say("cameras.not_read", what=self._what, reason=reason)
-                ) from error
-            self._running.run(pipeline, playback)
+                raise CameraError(start_problem(self._what, error)) from error
+            self._running.pipeline = pipeline
 
-    def _live_config(self) -> Any:
+    def _config(self) -> Any:
         rs, config = self._rs, self._rs.config()
         config.enable_device(self.serial)
         config.enable_stream(rs.stream.depth, *DEPTH_SIZE, rs.format.z16, FRAMES_PER_S)
@@ -104,48 +85,15 @@ class RealSense(Camera):
             config.enable_stream(rs.stream.infrared, eye, *DEPTH_SIZE, rs.format.y8, FRAMES_PER_S)
         return config
 
-    def _playback_config(self, pipeline: Any) -> Any:
-        """Depth, colour and the infrared pair of the file, as fast as they are asked for."""
-        rs, wrapper = self._rs, self._rs.pipeline_wrapper(pipeline)
-
-        def from_file() -> Any:
-            config = rs.config()
-            config.enable_device_from_file(str(self._path), repeat_playback=False)
-            return config
-
-        everything = from_file().resolve(wrapper)
-        profiles = everything.get_streams()
-        streams = {profile.stream_type() for profile in profiles}
-        if rs.stream.depth not in streams:
-            raise CameraError(f"{self._what} holds no depth images: record depth and colour")
-        config = from_file()
-        for stream in streams & {rs.stream.depth, rs.stream.color}:
-            config.enable_stream(stream)
-        self._infrared = self._has_pair(profiles)
-        for eye in (1, 2) if self._infrared else ():
-            config.enable_stream(rs.stream.infrared, eye)
-        # Both before the start, or images are lost: at the recorded pace those that are not fetched
-        # in time, and the first ones while the sensors are started one after the other.
-        playback = config.resolve(wrapper).get_device().as_playback()
-        playback.set_real_time(False)
-        playback.pause()
-        return config
-
-    def _has_pair(self, profiles: Any) -> bool:
-        """Whether there are a left and a right infrared stream of grey pixels."""
-        rs = self._rs
-        grey = (p for p in profiles if p.format() == rs.format.y8)
-        return {p.stream_index() for p in grey if p.stream_type() == rs.stream.infrared} >= {1, 2}
-
     def _check_open(self) -> None:
-        if not self._running:
+        if self._running.pipeline is None:
             raise CameraError(say("cameras.closed", what=self._what))
 
     def _depth_sensor(self) -> Any:
         return self._profile.get_device().first_depth_sensor()
 
     def close(self) -> None:
-        """Stop the camera, or close the file; a second call does nothing."""
+        """Stop the camera; a second call does nothing."""
         self._running.stop()
 
     # --- what the device says about itself -----------------------------------------------------
@@ -163,89 +111,52 @@ class RealSense(Camera):
         profiles = {p.stream_type(): p for p in self._profile.get_streams()}
         depth = profiles[rs.stream.depth].as_video_stream_profile()
         self.depth = Intrinsics.from_realsense(depth.get_intrinsics())
-        self.color = self.T_color_depth = self._to_rgb = None
+        self.color = self.T_color_depth = None
         if rs.stream.color in profiles:
             color = profiles[rs.stream.color].as_video_stream_profile()
             self.color = Intrinsics.from_realsense(color.get_intrinsics())
-            self._to_rgb = _rgb_converter(str(color.format()).rsplit(".", 1)[-1])
             extrinsics = depth.get_extrinsics_to(color)
             rotation = np.reshape(extrinsics.rotation, (3, 3), order="F")  # column by column
             self.T_color_depth = make_transform(rotation, extrinsics.translation)
 
     def __repr__(self) -> str:
-        where = f"recording {self._path.name}" if self._path else f"live, serial {self.serial}"
-        return camera_line(self, where, "unknown")
+        return camera_line(self, f"live, serial {self.serial}", "unknown")
 
     # --- frames --------------------------------------------------------------------------------
 
     def stream(self) -> Generator[Frame, None, None]:
         self._check_open()
-        if self._path is not None:
-            self.close()
-            self._start()
-        # A playback gives each depth image with the colour image before it and the one after it;
-        # a live camera gives matching images, and repeats one when the other is late.
-        choose = functools.partial(min, key=_time_apart) if self._path else next
-        frame = None
-        for _, groups in itertools.groupby(self._groups(), key=_identity):
-            frame = self._frame(choose(groups))
-            yield frame
-        self._check_end(frame)
-
-    def _groups(self) -> Iterator[_Group]:
-        """The images as librealsense groups them, until a recording ends."""
-        while (frameset := self._next_frameset()) is not None:
-            depth, color = frameset.get_depth_frame(), frameset.get_color_frame()
-            eyes = (1, 2) if self._infrared else ()
-            if depth:
-                infrared = tuple(frameset.get_infrared_frame(eye) or None for eye in eyes)
-                yield _Group(depth, color or None, infrared)
-
-    def _check_end(self, last: Frame | None) -> None:
-        """CameraError unless a playback that ended has given all depth images of its file.
-
-        librealsense ends it silently at the first message that it cannot decode.
-        """
-        if self._path is not None and self._path.suffix == ".db3":
-            numbers = recording.depth_frame_numbers(self._path)
-            lost = len(numbers)
-            if last is not None and last.number in numbers:
-                lost = numbers[::-1].index(last.number)
-            if lost:
-                raise CameraError(say("cameras.damaged_end", what=self._what, lost=lost))
-        if last is None:
-            raise CameraError(f"{self._what} holds no frames: record it anew")
+        last = None
+        while True:
+            images = self._next_frameset()
+            depth, color = images.get_depth_frame(), images.get_color_frame()
+            # An image is repeated when the other is late.
+            if depth and (moment := (depth.get_frame_number(), depth.get_timestamp())) != last:
+                last = moment
+                yield self._frame(depth, color, images)
 
     def _next_frameset(self) -> Any:
-        """The next group of images; None once a recording has ended."""
-        ended = False
+        """The next group of images."""
         for _ in range(MOST_POLLS):
             try:
-                arrived, frameset, status = self._running.poll()
+                arrived, images = self._running.poll()
             except RuntimeError as error:
-                stopped = (
-                    f"{self._what} stopped giving frames ({error}): {say('cameras.unplugged')}"
-                )
-                raise CameraError(stopped) from error
+                stopped = f"{self._what} stopped giving frames ({error})"
+                raise CameraError(f"{stopped}: {say('cameras.unplugged')}") from error
             if arrived is None:
                 raise CameraError(say("cameras.closed_meanwhile", what=self._what))
             if arrived:
-                return frameset
-            if ended:
-                return None
-            ended = status is not None and status == self._rs.playback_status.stopped
-        silence_s = MOST_POLLS * POLL_MS / 1000
-        raise CameraError(
-            f"no frame came from {self._what} for {silence_s:g} s: {say('cameras.unplugged')}"
-        )
+                return images
+        silent = f"no frame came from {self._what} for {MOST_POLLS * POLL_MS / 1000:g} s"
+        raise CameraError(f"{silent}: {say('cameras.unplugged')}")
 
-    def _frame(self, group: _Group) -> Frame:
-        depth, color, infrared = group
+    def _frame(self, depth: Any, color: Any, images: Any) -> Frame:
         counts = np.array(depth.get_data(), dtype=np.uint16)
-        rgb = self._to_rgb(np.asarray(color.get_data())) if color and self._to_rgb else None
+        rgb = np.array(color.get_data()) if color else None
         time_s, number = depth.get_timestamp() / 1000.0, depth.get_frame_number()
         figures = self.depth, self.color, self.T_color_depth
-        return Frame(counts, rgb, self.depth_scale_m, time_s, number, *figures, _pixels(infrared))
+        eyes = [images.get_infrared_frame(eye) for eye in ((1, 2) if self._infrared else ())]
+        return Frame(counts, rgb, self.depth_scale_m, time_s, number, *figures, _pixels(eyes))
 
     def _skip(self, n: int) -> None:
         for _ in itertools.islice(self.stream(), n):
@@ -254,9 +165,6 @@ class RealSense(Camera):
     # --- placing and settings ------------------------------------------------------------------
 
     def place(self, name: str, distance_m: float) -> None:
-        if self._path is not None:
-            super().place(name, distance_m)
-            return
         recording.check_distance(distance_m)
         device = specified(self.name)
         glass_m = device.nominal.glass_m if device else 0.0
@@ -270,8 +178,6 @@ class RealSense(Camera):
         self._skip(WARM_UP_FRAMES)  # those from before, and until automatic exposure has settled
 
     def _change(self, asked: dict[str, Any]) -> str:
-        if self._path is not None:
-            return super()._change(asked)
         said = []
         if "ambient" in asked:
             said.append("the room's light is yours to change: draw the curtains, turn on a lamp")
@@ -311,10 +217,8 @@ class RealSense(Camera):
         """Switch automatic exposure, gain and white balance off, at the values they have now.
 
         The colour camera does not report its automatic exposure (librealsense issue 2549), so it
-        takes its manual setting. A recording is left as it is. Returns one sentence that says so.
+        takes its manual setting. Returns one sentence that says so.
         """
-        if self._path is not None:
-            return say("cameras.as_recorded")
         self._check_open()
         rs, locked = self._rs, []
         try:
@@ -347,7 +251,7 @@ class RealSense(Camera):
 
     def _depth_exposure(self, sensor: Any) -> tuple[float, float]:
         """Exposure (us) and gain of the newest depth image, which automatic exposure chose."""
-        depth = next(self._groups()).depth
+        depth = self._next_frameset().get_depth_frame()
 
         def chosen(value: Any, setting: Any) -> float:
             known = depth.supports_frame_metadata(value)
@@ -361,44 +265,24 @@ class RealSense(Camera):
 
 
 class _Running:
-    """A pipeline while it runs, and for a recording the thread that wakes its playback and, at the
-    end, brings it to rest.
+    """A pipeline while it runs.
 
-    A thread that is inside librealsense when the interpreter ends, in resume() or waiting for
-    frames, ends the process with an abort. So a camera calls it in turns, and `leave`, at the
-    interpreter's end, has the last one. True while there is a pipeline.
+    A thread that is inside librealsense when the interpreter ends, waiting for frames, ends the
+    process with an abort. So a camera calls it in turns, and `leave`, at the interpreter's end, has
+    the last one.
     """
 
     def __init__(self) -> None:
         self.turn, self.left = threading.RLock(), False
-        self._pipeline: Any = None
-        self._playback: Any = None
-        self._attendant: threading.Thread | None = None
-        self._ending = threading.Event()
+        self.pipeline: Any = None
 
-    def __bool__(self) -> bool:
-        return self._pipeline is not None
-
-    def run(self, pipeline: Any, playback: Any) -> None:
-        """Take a started pipeline; playback: of one that was started paused, else None."""
-        self._pipeline, self._playback = pipeline, playback
-        self._attendant, self._ending = None, threading.Event()
-        if playback is not None:
-            attend = functools.partial(_attend, playback, self._ending)
-            self._attendant = threading.Thread(target=attend, daemon=True)
-            self._attendant.start()
-
-    def poll(self) -> tuple[bool | None, Any, Any]:
-        """Whether images came within POLL_MS, these, and a playback's status when none came.
-
-        All None once it is stopped.
-        """
+    def poll(self) -> tuple[bool | None, Any]:
+        """Whether images came within POLL_MS, and these; None twice once it is stopped."""
         with self.turn:
-            if self._pipeline is None or self.left:
-                return None, None, None
-            arrived, images = self._pipeline.try_wait_for_frames(POLL_MS)
-            ask = self._playback is not None and not arrived
-            return arrived, images, self._playback.current_status() if ask else None
+            if self.pipeline is None or self.left:
+                return None, None
+            arrived, images = self.pipeline.try_wait_for_frames(POLL_MS)
+            return arrived, images
 
     def leave(self) -> None:
         """Stop for good: when Python ends, or nobody holds the camera any more."""
@@ -406,86 +290,23 @@ class _Running:
         self.stop()
 
     def stop(self) -> None:
-        """Bring everything to rest: a thread that polls, the playback, the pipeline.
-
-        At the end of its file a playback's reading thread stops the sensors itself; when the
-        pipeline stops them at the same moment, librealsense frees its callbacks twice and may end
-        the process (its issue 9446). So that thread has to rest first, which pause() waits for; and
-        it comes to rest only while somebody takes its images.
-        """
+        """Stop the pipeline; a second call does nothing."""
         with self.turn:
-            pipeline, self._pipeline, self._playback = self._pipeline, None, None
-            if pipeline is None:
-                return
-            self._ending.set()
-            attendant = self._attendant
-            if attendant is threading.current_thread():  # where Python collects a forgotten camera
-                attendant = None
-            with contextlib.suppress(RuntimeError):  # an unplugged camera cannot be stopped
-                try:
-                    while attendant and attendant.is_alive():  # at most librealsense's own 10 s
-                        pipeline.try_wait_for_frames(1)
-                finally:
+            pipeline, self.pipeline = self.pipeline, None
+            if pipeline is not None:
+                with contextlib.suppress(RuntimeError):  # an unplugged camera cannot be stopped
                     pipeline.stop()
-
-
-def _attend(playback: Any, ending: threading.Event) -> None:
-    """Wake a paused playback, and pause it again when it is to end.
-
-    One thread does both, so that they come in this order: resume() returns only when the reading
-    thread has come so far.
-    """
-    playback.resume()
-    ending.wait()
-    playback.pause()
 
 
 # --- images ------------------------------------------------------------------------------------
 
 
-class _Group(NamedTuple):
-    """librealsense's images of one moment; infrared: none, or left and right, None if missing."""
-
-    depth: Any
-    color: Any
-    infrared: tuple[Any, ...]
-
-
-def _identity(group: _Group) -> tuple[int, float]:
-    return group.depth.get_frame_number(), group.depth.get_timestamp()
-
-
-def _time_apart(group: _Group) -> float:
-    """How far the images are apart in all, ms; infinitely far without one of them."""
-    others = group.color, *group.infrared
-    moment = group.depth.get_timestamp()
-    return sum(abs(moment - image.get_timestamp()) if image else np.inf for image in others)
-
-
-def _pixels(infrared: tuple[Any, ...]) -> tuple[Image, Image] | None:
+def _pixels(eyes: list[Any]) -> tuple[Image, Image] | None:
     """Left and right (H, W), None unless both are there."""
-    if not infrared or not all(infrared):
+    if not eyes or not all(eyes):
         return None
-    left, right = (np.array(image.get_data(), dtype=np.uint8) for image in infrared)
+    left, right = (np.array(image.get_data(), dtype=np.uint8) for image in eyes)
     return left, right
-
-
-def _rgb_converter(form: str) -> Callable[[AnyArray], Image]:
-    """The function that makes (h, w, 3) RGB of a colour image in librealsense's format `form`."""
-    slices: dict[str, Any] = {"rgb8": np.s_[..., :3], "rgba8": np.s_[..., :3]}
-    slices |= {"bgr8": np.s_[..., ::-1], "bgra8": np.s_[..., 2::-1]}
-    if form in slices:
-        return lambda image: image[slices[form]].copy()
-    if form in ("yuyv", "uyvy"):
-        import cv2
-
-        code = cv2.COLOR_YUV2RGB_YUYV if form == "yuyv" else cv2.COLOR_YUV2RGB_UYVY
-        return lambda image: cv2.cvtColor(_two_bytes_a_pixel(image), code)  # type: ignore[return-value]
-    raise ValueError(f"colour is stored as {form}, want {', '.join(slices)}, yuyv or uyvy")
-
-
-def _two_bytes_a_pixel(image: AnyArray) -> Image:
-    return np.ascontiguousarray(image).view(np.uint8).reshape(*image.shape[:2], 2)
 
 
 def shortest_decimal(value: float) -> float:

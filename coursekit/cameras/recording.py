@@ -1,5 +1,5 @@
-"""Recordings as files, one at a time and in sets: the checks before librealsense plays one, the
-only writer of .db3, and the index of a folder with one recording for each scene that was placed.
+"""Recordings as files, one at a time and in sets: the checks before one is played, the only
+writer of .db3, and the index of a folder with one recording for each scene that was placed.
 """
 
 from __future__ import annotations
@@ -30,8 +30,6 @@ STREAMS = {  # by our name: librealsense's kind and format, bytes a pixel, index
     "left": ("infrared", "y8", 1, 1, 2),
     "right": ("infrared", "y8", 1, 2, 3),
 }
-OWN_TOPICS = ("/device_", "/file_version")  # of librealsense, the latter in capitals before 2018
-TOPIC = re.compile(rb"(.{4})topic=", re.DOTALL)
 INDEX, INTRINSICS = "index.json", "intrinsics.json"
 SAME_PLACE_M = 0.0005  # distances closer than this are one place
 
@@ -40,7 +38,7 @@ SAME_PLACE_M = 0.0005  # distances closer than this are one place
 
 
 def check_recording(path: Path) -> None:
-    """CameraError with what to do when `path` is no recording, before librealsense opens it."""
+    """CameraError with what to do when `path` is no recording."""
     if path.suffix not in FILE_STARTS:
         raise CameraError(say("cameras.no_recording", path=path))
     if not path.exists():
@@ -57,78 +55,12 @@ def check_recording(path: Path) -> None:
         raise CameraError(f"{path} is empty: copy it again or record it anew")
     if not start.startswith(FILE_STARTS[path.suffix]):
         raise CameraError(say("cameras.other_file", path=path, suffix=path.suffix))
-    _topics(path)  # which says when it is truncated
-
-
-def is_of_ros(path: Path) -> bool:
-    """Whether a recording is of ROS topics, none of them librealsense's own."""
-    topics = _topics(path)
-    return path.suffix == ".mcap" or (
-        bool(topics) and not any(topic.lower().startswith(OWN_TOPICS) for topic in topics)
-    )
 
 
 def without_depth(path: Path, topics: Sequence[str]) -> CameraError:
     """What is wrong with a recording of ROS topics that hold no depth images."""
     nearest = sorted(topics, key=lambda topic: ("depth" not in topic, "info" in topic, topic))
     return CameraError(say("cameras.without_depth", path=path, shown="".join(nearest[:1])))
-
-
-def _topics(path: Path) -> list[str]:
-    """The topics of a recording; CameraError when it is cut short."""
-    readers = {".db3": _topics_of_db3, ".bag": _topics_of_bag}
-    return readers[path.suffix](path) if path.suffix in readers else []
-
-
-def _truncated(path: Path, there: int, wanted: int) -> CameraError:
-    return CameraError(say("cameras.truncated", path=path, there=there / 1e6, wanted=wanted / 1e6))
-
-
-def _topics_of_db3(path: Path) -> list[str]:
-    """The topics that a rosbag2 file holds; CameraError for fewer bytes than its header says.
-
-    https://www.sqlite.org/fileformat.html, 1.3: the size of a page, the number of pages, and
-    whether the latter is up to date.
-    """
-    with path.open("rb") as file:
-        header = file.read(100).ljust(100, b"\0")
-    there, number = path.stat().st_size, int.from_bytes
-    page = number(header[16:18], "big")
-    wanted = (65536 if page == 1 else page) * number(header[28:32], "big")
-    if there < 100 or (header[24:28] == header[92:96] and there < wanted):
-        raise _truncated(path, there, max(wanted, 100))
-    with _database(path) as file:
-        if file.execute("SELECT 1 FROM sqlite_master WHERE name = 'topics'").fetchone():
-            return [str(name) for (name,) in file.execute("SELECT name FROM topics")]
-    return []
-
-
-def _topics_of_bag(path: Path) -> list[str]:
-    """The topics in the index at the end of a bag; CameraError for a bag that ends before it does,
-    or whose records do not fill it: librealsense would look for the next one for ever.
-
-    http://wiki.ros.org/Bags/Format/2.0: the first record says where the index begins; a bag is a
-    row of headers and data, each after its length; in a header so is each field, name=value.
-    """
-    there = path.stat().st_size
-    with path.open("rb") as file:
-        start = re.search(rb"index_pos=(.{8})", file.read(4096), re.DOTALL)
-        index = int.from_bytes(start.group(1), "little") if start else 0
-        if start and not 0 < index < there:
-            raise _truncated(path, there, max(index, there))
-        at, ends = len(FILE_STARTS[".bag"]), set[int]()
-        while at < there:
-            ends.add(at)
-            file.seek(at)
-            at += 4 + int.from_bytes(file.read(4), "little")
-        file.seek(index)
-        data = file.read() if index else b""
-    if index in ends and at > there:
-        raise _truncated(path, there, at)
-    if index and (index not in ends or at != there):
-        raise CameraError(f"{path} is damaged inside: copy it again or record it anew")
-    ends_of = ((m.end(), int.from_bytes(m.group(1), "little")) for m in re.finditer(TOPIC, data))
-    return [data[end : end + length - 6].decode("utf-8", "replace") for end, length in ends_of]
 
 
 def depth_frame_numbers(path: Path) -> list[int]:

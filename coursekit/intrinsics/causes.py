@@ -67,6 +67,7 @@ FAIR = 3  # of the strongest causes are tested with each view's own noise
 NOTHING_LEFT = 1e-3  # of the p-value: so seldom is a cause missed that is all there is
 MOST, MOST_OF_SHAPE = 0.75, 0.5  # paper is never without a shape, whatever comes on top
 LEAST_GAIN = 0.02  # of the variance of the noise: a lens that gains less is as good
+MOST_MOTION_M = 0.03  # an axis, in the 20 ms of an image: beyond it there are smears, no corners
 STIFF = 0.1  # nor is it stiff: that much of what its shape does changes from view to view
 # At most 2 % of healthy sessions may get a finding. Six kinds of test at this level make 0.2 %; the
 # rest is for noise that is not quite Gaussian and for the checks that are no F-tests.
@@ -77,6 +78,7 @@ LEAST_SHAPE_M = 1e-6
 DENT_SIGMAS, DENT_M = 3.5, 2e-4  # of a corner that stands out from its board
 LEAST_PX = 1e-6  # of noise, where exact corners have none
 REFIT_STEPS, FISHEYE_STEPS = 40, 300
+MIRROR_STEPS, MIRROR_DAMPING = 20, 1e-3
 SMALL_DECREASE = 1e-7  # of the squares: a step that saves less is the last
 LEAST_DAMPING, MOST_DAMPING = 1e-12, 1.0  # of the columns' own squares
 SPOILED_RATIO = 3.0  # a view's rms over the others' median; blurred or far views reach 2
@@ -360,7 +362,8 @@ class Calibration:
         """The strength of smooth fields, each view its own, as a rival of what views have so.
 
         One width for all of them, as for a cause: where a cause is real, a few columns a view say
-        it all and are the likelier; where corners only share errors with their neighbours, all do.
+        it all and are the likelier, clearly; where corners only share errors with their neighbours,
+        all do.
         """
         fields = self._by_view(self._fields)
         return (
@@ -392,7 +395,9 @@ class Calibration:
         return replace(test, log_p=fair.explains(hypothesis).log_p)
 
     def matters(self, test: engine.Tested) -> bool:
-        """Whether a view stands out from the others; the rest is for the findings to say."""
+        """Whether a view stands out, or a motion can be; the rest is for the findings to say."""
+        if test.cause == SHUTTER:
+            return test.size < MOST_MOTION_M
         if test.cause != SPOILED_VIEW:
             return True
         rms = self._rms_by_view()
@@ -489,9 +494,8 @@ def as_fisheye(model: Calibration) -> tuple[Calibration, float]:
         {**model.values, LENS: np.zeros(10)},
     )
     rival = replace(model, camera=camera, estimated=estimated, values=values, fisheye=True)
-    rival = refit(rival, FISHEYE_STEPS)
-    left = [np.bincount(m.index, (m.linear.residuals**2).sum(axis=1)) for m in (model, rival)]
-    mine, theirs = np.log(np.array(left) + LEAST_PX**2)
+    rival = refit(turned_over(refit(rival, FISHEYE_STEPS)))
+    mine, theirs = (np.log(_squares_by_view(m) + LEAST_PX**2) for m in (model, rival))
     return rival, float(ttest_1samp(mine - theirs, 0.0, alternative="greater").pvalue)
 
 
@@ -528,7 +532,8 @@ def named(found: engine.CauseSearch[Calibration]) -> list[engine.Accepted[Calibr
     large = [s for s in others if taken([s]) > crumbs and s.test.cause != FLEX]
     for step in large:
         if step.test.cause in OWN:
-            good += [step] * (step.test.strength > step.before.smooth_strength)
+            clear = step.test.strength > step.before.smooth_strength + engine.RIVAL_GAIN
+            good += [step] * clear
         elif closed or step.after.smooth[0] < (1 - MOST) * step.before.smooth[0]:
             good += [step]
     kept = _sound(found, good)
@@ -671,6 +676,52 @@ def refit(model: Calibration, steps: int = REFIT_STEPS) -> Calibration:
         if small:
             break
     return model
+
+
+def turned_over(model: Calibration) -> Calibration:
+    """The model with each board mirrored in its tilt where that fits its view better.
+
+    A plane and its mirror image look nearly alike, and a solver that went through a wrong lens
+    keeps the wrong one of them: that view then passes for whatever bends a view of its own. Each
+    mirror image is fitted to its view with the camera as it is (Levenberg-Marquardt).
+    """
+    centre = model.board.mean(axis=0)
+    middle = model.poses[:, :3, :3] @ centre + model.poses[:, :3, 3]
+    sight = middle / np.linalg.norm(middle, axis=1, keepdims=True)
+    mirror = np.eye(3) - 2 * sight[:, :, None] * sight[:, None, :]
+    poses = model.poses.copy()
+    poses[:, :3, :3] = mirror @ poses[:, :3, :3] * [1.0, 1.0, -1.0]
+    poses[:, :3, 3] = middle - poses[:, :3, :3] @ centre
+    trial, damping = replace(model, poses=poses), np.full(len(model.views), MIRROR_DAMPING)
+    squares = _squares_by_view(trial)
+    for _ in range(MIRROR_STEPS):
+        own, poses = trial.linear.own[..., :6], trial.poses.copy()
+        normal, gradient = np.zeros((len(damping), 6, 6)), np.zeros((len(damping), 6))
+        np.add.at(normal, trial.index, np.swapaxes(own, 1, 2) @ own)
+        np.add.at(gradient, trial.index, np.einsum("nij,ni->nj", own, trial.linear.residuals))
+        diagonal = np.einsum("njj->nj", normal)
+        damped = normal + (damping[:, None] * diagonal)[..., None] * np.eye(6)
+        step = np.linalg.solve(damped, gradient[..., None])[..., 0]
+        poses[trial.views] = moved(poses[trial.views], step)
+        now = _squares_by_view(replace(trial, poses=poses))
+        less = now < squares
+        poses[trial.views[~less]] = trial.poses[trial.views[~less]]
+        trial, squares = replace(trial, poses=poses), np.where(less, now, squares)
+        damping = np.where(less, damping / 10.0, damping * 10.0)
+    better = model.views[squares < (1.0 - SMALL_DECREASE) * _squares_by_view(model)]
+    poses = model.poses.copy()
+    poses[better] = trial.poses[better]
+    return replace(model, poses=poses)
+
+
+def _squares_by_view(model: Calibration) -> Floats:
+    """Squared residuals (views,), infinite where a corner would be behind the camera."""
+    R, t = model.poses[model.corners.view, :3, :3], model.poses[model.corners.view, :3, 3]
+    behind = np.einsum("nj,nj->n", R[:, 2], model.corners.points) + t[:, 2] <= 0
+    with np.errstate(all="ignore"):
+        squares = np.bincount(model.index, (model.linear.residuals**2).sum(axis=1))
+    squares[model.index[behind]] = np.inf
+    return np.nan_to_num(squares, nan=np.inf, posinf=np.inf)
 
 
 def _squares(model: Calibration) -> float:

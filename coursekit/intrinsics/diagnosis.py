@@ -113,7 +113,7 @@ def diagnose(
     if flat:
         unseen.append(_TEXTS.not_tested["residuals"])
     else:
-        start = causes.refit(Calibration.of(result))
+        start = causes.refit(causes.turned_over(Calibration.of(result)))
         if lens := _wrong_lens(start):  # passes for everything else
             return Findings([*found, lens], _TEXTS.looked_for, [_TEXTS.not_tested["lens_first"]])
         found += _residuals(start, result, unseen)

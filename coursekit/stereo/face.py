@@ -282,9 +282,8 @@ def _frame_planes(patch: _Patch) -> Floats:
     inner = _inner(patch.z.shape[1:], patch.rows, patch.columns)
     off = patch.z - 1 / windows.plane_image(patch.plane, inner.shape)
     use = inner & (np.abs(off) < 2 * patch.tolerance)
-    enough = use.sum(axis=(1, 2)) >= 12
-    frames = zip(np.where(use, patch.z, np.nan), enough, strict=True)
-    return np.array([windows.fit_plane(frame) if fits else patch.plane for frame, fits in frames])
+    enough = use.sum(axis=(1, 2))[:, None] >= 12
+    return np.where(enough, windows.fit_plane(np.where(use, patch.z, np.nan)), patch.plane)
 
 
 def _edges(patch: _Patch) -> Floats:

@@ -64,9 +64,9 @@ class LawFit(Estimate):
     @property
     def consistent(self) -> bool:
         """Whether the stated errors explain how large the residuals are."""
-        from scipy.stats import chi2
+        from scipy.special import chdtrc
 
-        return self.dof < 1 or bool(chi2.sf(self.chi2, self.dof) > WIDENED_BELOW)
+        return self.dof < 1 or bool(chdtrc(self.dof, self.chi2) > WIDENED_BELOW)
 
     def quantile(self, level: float = 0.95) -> float:
         """How many sigmas an interval of probability `level` reaches to either side.
@@ -75,11 +75,10 @@ class LawFit(Estimate):
         on repeats; else Student's t, and more by the factor by which the residuals are larger than
         their errors.
         """
-        from scipy.stats import norm, t
+        from scipy.special import stdtrit
 
         if self.consistent:
-            of_errors = norm if math.isinf(self.scatter_dof) else t(self.scatter_dof)
-            return float(of_errors.ppf((1 + level) / 2))
+            return float(stdtrit(self.scatter_dof, (1 + level) / 2))
         return super().quantile(level) * math.sqrt(self.chi2 / self.dof)
 
     def _half_band(self, slopes: list[Floats]) -> Floats:

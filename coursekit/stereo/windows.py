@@ -127,9 +127,9 @@ class WindowStats:
     @property
     def pixel_std_interval_m(self) -> Interval:
         """95 % interval of `pixel_std_m`: dof s^2 / sigma^2 is chi-squared with pixel_dof."""
-        from scipy.stats import chi2
+        from scipy.special import chdtri
 
-        ends = chi2.ppf([0.975, 0.025], self.pixel_dof) / self.pixel_dof
+        ends = chdtri(self.pixel_dof, [0.025, 0.975]) / self.pixel_dof
         low, high = self.pixel_std_m / np.sqrt(ends)
         return float(low), float(high)
 
@@ -174,7 +174,7 @@ def window_stats(depth: Any, window: Window, depth_scale_m: float | None = None)
         invalid_fraction=1 - float(valid.mean()),
         n_mismatches=mismatches,
         frozen_fraction=float(frozen),
-        depth_m=level,
+        depth_m=float(level),
         depth_error_m=math.hypot(
             0.0 if n == 1 else mean_std / math.sqrt(effective_frames(drift[:, None])[0]),
             _patch_error(residual),
@@ -195,7 +195,8 @@ def window_stats(depth: Any, window: Window, depth_scale_m: float | None = None)
 def without_mismatches(z: Floats, step: float | None) -> tuple[Floats, int]:
     """The stack (N, h, w) with NaN for mismatches, and their number.
 
-    A mismatch is far from its pixel's median, or this median is far off the window's plane.
+    A mismatch is far from its pixel's median, by the noise of the window and by that of the pixel,
+    for some places are noisier than others; or this median is far off the window's plane.
 
     >>> z = np.full((5, 3, 3), 0.45)
     >>> z[2, 1, 1] = 0.52
@@ -203,10 +204,12 @@ def without_mismatches(z: Floats, step: float | None) -> tuple[Floats, int]:
     1
     """
     middle = valid_median(z)
-    jumps = _far(z - middle, step)
+    off = np.abs(z - middle)
+    jumps = _far(off, step)
+    at = jumps.any(axis=0) & (np.isfinite(z).sum(axis=0) >= 8)  # fewer say nothing of a pixel
+    jumps[:, at] &= off[:, at] > JUMP_SIGMAS * 1.4826 * valid_median(off[:, at])
     for _ in range(2):  # the second plane is free of what the first one throws out
-        off, _level = about_plane(middle)
-        middle = np.where(_far(off, step), np.nan, middle)
+        middle = np.where(_far(about_plane(middle)[0], step), np.nan, middle)
     jumps |= np.isfinite(z) & np.isnan(middle)
     return np.where(jumps, np.nan, z), int(jumps.sum())
 
@@ -282,7 +285,8 @@ def _far(off: Floats, step: float | None) -> Bools:
     typical = size[np.isfinite(size)]
     if typical.size == 0:
         return np.zeros(off.shape, bool)
-    scale = max(1.4826 * np.median(typical), np.percentile(typical, 90) / 1.645, step or 0.0)
+    middle, most = np.percentile(typical, [50, 90])
+    scale = max(1.4826 * middle, most / 1.645, step or 0.0)
     return size > max(JUMP_SIGMAS * scale, 1e-9)
 
 
@@ -301,11 +305,13 @@ def _temporal(deviation: Floats) -> tuple[float, float, Floats]:
     if complete.shape[1] < 2 or not complete.any():
         return math.sqrt(float(np.nansum(deviation**2)) / (known.sum() - pixels)), n - 1.0, drift
     own = complete - complete.mean(axis=1, keepdims=True)
+    gram = own @ own.T
     # The mean of frames that correlate follows them: it costs tau squares a pixel, not one.
-    tau = _correlation_time(own) if n > 4 else 1.0
+    tau = _correlation_time(gram) if n > 4 else 1.0
     variance = float(np.nansum(deviation**2)) / (known.sum() - pixels * min(tau, n / 2))
     common = min(float(drift @ drift) / (n - 1), variance)
-    shares = (variance - common) ** 2 / _pixel_dof(own) + common**2 / series_std(drift)[1]
+    of_noise = (variance - common) ** 2 / _pixel_dof(gram, own.shape[1])
+    shares = of_noise + common**2 / series_std(drift)[1]
     return math.sqrt(variance), variance**2 / shares, drift
 
 
@@ -320,12 +326,13 @@ def _patch_error(residual: Floats) -> float:
 # --- how many samples are independent ---
 
 
-def _pixel_dof(deviation: Floats) -> float:
-    """The number of independent squares in noise (N, P) that correlates in space and time."""
-    n, pixels = deviation.shape
-    frames = max((n - 1) / _squared_correlation(deviation), 1.0)
-    gram = deviation @ deviation.T  # tr S and tr S^2 of the pixels' covariance S, without forming S
-    trace, square = np.trace(gram), np.square(gram).sum()
+def _pixel_dof(gram: Floats, pixels: int) -> float:
+    """The number of independent squares in noise that correlates in space and time.
+
+    gram (N, N): of the frames of P pixels, as for `_autocorrelation`.
+    """
+    frames = max((len(gram) - 1) / _squared_correlation(gram, pixels), 1.0)
+    trace, square = np.trace(gram), np.square(gram).sum()  # tr S, tr S^2 of the pixels' covariance
     if trace == 0 or frames < 2:
         return frames
     # E tr S^2 = tr C^2 (1 + 1/m) + (tr C)^2 / m for m independent frames (Srivastava, 2005)
@@ -338,42 +345,44 @@ def series_std(series: Floats) -> tuple[float, float]:
     n = len(series)
     if n < 2 or not np.isfinite(series).all():
         return math.nan, 0.0
-    return float(series.std(ddof=1)), max((n - 1) / _squared_correlation(series[:, None]), 1.0)
+    squares = max((n - 1) / _squared_correlation(np.outer(series, series)), 1.0)
+    return float(series.std(ddof=1)), squares
 
 
-def _squared_correlation(series: Floats) -> float:
-    """1 + 2 sum of rho^2 of series (N, P), up to the first lag with nothing significant left.
+def _squared_correlation(gram: Floats, pixels: int = 1) -> float:
+    """1 + 2 sum of rho^2 of P pixels, up to the first lag with nothing significant left.
 
     For the variance of a variance it is the squares of autocorrelations that count. P pixels in
     patches of CORRELATION_PX tell more than one series.
     """
-    n, pixels = series.shape
-    rho = _autocorrelation(series, max(1, n // 3))
+    n = len(gram)
+    rho = _autocorrelation(gram, max(1, n // 3))
     noise = 1 / math.sqrt(n * max(1.0, pixels / CORRELATION_PX**2))
     over = np.flatnonzero(rho < 2 * noise)
     return 1 + 2 * float(np.square(rho[: over[0] if over.size else None]).sum())
 
 
-def _autocorrelation(series: Floats, lags: int) -> Floats:
-    """Autocorrelation (lags,) at lag 1, 2, ... of series (N, P) of known mean, pooled over P."""
-    n, pixels = series.shape
-    power = float(np.square(series).sum()) / n
+def _autocorrelation(gram: Floats, lags: int) -> Floats:
+    """Autocorrelation (lags,) at lag 1, 2, ... of frames of known mean, pooled over pixels.
+
+    gram (N, N): the frames (N, P) times their transpose.
+    """
+    n = len(gram)
+    power = np.trace(gram) / n
     if power == 0 or n < 3:
         return np.zeros(lags)
-    flat = np.ascontiguousarray(series).ravel()
-    pairs = ((flat[: -k * pixels], flat[k * pixels :], n - k) for k in range(1, lags + 1))
-    return np.array([np.einsum("i,i->", a, b) / count for a, b, count in pairs]) / power
+    return np.array([np.trace(gram, k) / (n - k) for k in range(1, lags + 1)]) / power
 
 
-def _correlation_time(own: Floats) -> float:
-    """1 + 2 sum of rho, at least 1, of series (N, P) free of the drift that all pixels share.
+def _correlation_time(gram: Floats) -> float:
+    """1 + 2 sum of rho, at least 1, of frames free of the drift that all pixels share.
 
     Summed up to the lag 2.5 tau (Sokal, 1997): many pixels pin it down, a slow drift would not be
     seen. The mean was taken from the same frames, which lowers every autocovariance by
     var / N_eff; that is put back.
     """
-    n = len(own)
-    raw = _autocorrelation(own, max(1, n // 2))
+    n = len(gram)
+    raw = _autocorrelation(gram, max(1, n // 2))
     tau = 1.0
     for _ in range(20):
         share = min(tau / n, 0.5)
@@ -490,7 +499,8 @@ def averaging_curve(series_m: ArrayLike) -> AveragingCurve:
     floor = None
     if values.ndim == 3:
         own = deviation - deviation.mean(axis=1, keepdims=True)  # without the drift all share
-        noise = np.square(own).sum() / own.shape[1] / (n - 1) / (n / _correlation_time(own))
+        each = np.square(own).sum() / own.shape[1] / (n - 1)
+        noise = each / (n / _correlation_time(own @ own.T))
         floor = math.sqrt(max(off_plane(values.mean(axis=0)[None]) ** 2 - noise, 0.0))
     return AveragingCurve(n, effective, interval, math.sqrt(effective), floor)
 
@@ -504,12 +514,17 @@ def valid_mean(values: Floats, axis: int) -> Floats:
     >>> valid_mean(np.array([[0.45, np.nan], [0.47, np.nan]]), axis=0)
     array([0.46,  nan])
     """
-    return np.asarray(np.ma.masked_invalid(values).mean(axis=axis).filled(np.nan))
+    known = np.isfinite(values)
+    count = known.sum(axis=axis)
+    total = np.where(known, values, 0.0).sum(axis=axis)
+    return np.asarray(total / np.where(count > 0, count, np.nan))
 
 
 def valid_median(stack: Floats) -> Floats:
     """The median over frames (N, ...) without NaN, NaN where there is nothing else."""
-    return np.asarray(np.ma.median(np.ma.masked_invalid(stack), axis=0).filled(np.nan))
+    count = np.isfinite(stack).sum(axis=0)
+    middle = np.stack([(count - 1) // 2, count // 2])  # of the sorted ones: NaN comes last
+    return np.asarray(np.take_along_axis(np.sort(stack, axis=0), middle, axis=0).mean(axis=0))
 
 
 def off_plane(images: Floats) -> float:
@@ -519,31 +534,36 @@ def off_plane(images: Floats) -> float:
     >>> print(f"{off_plane(image[None]):.4f} m")
     0.0028 m
     """
-    off = np.array([about_plane(image)[0] for image in images])
+    off = about_plane(images)[0]
     return math.sqrt(np.nanmean(np.square(off))) if np.isfinite(off).any() else math.nan
 
 
-def about_plane(image: Floats) -> tuple[Floats, float]:
-    """What an image (h, w) of depths is off its plane, and the plane's depth at the centre."""
-    plane = fit_plane(image)
-    return image - 1 / plane_image(plane, image.shape), float(1 / plane[0])
+def about_plane(images: Floats) -> tuple[Floats, Floats]:
+    """What images (..., h, w) of depths are off their planes; the planes' depths at the centre."""
+    planes = fit_plane(images)
+    return images - 1 / plane_image(planes, images.shape[-2:]), 1 / planes[..., 0]
 
 
-def fit_plane(image: Floats) -> Floats:
-    """A plane in space through an image (h, w) of depths: 1/Z = plane (3,) . (1, u - u0, v - v0).
+def fit_plane(images: Floats) -> Floats:
+    """A plane in space through each image (..., h, w) of depths: (..., 3).
 
-    Linear in 1/Z, and u0, v0 the middle. NaN is invalid; fewer than three valid pixels leave NaN.
+    1/Z = plane . (1, u - u0, v - v0), linear in 1/Z, and u0, v0 the middle. NaN is invalid; fewer
+    than three valid pixels leave NaN. The normal equations of all images are solved at once: about
+    the middle they are well conditioned, and of pixels in one line the shortest solution is taken.
     """
-    known = np.isfinite(image)
-    if known.sum() < 3:
-        return np.full(3, np.nan)
-    design = _plane_design(image.shape)[known]
-    return np.asarray(np.linalg.lstsq(design, 1 / image[known], rcond=None)[0])
+    design = _plane_design(images.shape[-2:]).reshape(-1, 3)
+    inverse = 1 / images.reshape(*images.shape[:-2], -1)
+    known = np.isfinite(inverse).astype(float)
+    products = (design[:, :, None] * design[:, None, :]).reshape(-1, 9)
+    squares = (known @ products).reshape(*known.shape[:-1], 3, 3)
+    right = np.where(known, inverse, 0.0) @ design
+    planes = np.linalg.pinv(squares, rcond=1e-12, hermitian=True) @ right[..., None]
+    return np.where(known.sum(axis=-1, keepdims=True) < 3, np.nan, planes[..., 0])
 
 
-def plane_image(plane: Floats, shape: tuple[int, ...]) -> Floats:
-    """1/Z of a plane at the pixels of a patch (h, w)."""
-    return np.asarray(_plane_design(shape) @ plane)
+def plane_image(planes: Floats, shape: tuple[int, ...]) -> Floats:
+    """1/Z of planes (..., 3) at the pixels of a patch: (..., h, w)."""
+    return np.einsum("...i,hwi->...hw", planes, _plane_design(shape))
 
 
 def _plane_design(shape: tuple[int, ...]) -> Floats:

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 import jinja2
 import numpy as np
-import scipy.stats  # noqa: F401 - `stereo` would load it while it grades the first bundle
+import scipy.optimize  # noqa: F401 - `stereo` would load it while it grades the first bundle
 from markupsafe import Markup
 
 from coursekit.arrays import Interval

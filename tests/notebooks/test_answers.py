@@ -1,8 +1,9 @@
 """Blank, right and wrong answers to every exercise of the notebooks get the verdict they should.
 
 And a notebook runs for somebody who leaves out every section marked deeper or studio.
-COURSEKIT_NIGHTLY=1 judges all wrong answers in place of one for each verdict of an exercise, and
-runs the notebooks with all answers in them, the core alone and whole.
+All right answers, in each style, are judged by day; of the wrong ones one for each verdict of an
+exercise. COURSEKIT_NIGHTLY=1 judges all, and runs the notebooks with all answers in them, the core
+alone and whole.
 """
 
 import nbformat
@@ -33,8 +34,10 @@ def parts_of(path):
 
 SOURCES = {name: parts for path in PATHS for name, parts in parts_of(path).items()}
 ANSWERS = [(name, answer) for name in EXERCISES for answer in attempts(name)]
-if not NIGHTLY:  # the last of each: those that stand as text were written without a look at ours
-    ANSWERS = {(name, answer.verdict): (name, answer) for name, answer in ANSWERS}.values()
+if not NIGHTLY:  # of wrong ones the last: those that are text were written without ours in view
+    ANSWERS = {
+        (name, a.name if a.verdict[0] == "right" else a.verdict): (name, a) for name, a in ANSWERS
+    }.values()
 WRONG = [pytest.param(name, answer, id=f"{name}, {answer.name}") for name, answer in ANSWERS]
 
 

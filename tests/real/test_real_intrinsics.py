@@ -204,8 +204,3 @@ def test_the_published_k_is_one_of_the_flat_board_and_inside_its_interval(sessio
         assert abs(fit.value(name) - factory) < 2 * fit.sigma(name)
         assert abs(shaped.value(name) - factory) < 5
     assert shaped.sigma("fx") < 0.5 * fit.sigma("fx")
-
-
-def test_diagnose_says_that_four_views_are_few(charuco_views):
-    found = intrinsics.diagnose(charuco_views, CHARUCO)
-    assert {"few_views", "no_edge_corners"} <= set(found.names)

@@ -1,17 +1,10 @@
 """Wrong answers to `sensitivities` of notebook 05."""
 
-import numpy as np
-
 from wrong_answers import wrong
 
 
 def one_line(u, Z, fx, cx, depth_error):
     return Z / fx, (u - cx) / fx, (u - cx) / fx * depth_error
-
-
-def with_the_slope(u, Z, fx, cx, depth_error):
-    slope = (u - cx) / fx
-    return np.array([Z / fx, slope, slope * depth_error])
 
 
 @wrong("reciprocal")
