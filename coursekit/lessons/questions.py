@@ -257,7 +257,6 @@ def panel(checkpoint: Checkpoint, say: Callable[[str], None]) -> Any:
 
     field = checkpoint.input_widget()
     button = ipywidgets.Button(description="Commit", tooltip="Commit this answer")
-
     judged, waiting = "", False  # Enter is told before the number that it commits
 
     def commit(*_: Any) -> None:
@@ -275,9 +274,13 @@ def panel(checkpoint: Checkpoint, say: Callable[[str], None]) -> Any:
             if not waiting:  # it came when the field was left
                 commit()
 
+    def changed(_: Any) -> None:
+        if waiting:
+            commit()
+
     button.on_click(commit)
     field.on_msg(entered)
-    field.observe(lambda _: waiting and commit(), "value")
+    field.observe(changed, "value")
     return words.stacked(field, button)
 
 
