@@ -313,7 +313,7 @@ def _cameras(which: str) -> Iterator[CheckUp]:
     named = os.environ.get(VARIABLE, "auto") if which == "auto" else which
     if named != which:
         yield found("variable", variable=VARIABLE, named=named)
-    if named == "simulated" or Path(named).is_dir():  # a set opens its files, and says so
+    if not (named == "auto" or named.isdecimal()):  # the simulated one or a recording
         yield from _tested(named)
         return
     try:
@@ -326,8 +326,7 @@ def _cameras(which: str) -> Iterator[CheckUp]:
             yield from _stand_in()
         return
     yield found("driver", check="Driver", version=getattr(rs, "__version__", ""))
-    live = named == "auto" or named.isdecimal()
-    yield from _live(rs, named) if live else _tested(named)
+    yield from _live(rs, named)
 
 
 def _live(rs: Any, named: str) -> Iterator[CheckUp]:

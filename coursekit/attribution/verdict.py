@@ -26,7 +26,7 @@ from coursekit.attribution.significance import MeanTest, PlaceTest, PoseTest
 from coursekit.budget.view import GRIPPER_DOWN
 from coursekit.checks import want
 from coursekit.geometry import make_transform
-from coursekit.words import wrapped
+from coursekit.words import ROOM_TEXTS, say, wrapped
 
 Blame = Literal["calibration", "perception", "pose_dependent", "cannot_tell_yet"]
 
@@ -50,22 +50,8 @@ FAR_APART_M = 0.1
 # and those after him). Otherwise the mean must stand out among the means of the places too.
 POOLING_LEVEL = 0.25
 DOUBT_LEVEL = 0.05  # of the mean, below which "perception" is not said
-REMEDY: dict[Blame, str] = {
-    "calibration": "repeat the hand-eye calibration, which also takes up what the arm is wrong by "
-    "everywhere, or measure the constant and subtract it; more frames will not help",
-    "perception": "look at the detector, the depth and its averaging; a new calibration will not "
-    "help",
-    "pose_dependent": "let the calibration estimate the arm's joint zeros, or calibrate where you "
-    "grasp; a camera that is turned (fixed camera) or a shifted finger or wrist camera looks like "
-    "this too, and the shares of the scatter say which is likelier",
-    "cannot_tell_yet": "repeat the grasp, at places and turns all over the table",
-}
+REMEDY: dict[Blame, str] = ROOM_TEXTS["attribution"]["remedy"]
 ELSEWHERE = "grasp in other places, all over the table"
-BY_PLACE = (
-    "calibrate where you grasp, or subtract what each place misses by. No turn, scale or shift is "
-    "seen to explain it: look at the arm's gears and load, the table, and the depth and the lens "
-    "in that part of the image"
-)
 
 
 # --- what may be at work ---
@@ -227,12 +213,10 @@ def _pose_dependent(seen: MissEvidence) -> Decision:
     says, remedy = "the miss changes with the pose of the gripper", REMEDY["pose_dependent"]
     places = seen.places
     if places is not None and places.p_value < TEST_LEVEL:
-        says = (
-            f"the miss changes by {1e3 * places.part_m:.1f} mm from place to place, repeats in one "
-            f"place scatter by {1e3 * places.scatter_m:.1f} mm"
-        )
+        part, scatter = 1e3 * places.part_m, 1e3 * places.scatter_m
+        says = say("attribution.places_differ", part=part, scatter=scatter)
         if places.p_follows is None or places.p_follows >= TEST_LEVEL:
-            remedy = BY_PLACE
+            remedy = say("attribution.by_place")
     return Decision("pose_dependent", says, 0, remedy)
 
 
@@ -334,9 +318,7 @@ class Attribution:
                 f"{1e3 * pose.part_m:.1f} mm rms{alone}"
             )
         else:
-            lines.append(
-                "not tested against the pose: an arm error that follows it is not ruled out"
-            )
+            lines.append(say("attribution.no_poses"))
         if place is not None:
             both = f"; with the line above {_p(seen.p_pose)}" if pose is not None else ""
             lines.append(

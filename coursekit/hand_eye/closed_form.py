@@ -34,6 +34,7 @@ from coursekit.hand_eye.poses import (
     nearest_rotation,
     stand_board,
 )
+from coursekit.words import say
 
 HAND_EYE = ("tsai", "park", "horaud", "andreff", "daniilidis")  # OpenCV's, of A X = X B
 ROBOT_WORLD = ("shah", "li")  # OpenCV's, of X and Y together
@@ -136,15 +137,8 @@ def rotation_from_shifts(
 
 def _too_few_axes(a: Floats, spread: Floats) -> str:
     if spread[0] < LEAST_TURN_RAD:
-        return (
-            "T_base_gripper: the poses do not turn against each other (R_A = 1), so t_X drops out "
-            "of (R_A - 1) t_X = R_X t_B - t_A: translation is free in all directions"
-        )
-    axis = axis_text(np.linalg.svd(a)[2][0])
-    return (
-        f"T_base_gripper: all poses turn about one axis, {axis} in the frame that carries the "
-        "camera: rotation about it and translation along it are free; turn about a second axis"
-    )
+        return say("hand_eye.no_turns")
+    return say("hand_eye.one_axis", axis=axis_text(np.linalg.svd(a)[2][0]))
 
 
 # --- the solvers ---
@@ -172,10 +166,7 @@ def closed_form(
                 method=getattr(cv2, f"CALIB_HAND_EYE_{method.upper()}"),
             )
         if np.array_equal(R, np.eye(3)):
-            raise SolverFailed(
-                f"{method}: OpenCV returned the identity, which is what it does when it finds no "
-                "pair of poses with enough rotation between them; turn the wrist more"
-            )
+            raise SolverFailed(say("hand_eye.identity", method=method))
         X = _rigid(method, R, t)
     else:  # OpenCV's world is the board, its base the stand and its gripper the carrier
         with _opencv(method):

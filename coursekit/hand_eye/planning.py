@@ -21,7 +21,7 @@ from coursekit.hand_eye.poses import IN_METRES, SCATTER, by_X_and_Y, camera_boar
 from coursekit.hand_eye.refinement import arm_poses_with
 from coursekit.hand_eye.session import HandEyeResult, HandEyeSession
 from coursekit.hand_eye.views import PixelViews, board_gap, rms_length, view_residuals
-from coursekit.words import wrapped
+from coursekit.words import say, wrapped
 
 CORNER_PX = 0.1  # corner noise where no images have told
 VIEW_ROOM_PX = 10.0  # that a proposed view leaves between the board and the image's border
@@ -68,11 +68,9 @@ class HeldOut:
     def __repr__(self) -> str:
         pixels = "" if self.residuals is None else f"{self.rms_px:.2f} px, "
         across, along = (1e3 * rms_length(part[:, None]) for part in (self.across_m, self.along_m))
-        return wrapped(
-            f"{len(self.gap_m)} poses held out: {pixels}{self.rms_mm:.2f} mm at the board "
-            f"({across:.2f} across the line of sight, {along:.2f} along it), "
-            f"worst {1e3 * self.gap_m.max():.2f} mm"
-        )
+        facts = {"across": across, "along": along, "worst": 1e3 * self.gap_m.max()}
+        held = say("hand_eye.held_out", n=len(self.gap_m), pixels=pixels, mm=self.rms_mm, **facts)
+        return wrapped(held)
 
 
 def held_out(
@@ -135,11 +133,8 @@ class NextPose:
         if self.q is not None:
             angles = ", ".join(f"{angle:.1f}" for angle in np.degrees(self.q) + 0.0)
             joints = f",\n  joints ({angles}) deg"
-        return (
-            f"next: gripper at {place}{joints}\n"
-            f"X in its worst direction: {self.now_mm:.2f} mm now, "
-            f"{self.then_mm[self.index]:.2f} mm with it ({usable} candidates)"
-        )
+        then = {"now": self.now_mm, "then": self.then_mm[self.index], "usable": usable}
+        return say("hand_eye.next", place=place, joints=joints, **then)
 
 
 def next_pose(

@@ -58,15 +58,11 @@ from coursekit.hand_eye.poses import (
     stand_board,
 )
 from coursekit.results import write_bytes
-from coursekit.words import Estimate, wrapped
+from coursekit.words import Estimate, say, wrapped
 
 SENTENCES = DiagnosisTexts.of("hand_eye")
 METHODS = ("refine", *CLOSED_FORMS)
 POSES = "poses.csv"
-OF_SIZE = (
-    "one of these images, {} x {} px: calibrate at their resolution, or scale K: fx and fy times "
-    "the ratio of the widths, cx + 0.5 and cy + 0.5 likewise"
-)
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 OPTIONAL = {"times": ("time",), "q": JOINTS, "dq": VELOCITIES}
 REPEATS = "repeats"  # how the reason begins for which a pair is left out by `once`
@@ -293,20 +289,14 @@ class HandEyeSession:
             skipped += some.skipped
         used = [file for file in rows if file in found]
         if len(used) < FEWEST_POSES:
-            raise ValueError(
-                f"folder: {len(used)} usable pairs of arm pose and image in "
-                f"{os.fspath(folder)!r}, want at least {FEWEST_POSES}"
-                + "".join(f"; {skip!r}" for skip in skipped[:3])
-            )
+            facts = {"used": len(used), "folder": os.fspath(folder), "fewest": FEWEST_POSES}
+            reasons = "".join(f"; {skip!r}" for skip in skipped[:3])
+            raise ValueError(say("hand_eye.few_pairs", **facts) + reasons)
         T, columns = _stacked(rows[file] for file in used)
         views_ = Detections(found[file] for file in used)
         size, wanted = views_.size, (intrinsics.width, intrinsics.height)
-        want(
-            size == wanted,
-            "intrinsics",
-            "a lens of {} x {} px".format(*wanted),
-            OF_SIZE.format(*size),
-        )
+        lens = "a lens of {} x {} px".format(*wanted)
+        want(size == wanted, "intrinsics", lens, say("hand_eye.of_these_images", size=size))
         names, unused = tuple(used), tuple(skipped)
         return cls(mount, T, views_, board, intrinsics, names=names, skipped=unused, **columns)
 
@@ -394,9 +384,7 @@ def _table(
     files = sorted((p for p in folder.rglob("*") if p.is_file()), key=natural)
     if in_order:
         images = [file for file in files if file.suffix.lower() in IMAGES]
-        pair = (
-            f"{len(read)}, one a row (with in_order they go together): keep the row of each image"
-        )
+        pair = say("hand_eye.one_a_row", rows=len(read))
         want(len(images) == len(read) and "file" not in columns, "images", len(images), pair)
         named = zip(read, images, strict=True)
         read = [replace(row, file=file.relative_to(folder).as_posix()) for row, file in named]
@@ -434,18 +422,12 @@ def _image(folder: Path, files: Sequence[Path], file: str) -> tuple[str, str]:
 
 def _check_columns(columns: set[str]) -> None:
     if "file" not in columns:
-        raise ValueError(
-            f"folder: {POSES} has no column 'file'; its columns are {sorted(columns)}. Name the "
-            "images, or say in_order=True where row and image go together in the order of names"
-        )
+        raise ValueError(say("hand_eye.no_file_column", table=POSES, columns=sorted(columns)))
     turn = THREE if columns.issuperset(THREE) else TURN
     missing = [name for name in (*PLACE, *turn) if name not in columns]
     if missing and not columns.issuperset(JOINTS):
-        raise ValueError(
-            f"folder: {POSES} has no column {missing[0]!r}, and not all of {', '.join(JOINTS)} "
-            "either: want a pose (x, y, z with a quaternion or rx, ry, rz), or joint angles of the "
-            "WidowX AI (rad); those of another arm tell nothing here, its poses do"
-        )
+        facts = {"table": POSES, "missing": missing[0], "joints": ", ".join(JOINTS)}
+        raise ValueError(say("hand_eye.no_pose_column", **facts))
 
 
 def _read_row(row: PoseRow, columns: set[str]) -> dict[str, Any]:
@@ -832,11 +814,8 @@ class HandEyeResult(Estimate):
             lines.append(self.session.repeated)
         if self.free:
             lines.append(wrapped(f"NOT DETERMINED: {'; '.join(self.free)}", indent=""))
-        lines.append(f"residuals: {pixels}{self.rms_mm:.2f} mm at the board (rms)")
-        lines.append(
-            f"spread: {self.spread_board_mm:.2f} mm of the board in the {name_Y.split('_')[1]}, "
-            f"{self.spread_gripper_mm:.2f} mm and {self.spread_gripper_deg:.3f} deg of the gripper"
-        )
+        stand = name_Y.split("_")[1]
+        lines.append(say("hand_eye.left_over", result=self, pixels=pixels, stand=stand))
         return "\n".join(lines)
 
     def _pose_line(self, name: str, T: Floats, first: int) -> str:

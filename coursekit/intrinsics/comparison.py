@@ -29,7 +29,7 @@ from coursekit.intrinsics.fit import (
     projection_columns,
     worst_direction,
 )
-from coursekit.words import p_text
+from coursekit.words import p_text, say
 
 _GAUSS_NEWTON_STEPS = 20
 
@@ -66,15 +66,12 @@ class HalvesDifference:
     def __repr__(self) -> str:
         length, wide = self.length_px, self.expected_px
         alone = "explains" if self.noise_p_value > 0.01 else "does not explain"
-        return (
-            f"two halves ({len(self.first.residuals)} and {len(self.second.residuals)} views) "
-            f"differ by {np.nanmedian(length):.2f} px in the median\nof the image and "
-            f"{np.nanmax(length):.2f} px at worst, at {self.range_m:.2f} m; by the scatter of "
-            f"the views:\nsigma {np.nanmedian(wide):.2f} and {np.nanmax(wide):.2f} px "
-            f"({p_text(self.p_value)}); corner noise alone {alone} it "
-            f"({p_text(self.noise_p_value)})"
-            + "".join(f"\n{line}" for line in folded_text(float(np.isnan(length).mean())))
-        )  # fmt: skip
+        px, sigma = ({"median": np.nanmedian(m), "worst": np.nanmax(m)} for m in (length, wide))
+        views = [len(half.residuals) for half in (self.first, self.second)]
+        p = {"views": p_text(self.p_value), "noise": p_text(self.noise_p_value)}
+        facts = {"views": views, "range_m": self.range_m, "px": px, "sigma": sigma, "p": p}
+        lines = [say("intrinsics.halves", alone=alone, **facts)]
+        return "\n".join([*lines, *folded_text(float(np.isnan(length).mean()))])
 
 
 def halves(
@@ -221,17 +218,10 @@ class Comparison:
             lines.append(
                 f"{name:>4} {difference:+9.{places}f}, {difference / sigma:+6.1f} of its sigma"
             )
-        lines.append(
-            f"all together: {p_text(self.p_value)}; in the image "
-            f"{np.nanmedian(self.difference_px):.2f} px in the median, "
-            f"{np.nanmax(self.difference_px):.2f} px at worst"
-        )
-        lines.append(
-            f"a point {self.range_m:.2f} m away moves by "
-            f"{1e3 * np.nanmedian(self.shift_m):.2f} mm in the median, "
-            f"{1e3 * np.nanmax(self.shift_m):.2f} mm at worst "
-            f"(sigma {1e3 * np.nanmedian(self.expected_shift_m):.2f} mm)"
-        )
+        maps = (self.difference_px, 1e3 * self.shift_m, 1e3 * self.expected_shift_m)
+        px, mm, sigma = ({"median": np.nanmedian(m), "worst": np.nanmax(m)} for m in maps)
+        facts = {"p": p_text(self.p_value), "range_m": self.range_m, "px": px, "mm": mm}
+        lines.append(say("intrinsics.apart", sigma=sigma, **facts))
         lines += folded_text(float(np.isnan(self.shift_m).mean()))
         return "\n".join(lines)
 

@@ -40,7 +40,7 @@ from coursekit.boards.board import check_detections
 from coursekit.checks import array, choice, is_number, want
 from coursekit.geometry import Intrinsics, deproject, make_transform, project
 from coursekit.intrinsics import derivatives
-from coursekit.words import Estimate, wrapped
+from coursekit.words import Estimate, say, wrapped
 
 Fixed = Literal["world", "camera"]
 
@@ -307,28 +307,19 @@ class IntrinsicsResult(Estimate):
         determined = max(focal, centre / self.value("fx")) < DETERMINED_SHARE
         near_mm = 1e3 * near * range_m / self.value("fx")
         where = "the pixels that have a ray" if self.folded_share else "the image"
-        says = (
-            f"in 95 % of {where} a point {range_m:.2f} m away is seen where this camera says to "
-            f"± {near:.2f} px ({near_mm:.2f} mm), and a direction to ± {far:.2f} px (95 %)."
-            if determined
-            else f"these {views} views do not determine K (f ± {100 * focal:.1f} %, "
-            f"centre ± {centre:.0f} px, 95 %)."
-        )
+        says = say("intrinsics.undetermined", views=views, focal=100 * focal, centre=centre)
+        if determined:
+            reaches = {"range_m": range_m, "near": near, "near_mm": near_mm, "far": far}
+            says = say("intrinsics.determined", where=where, **reaches)
         weak = list(_weaknesses(self))
         if not weak and (near > GOOD_PX or far > GOOD_FAR_PX):
-            weak = [
-                "nothing is wrong with coverage and tilt, there is too little of it: take more "
-                f"views, or sharper ones (the corners scatter by {self.sigma_px:.2f} px)."
-            ]
+            weak = [say("intrinsics.too_little", sigma=self.sigma_px)]
         grade = "Usable with care" if weak else "Good"
         small = near < USABLE_PX and far < USABLE_FAR_PX and self.folded_share <= MOST_FOLDED
         if not (self.converged and determined and small):
             grade = "Not good enough"
         lines = [f"{grade}: {says}", *(f"- {reason}" for reason in weak)]
-        lines.append(
-            f"The RMS of {self.rms_px:.2f} px says none of this: the poses absorb much of what is "
-            "wrong with K, and the RMS stays small."
-        )
+        lines.append(say("intrinsics.rms", rms=self.rms_px))
         return "\n".join(map(wrapped, lines))
 
     def __repr__(self) -> str:
@@ -344,15 +335,9 @@ class IntrinsicsResult(Estimate):
             half = self.quantile() * self.sigma(name)
             number = f"{self.value(name):.{places}f} ± {half:.{places}f}{unit}"
             lines.append(f"{'fx = fy' if name == 'f' else name} = {number} (95 %)")
-        lines.append(
-            f"residuals: rms {self.rms_px:.3f} px (2-D), {self.rms_u_px:.3f} along u, "
-            f"{self.rms_v_px:.3f} along v"
-        )
         sigmas = self.quantile() * self.uncertainty_map(self.board_range_m)
-        lines.append(
-            f"at {self.board_range_m:.2f} m a point is seen within ± {np.nanmedian(sigmas):.2f} px "
-            f"(median of the image), ± {np.nanmax(sigmas):.2f} px (worst)"
-        )
+        within = {"median": np.nanmedian(sigmas), "worst": np.nanmax(sigmas)}
+        lines.append(say("intrinsics.residuals", fit=self, **within))
         lines += folded_text(self.folded_share)
         return "\n".join(lines)
 
@@ -555,11 +540,7 @@ def _solve(
     depths = [p @ T[2, :3] + T[2, 3] for T, p in zip(poses, points, strict=True)]
     in_front = all((z > 0).all() for z in depths)
     if min(K[0, 0], K[1, 1]) < LEAST_FOCAL * size[0] or not in_front:
-        raise CalibrationFailed(
-            f"detections: the solver ended at a camera that cannot be (fx = {K[0, 0]:.3g}, fy = "
-            f"{K[1, 1]:.3g} px, or a board behind it). Is this the board in the images? If it is, "
-            "tilt it more, or give a guess"
-        )
+        raise CalibrationFailed(say("intrinsics.no_camera", fx=K[0, 0], fy=K[1, 1]))
     kind = "brown_conrady" if estimated else "none"
     coeffs = tuple(np.ravel(dist)[:5].tolist())
     return Intrinsics(*size, K[0, 0], K[1, 1], K[0, 2], K[1, 2], kind, coeffs), poses
@@ -727,18 +708,10 @@ def _weaknesses(result: IntrinsicsResult) -> Iterator[str]:
     if views < GOOD_VIEWS:
         yield f"{views} views are few: take 20 to 40."
     if min(about_x, about_y) < GOOD_SPREAD_DEG:
-        yield (
-            f"the boards' tilts spread only {about_x:.0f} and {about_y:.0f} deg about x and y, and "
-            "nearly parallel boards leave focal length and distance to trade against each other: "
-            "tilt 30 to 45 deg about both axes, to both sides."
-        )
+        yield say("intrinsics.parallel", about_x=about_x, about_y=about_y)
     if seen.empty_sides:
         sides = " and ".join(seen.empty_sides) if len(seen.empty_sides) < 4 else "all four"
-        yield (
-            f"no corners in the outer tenth of the image ({sides} sides): there the figures above "
-            "extrapolate and hold only if the distortion model does. Push the board into the "
-            "image's corners."
-        )
+        yield say("intrinsics.bare", sides=sides)
     if seen.fraction < GOOD_COVERAGE:
         yield f"only {100 * seen.fraction:.0f} % of the image saw a corner: fill the rest."
 

@@ -22,6 +22,21 @@ def _build(steps: Mapping[str, Step]) -> Model:
     return sensitivities
 
 
+def _prices(u: float, Z: float, fx: float, cx: float, depth_error: float) -> Any:
+    off = u - cx
+    dX_du = Z / fx
+    dX_dZ = off / fx
+    return dX_du, dX_dZ, off / fx * depth_error
+
+
+def _prices_by_differences(u: float, Z: float, fx: float, cx: float, depth_error: float) -> Any:
+    step = 0.5
+    X = (u - cx) * Z / fx
+    dX_du = ((u + step - cx) * Z / fx - X) / step
+    dX_dZ = ((u - cx) * (Z + step) / fx - X) / step
+    return dX_du, dX_dZ, (u - cx) * (Z + depth_error) / fx - X
+
+
 SENSITIVITIES = Exercise(
     name="error_budget.sensitivities",
     build=_build,
@@ -44,6 +59,7 @@ SENSITIVITIES = Exercise(
         "u = {:g} px, Z = {:g} m, fx = {:g} px, cx = {:g} px, depth error {:g} m".format(*args)
     ),
     show=lambda row: "(" + ", ".join(f"{v:.6g}" for v in np.ravel(row)) + ")",
+    styles=[_prices, _prices_by_differences],
 )
 
 
@@ -130,6 +146,23 @@ LESSON_ROWS: Rows = [
     (2.0, 4.0, None, "bias"),
 ]
 
+
+def _sums_by_rows(rows: Rows, tolerance: float) -> Any:
+    noise, worst, quadrature, square = 0.0, 0.0, 0.0, 0.0
+    for low, high, toward, kind in rows:
+        along = 1.0 if toward is None else abs(toward[0])
+        part = 1 / 3 if toward is None else toward[0] ** 2
+        if kind == "noise":
+            noise += (high * along) ** 2
+        else:
+            worst += high * along
+            quadrature += (high * along) ** 2
+            square += part * (low**2 + low * high + high**2) / 3
+    sigma = np.sqrt(square)
+    share = math.erfc(tolerance / (math.sqrt(2) * sigma))
+    return np.sqrt(noise), worst, np.sqrt(quadrature), share
+
+
 ADD_UP = Exercise(
     name="error_budget.add_up",
     build=_build_sums,
@@ -163,6 +196,7 @@ ADD_UP = Exercise(
     describe=lambda args: "; ".join(_row_in_words(row) for row in args[0])
     + f"; tolerance {args[1]:g} mm",
     show=lambda row: "(" + ", ".join(f"{v:.4g}" for v in np.ravel(row)) + ")",
+    styles=[_sums_by_rows],
 )  # fmt: skip
 
 
@@ -175,6 +209,7 @@ def _row_in_words(row: tuple[float, float, Any, str]) -> str:
 ADD_UP.add_mistakes(
     ("kinds", "kinds_exchanged", lambda rows: _sorted(rows)[::-1]),
     ("kinds", "noise_in_the_bias", lambda rows: (_sorted(rows)[0], rows)),
+    ("kinds", "noise_in_the_bias", lambda rows: ([], rows)),
     ("kinds", "kind_ignored", lambda rows: (rows, rows)),
     ("", "first_row_only", lambda sums: lambda rows, tolerance: sums(rows[:1], tolerance)),
     ("noise part", "noise_shared_out", lambda way, along: along(way) if way else 3**-0.5),

@@ -85,7 +85,8 @@ class Exercise:
     `tolerance` (in `unit`) or a millionth of their size, as float32 does, and NaN with NaN. Where
     `nan_answers`, NaN is an answer like any other; otherwise a wrong model that comes to NaN or
     infinity has overflowed. ways: other right answers, what each does and the steps that do it;
-    `way` is what the model does. An
+    `way` is what the model does. styles: the whole function as learners write it, for the device to
+    edit. An
     attempt that leaves out what is beyond the `core` is judged by the core cases alone: by an
     exercise that has only those, and is `part_of` this one.
     """
@@ -105,6 +106,7 @@ class Exercise:
     way: str = ""
     ways: list[tuple[str, dict[str, Step]]] = field(default_factory=list)
     core: Core | None = None
+    styles: list[Model] = field(default_factory=list)
     mistakes: list[Mistake] = field(default_factory=list)
     part_of: Exercise | None = field(default=None, repr=False)
     _known: dict[tuple[int, ...], Floats | None] = field(
@@ -277,18 +279,19 @@ class Exercise:
         if formal:
             return self._several(formal[0], count, evidence)
         mistakes = self._found(values, relation in FOUND["told"])
-        if len({m.name for m in mistakes}) > 1:
-            seen = self._seen_in(first, mistakes, expected[first])
-            return self._several(_in_words(seen, known), count, evidence)
         if self.core and not mistakes:  # what is wrong there may hide behind the rest
             of_core = [i for i, args in enumerate(self.cases) if self.is_core(args)]
             ours, wanted = ([of[i] for i in of_core] for of in (values, expected))
             verdict = self._core_alone()._judged(ours, wanted, [], known)
             if verdict.named:
                 return verdict
+        where = self._parts_off(values, expected)
         if relation and not mistakes:
             mistakes = (_device(relation, "your result", "", replace),)
-        where = self._parts_off(values, expected)
+        mistakes = mistakes or self._by_part(values, expected)
+        if len({m.name for m in mistakes}) > 1:
+            seen = self._seen_in(first, mistakes, expected[first])
+            return self._several(_in_words(seen, known), count, evidence)
         if mistakes:
             where = where * mistakes[0].device
             return self._one(_in_words(mistakes[0], known), count + where, evidence)
@@ -297,6 +300,21 @@ class Exercise:
     def _part(self, i: int) -> Any:
         """The index of a part of a result: of a column, or of a number."""
         return (..., i) if self.per_row else i
+
+    def _by_part(self, values: list[Floats], expected: list[Floats]) -> tuple[Mistake, ...]:
+        """What gives the numbers of each wrong part of the result, where something does."""
+        both = list(zip(values, expected, strict=True))
+        singles = [*self.single_mistakes(), *self._edits[1], *self._edits[2]]
+        found: list[Mistake] = []
+        for i, name in enumerate(self.parts):
+            at = self._part(i)
+            if not all(self._agrees(v[at], e[at]) for v, e in both):
+                alike = (m for m in singles if self._explains((m,), values, at))
+                found += [
+                    replace(m, says=f"in {name}: {m.says}", name=f"{m.name}, in {name}")
+                    for m in itertools.islice(alike, 1)
+                ]
+        return tuple(found)
 
     def _parts_off(self, values: list[Floats], expected: list[Floats]) -> str:
         """Says which parts of the result are wrong, where others are right."""
@@ -427,8 +445,8 @@ class Exercise:
         says = f"in {self.parts[i]}: {mistake.says}"
         return replace(mistake, says=says, step="", wrong=mixed, of_result=True)
 
-    def _explains(self, mistakes: tuple[Mistake, ...], values: list[Floats]) -> bool:
-        """Whether a wrong model gives exactly these values.
+    def _explains(self, mistakes: tuple[Mistake, ...], values: list[Floats], at: Any = ...) -> bool:
+        """Whether a wrong model gives exactly these values, or what stands `at` a place in them.
 
         Where the model itself overflows (an iteration that diverges, say) nobody's arithmetic
         agrees, and the case is left out; so one case at least must show that the model is wrong.
@@ -440,10 +458,15 @@ class Exercise:
                 if mistakes[-1].device:
                     return False
                 continue
-            if value.shape != wrong.shape or not self._agrees(value, wrong):
+            if value.shape != wrong.shape or not self._agrees(value[at], wrong[at]):
                 return False
+            off, size = np.abs(value[at] - wrong[at]), np.abs(wrong[at])
+            if mistakes[-1].device and np.nanmax(off, initial=0) > 1e-3 * np.nanmax(
+                size, initial=0
+            ):
+                return False  # next to nothing is not nothing
             right = self._answer((), args)
-            shown = shown or right is None or not self._agrees(wrong, right)
+            shown = shown or right is None or not self._agrees(wrong[at], right[at])
         return shown
 
     def _telling(self, values: list[Floats]) -> list[tuple[Floats, tuple[Any, ...]]]:
@@ -463,8 +486,9 @@ class Exercise:
             if mistakes and mistakes[-1].of_result:
                 given = self._answer(mistakes[:-1], args)
                 model = mistakes[-1].wrong(lambda *_: given)
+            own = [np.array(a) if isinstance(a, np.ndarray) else a for a in args]
             try:
-                value = _as_numbers(model(*args))
+                value = _as_numbers(model(*own))
             except Exception:  # an edit of the device may come to nothing
                 value = None
             overflows = value is not None and not self.nan_answers and not np.isfinite(value).all()
@@ -580,6 +604,7 @@ ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh")
 NUMERIC = (int, float, np.generic, np.ndarray)
 _ONE = r"(the \w+ (part|number|column) of )?(what is made of )?`\w+`"
 _NAMED = re.compile(rf"(each of )?{_ONE}((, | and | of ){_ONE})*")
+LINES = (ast.Assign, ast.AugAssign, ast.Return, ast.Expr, ast.For, ast.If)
 MOST_PARTS = 5  # of more parts no two are edited alike
 MOST_NAMES = 3  # of more of them no learner finds the place
 MOST_SITES = 55  # of more of them in one step no two are tried together
@@ -617,6 +642,10 @@ def _all_edits(exercise: Exercise) -> tuple[list[Mistake], list[Mistake], list[M
     inputs = [f"`{name}`" for name in inspect.signature(exercise.model()).parameters]
     rewritten = [(name, edit) for name, step in steps.items() for edit in _rewritten(step)]
     found: list[tuple[str, str, str, Step]] = []
+    for style in exercise.styles:
+        for n, kind, where, new in _rewritten(style, whole=True):
+            if n == 1:
+                found.append((kind, where, "", lambda _, new=new: new))
     found += [(kind, where, name, new) for name, (n, kind, where, new) in rewritten if n == 1]
     for kind, where, edit in _edits_of(args, _listed(inputs), inputs):
         found.append((kind, where, "", lambda f, e=edit: lambda *a: f(*e(a))))
@@ -732,10 +761,11 @@ def _factors(
 
 
 @cache
-def _rewritten(step: Step) -> list[tuple[int, str, str, Step]]:
+def _rewritten(step: Step, whole: bool = False) -> list[tuple[int, str, str, Step]]:
     """The step with one edit of its source, or the like in several places; then with two.
 
-    Before each stands 1 or 2. A step without a source has none.
+    Before each stands 1 or 2. A step without a source has none. Of a `whole` function more is
+    edited, one at a time, and the line that is edited is shown.
     """
     tree = _source(step)
     if tree is None:
@@ -745,19 +775,25 @@ def _rewritten(step: Step) -> list[tuple[int, str, str, Step]]:
     names |= {n.id for n in ast.walk(tree) if isinstance(n, ast.Name) and type(n.ctx) is ast.Store}
     sites: list[tuple[int, str, str, dict[int, ast.AST]]] = []
     groups: dict[Any, tuple[str, str, dict[int, ast.AST]]] = {}
+    lines = {id(n): line for line in ast.walk(tree) for n in ast.walk(line) if type(line) in LINES}
     for node, around, path in _walk(tree):
         fields = tuple(field for field in path if isinstance(field, str))
         beside = tuple(field for field in path if field not in ("left", "right"))
-        for kind, detail, new in _alternatives(node, names):
+        more = _wrapped(node) if whole else ()
+        for kind, detail, new in itertools.chain(_alternatives(node, names), more):
             where = _named_in(node) or _named_in(around)
             if kind == "function_dropped":
                 where = f"`{detail}` of {where}"
             where = detail[1] if kind == "name" else where
+            if whole and id(node) in lines:
+                line = _rebuilt(lines[id(node)], {id(node): new})
+                text = ast.unparse(ast.fix_missing_locations(line)).splitlines()[0]
+                where = f"{where or FOUND['unseen']} in a line like `{text}`"
             sites.append((1, kind, where, {id(node): new}))
             for like in ((), fields, beside, where):
                 groups.setdefault((kind, detail, like), (kind, where, {}))[2][id(node)] = new
     pools: list[list[Any]] = [sites, [site for site in sites if site[1] == "name"], []]
-    pool = next(pool for pool in pools if len(pool) <= MOST_SITES)
+    pool = [] if whole else next(pool for pool in pools if len(pool) <= MOST_SITES)
     pairs = itertools.combinations(pool, 2)
     several = [(1, *group) for group in groups.values() if len(group[2]) > 1]
     double = [(2, kind, where, a | b) for (_, kind, where, a), (*_, b) in pairs]
@@ -842,6 +878,31 @@ def _alternatives(node: Any, names: set[str]) -> Iterator[tuple[str, Any, ast.AS
             yield "transpose_missing", 0, value
         case ast.UnaryOp(_, operand):
             yield "sign_missing", 0, operand
+
+
+def _wrapped(node: Any) -> Iterator[tuple[str, Any, ast.AST]]:
+    """A value with a function too many, several in another order, a call without an argument."""
+    match node:
+        case ast.BinOp() | ast.Call() | ast.Name(_, ast.Load()) | ast.Subscript(_, _, ast.Load()):
+            for kind in FOUND["wrapped"]:
+                form = ast.parse(FOUND["edits"][kind], mode="eval").body
+                here = {
+                    id(n): node for n in ast.walk(form) if isinstance(n, ast.Name) and n.id == "v"
+                }
+                yield kind, 0, _rebuilt(form, here)
+        case ast.AugAssign(target, _, value):
+            yield "kept_only_last", 0, ast.Assign([target], value)
+    match node:
+        case ast.Call(function, arguments, [*keywords]) if keywords:
+            for keyword in keywords:
+                rest = [k for k in keywords if k is not keyword]
+                yield "argument_missing", keyword.arg, ast.Call(function, arguments, rest)
+        case ast.Tuple([*parts], context):
+            for i in range(len(parts) - 1):
+                turned = [*parts[:i], parts[i + 1], parts[i], *parts[i + 2 :]]
+                yield "exchanged", i, ast.Tuple(turned, context)
+        case ast.Call(function, [first, second, *rest], keywords):
+            yield "exchanged", 0, ast.Call(function, [second, first, *rest], keywords)
 
 
 def _rank(op: ast.operator) -> int:

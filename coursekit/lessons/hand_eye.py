@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -63,6 +64,23 @@ def _vector(T: Floats) -> str:
     return "(" + ", ".join(f"{v:.3f}" for v in T[:3, 3]) + ")"
 
 
+def _pair_by_halves(gripper_i: Floats, gripper_j: Floats, board_i: Floats, board_j: Floats) -> Any:
+    A, B = np.eye(4), np.eye(4)
+    A[:3, :3] = gripper_j[:3, :3].T @ gripper_i[:3, :3]
+    A[:3, 3] = gripper_j[:3, :3].T @ (gripper_i[:3, 3] - gripper_j[:3, 3])
+    B[:3, :3] = board_j[:3, :3] @ board_i[:3, :3].T
+    B[:3, 3] = board_j[:3, 3] - B[:3, :3] @ board_i[:3, 3]
+    return A, B
+
+
+def _pair_by_inverses(
+    gripper_i: Floats, gripper_j: Floats, board_i: Floats, board_j: Floats
+) -> Any:
+    A = np.linalg.inv(gripper_j) @ gripper_i
+    B = board_j @ np.linalg.inv(board_i)
+    return A, B
+
+
 MOTION_PAIR = Exercise(
     name="hand_eye.motion_pair",
     build=_build_pair,
@@ -80,6 +98,7 @@ MOTION_PAIR = Exercise(
     unit="m",
     describe=_describe_pair,
     show=lambda row: f"translations of A and B {_vector(row[0])} and {_vector(row[1])}",
+    styles=[_pair_by_halves, _pair_by_inverses],
 )
 
 
@@ -166,6 +185,29 @@ def _quarter_turns() -> Pair:
     return A.as_matrix(), (X.inv() * A * X).as_matrix()
 
 
+def _half_by_kabsch(R_A: Floats, R_B: Floats) -> Any:
+    a = Rotation.from_matrix(R_A).as_rotvec()
+    b = Rotation.from_matrix(R_B).as_rotvec()
+    U, _, Vt = np.linalg.svd(a.T @ b)
+    sign = np.linalg.det(U @ Vt)
+    return U @ np.diag([1, 1, sign]) @ Vt
+
+
+def _half_by_motions(R_A: Floats, R_B: Floats) -> Any:
+    a = np.array([Rotation.from_matrix(A).as_rotvec() for A in R_A])
+    b = np.array([Rotation.from_matrix(B).as_rotvec() for B in R_B])
+    return Rotation.align_vectors(a, b)[0].as_matrix()
+
+
+def _half_by_null_space(R_A: Floats, R_B: Floats) -> Any:
+    eye = np.eye(3)
+    M = np.vstack([np.kron(A, eye) - np.kron(eye, B.T) for A, B in zip(R_A, R_B, strict=True)])
+    X = np.linalg.svd(M)[2][-1].reshape(3, 3)
+    X = X * np.sign(np.linalg.det(X))
+    U, _, Vt = np.linalg.svd(X)
+    return U @ Vt
+
+
 ROTATION_HALF = Exercise(
     name="hand_eye.rotation_half",
     build=_build_half,
@@ -190,6 +232,7 @@ ROTATION_HALF = Exercise(
         else f"{len(args[0])} motions" + ", the first two about one axis" * _parallel(args[0])
     ),
     show=lambda R: "; ".join(" ".join(f"{v:.3f}" for v in row) for row in np.atleast_2d(R)),
+    styles=[_half_by_kabsch, _half_by_motions, _half_by_null_space],
 )
 
 

@@ -40,6 +40,25 @@ def _describe_rms(args: tuple[Any, ...]) -> str:
     return "residuals " + ", ".join(f"({u:g}, {v:g})" for u, v in residuals) + " px"
 
 
+def _rms_by_axes(observed: Floats, predicted: Floats) -> Any:
+    error = observed - predicted
+    n = len(error)
+    u = np.sqrt(np.sum(error[:, 0] ** 2) / n)
+    v = np.sqrt(np.sum(error[:, 1] ** 2) / n)
+    return u, v, np.sqrt(u**2 + v**2)
+
+
+def _rms_by_rows(observed: Floats, predicted: Floats) -> Any:
+    u = v = both = 0.0
+    for seen, there in zip(observed, predicted, strict=True):
+        du, dv = seen[0] - there[0], seen[1] - there[1]
+        u += du**2
+        v += dv**2
+        both += du**2 + dv**2
+    n = len(observed)
+    return np.sqrt(u / n), np.sqrt(v / n), np.sqrt(both / n)
+
+
 REPROJECTION_RMS = Exercise(
     name="intrinsics.reprojection_rms",
     build=_build_rms,
@@ -67,6 +86,7 @@ REPROJECTION_RMS = Exercise(
     tolerance=5e-5,
     describe=_describe_rms,
     show=lambda row: "(" + ", ".join(f"{v:.4f}" for v in np.ravel(row)) + ")",
+    styles=[_rms_by_axes, _rms_by_rows],
 )
 
 
@@ -134,6 +154,26 @@ def _least_squares(seed: int, rows: int, columns: int, sigma: float) -> tuple[Fl
     return J, noise - J @ np.linalg.lstsq(J, noise, rcond=None)[0]
 
 
+def _sigma_by_covariance(J: Floats, residuals: Floats) -> Any:
+    M, P = J.shape
+    variance = np.sum(residuals**2) / (M - P)
+    covariance = variance * np.linalg.inv(J.T @ J)
+    return np.sqrt(covariance[0, 0])
+
+
+def _sigma_by_root(J: Floats, residuals: Floats) -> Any:
+    M, P = J.shape
+    sigma = np.linalg.norm(residuals) / np.sqrt(M - P)
+    return sigma * np.sqrt(np.linalg.inv(J.T @ J)[0, 0])
+
+
+def _sigma_by_pinv(J: Floats, residuals: Floats) -> Any:
+    M, P = J.shape
+    noise = np.sqrt(np.sum(residuals**2) / (M - P))
+    gain = np.linalg.pinv(J)[0]
+    return noise * np.sqrt(np.sum(gain**2))
+
+
 FOCAL_SIGMA = Exercise(
     name="intrinsics.focal_sigma",
     build=_build_sigma,
@@ -161,6 +201,7 @@ FOCAL_SIGMA = Exercise(
         + (f" with rows {args[0].tolist()}, residuals {args[1].tolist()}" * (len(args[0]) < 7))
     ),
     show=lambda row: f"{float(row):.5f}",
+    styles=[_sigma_by_covariance, _sigma_by_root, _sigma_by_pinv],
 )
 
 

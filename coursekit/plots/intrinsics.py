@@ -29,6 +29,7 @@ from coursekit.plots.style import (
 
 F_PX = np.linspace(300, 1200, 181)
 ARROWS = 150  # residuals are drawn so many times too long
+LABEL_PART = 0.09  # of the image's width: closer to its rim a contour's label is cut
 LEVELS_PX = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100)
 
 
@@ -165,13 +166,14 @@ def uncertainty(results: Mapping[str, IntrinsicsResult], range_m: float) -> Less
         width, height = results[name].intrinsics.size
         u, v = np.linspace(0, width - 1, sigma.shape[1]), np.linspace(0, height - 1, len(sigma))
         shown = ax.pcolormesh(u, v, sigma, norm=LogNorm(*ends), shading="gouraud", cmap="cividis")
-        levels = [x for x in LEVELS_PX if 0.02 < np.mean(sigma < x) < 0.99]  # room for a label
+        levels = [x for x in LEVELS_PX if 0.02 < np.mean(sigma < x) < 0.99]
         lines = ax.contour(u, v, sigma, levels, colors="white", linewidths=1.2)
         lines.set_path_effects(edge)
         ends_at = np.array([width, height]) - 1
         drawn = [path.vertices for path in lines.get_paths() if len(path)]
         inside = [at[np.minimum(at, ends_at - at).min(axis=1).argmax()] for at in drawn]
-        ax.clabel(lines, fmt="%g px", fontsize=9, inline_spacing=1, manual=inside)
+        whole = [at for at in inside if np.minimum(at, ends_at - at).min() > LABEL_PART * width]
+        ax.clabel(lines, fmt="%g px", fontsize=9, inline_spacing=1, manual=whole)
         for text in lines.labelTexts:
             text.set_path_effects(edge)
         image_axes(ax, width, height)

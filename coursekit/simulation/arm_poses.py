@@ -23,6 +23,7 @@ from coursekit.checks import choice, number, transform, transforms, whole
 from coursekit.geometry import Intrinsics, inverse_of, invert_transform, make_transform
 from coursekit.hand_eye.poses import MOUNTS, Mount
 from coursekit.specifications import DATA
+from coursekit.words import say
 
 SMALLEST_SQUARE_PX = 14.0  # a square's side as seen, below which markers are not read
 STEEPEST_RAD = np.radians(60)  # between the line of sight and the board's normal
@@ -185,10 +186,8 @@ def careful_poses(
     q = q[_farthest(setup.arm.forward(q)[:, :3, :3], n)]
     turns = half_turns(setup.arm.forward(q))
     if turns[1] < WIDE_TURN_RAD:
-        raise ValueError(
-            f"n: {n} poses turn only {np.degrees(turns[1]):.0f} degrees to either side about their "
-            f"second axis, want {np.degrees(WIDE_TURN_RAD):.0f}: take more poses or move the board"
-        )
+        facts = {"turn": np.degrees(turns[1]), "least": np.degrees(WIDE_TURN_RAD)}
+        raise ValueError(say("simulation.narrow_turns", n=n, **facts))
     return q
 
 
@@ -202,10 +201,7 @@ def random_poses(setup: Setup, rng: np.random.Generator, n: int) -> Floats:
         tried += batch
         batch = 20_000
     if len(found) < n:
-        raise ValueError(
-            f"n: got {n}, but only {len(found)} of {tried} random configurations have the board in "
-            "view: move the board or the camera"
-        )
+        raise ValueError(say("simulation.few_in_view", n=n, found=len(found), tried=tried))
     return found[:n]
 
 

@@ -38,7 +38,7 @@ from coursekit.simulation.arm_poses import Setup
 from coursekit.simulation.board_images import render_board
 from coursekit.simulation.corner_sessions import Effects, corner_noise, printed, with_street_errors
 from coursekit.specifications import DATA, device
-from coursekit.words import counting
+from coursekit.words import counting, say
 
 Design = Literal["careful", "grid", "single_axis", "small_rotations"]
 Degrees = Literal["", "joints", "rotation_vectors"]
@@ -58,19 +58,8 @@ WHOSE_LENS: dict[Mount, str] = {"eye_in_hand": "D405", "eye_to_hand": "D435"}
 FOLDER_VIEWS = 20
 # Progressive: the same pixels in a tenth less space.
 JPEG_OPTIONS = [
-    cv2.IMWRITE_JPEG_QUALITY,
-    92,
-    cv2.IMWRITE_JPEG_OPTIMIZE,
-    1,
-    cv2.IMWRITE_JPEG_PROGRESSIVE,
-    1,
-]
-FOLDER_ORIGIN = (
-    "Rendered by coursekit.simulation.session_folder: a WidowX AI with hidden errors, its seed as "
-    "given, stops at each pose; the lens is this device's colour camera, and the intrinsics given "
-    "are the true ones. The table behind a board in the gripper goes along with it. No real arm or "
-    "camera took it. Where the camera really is, coursekit.simulation.truth_of tells."
-)
+    cv2.IMWRITE_JPEG_QUALITY, 92, cv2.IMWRITE_JPEG_OPTIMIZE, 1, cv2.IMWRITE_JPEG_PROGRESSIVE, 1
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -258,7 +247,7 @@ def session_folder(mount: Mount, seed: int, into: str | os.PathLike[str]) -> Pat
     names = tuple(f"{name}.jpg" for name in session.names)
     encoded = (cv2.imencode(".jpg", image, JPEG_OPTIONS)[1].tobytes() for image in images)
     about = {"camera": f"Simulated {WHOSE_LENS[mount]}", "source": SIMULATED, "seed": seed}
-    about |= {"views": FOLDER_VIEWS, "origin": FOLDER_ORIGIN}
+    about |= {"views": FOLDER_VIEWS, "origin": say("simulation.folder_origin")}
     replace(session, names=names).save(made, dict(zip(names, encoded, strict=True)), about)
     return made
 

@@ -22,6 +22,7 @@ from coursekit.boards import Board, Detection, Detections
 from coursekit.boards.board import BORDER_PX, seen, slide_into_view
 from coursekit.checks import array, number, positive, whole
 from coursekit.geometry import Intrinsics, project, transform_points
+from coursekit.words import say
 
 PARTIAL_SHARE = 0.4  # a ChArUco view shows at least this share of the corners
 SHARP_BLUR_PX = 0.63  # std of the blur that `detect` measures in sharp rendered images
@@ -245,10 +246,8 @@ def view_poses(
             if T is not None:
                 break
         if T is None:
-            raise ValueError(
-                f"board: {board.size_m[0]:.3f} x {board.size_m[1]:.3f} m does not fit the "
-                f"{lens.width}x{lens.height} image at {NEAREST_M} to {FARTHEST_M} m"
-            )
+            facts = {"board": board, "lens": lens, "near": NEAREST_M, "far": FARTHEST_M}
+            raise ValueError(say("simulation.board_too_large", **facts))
         poses.append(T)
     return np.stack(poses)
 
@@ -411,10 +410,8 @@ def rolling_shutter(
         pixels = moved
         if change < ROW_TOLERANCE_PX:
             return pixels
-    raise ValueError(
-        f"velocity: {np.linalg.norm(velocity):g} m/s over {readout_s:g} s moves the image as fast "
-        "as the shutter runs; the row of a corner has no answer"
-    )
+    speed = np.linalg.norm(velocity)
+    raise ValueError(say("simulation.as_fast_as_the_shutter", speed=speed, readout=readout_s))
 
 
 # --- what the detector makes of it ---

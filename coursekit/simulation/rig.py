@@ -362,10 +362,8 @@ def cost_curve(left: ArrayLike, right: ArrayLike, u: int, v: int) -> Floats:
     """
     left, right = _pair(left, right)
     height, width = left.shape
-    if not (HALF <= u < width - HALF and HALF <= v < height - HALF):
-        raise ValueError(
-            f"u, v: got ({u}, {v}), want a window of {2 * HALF + 1} px inside {width}x{height} px"
-        )
+    inside = HALF <= u < width - HALF and HALF <= v < height - HALF
+    want(inside, "u, v", (u, v), f"a window of {2 * HALF + 1} px inside {width}x{height} px")
     a, b = high_pass(left).astype(np.int64), high_pass(right).astype(np.int64)
     rows = slice(v - HALF, v + HALF + 1)
     window = a[rows, u - HALF : u + HALF + 1]
