@@ -289,12 +289,13 @@ class Exercise:
         if relation and not mistakes:
             mistakes = (_device(relation, "your result", "", replace),)
         mistakes = mistakes or self._by_part(values, expected)
-        if len({m.name for m in mistakes}) > 1:
+        if len({m.name.partition(",")[0] for m in mistakes}) > 1:
             seen = self._seen_in(first, mistakes, expected[first])
             return self._several(_in_words(seen, known), count, evidence)
         if mistakes:
             where = where * mistakes[0].device
             return self._one(_in_words(mistakes[0], known), count + where, evidence)
+        where += self._factors_off(values, expected)
         return self._say("wrong", f"not right yet. {count}{where}", evidence, FOUND["by_hand"])
 
     def _part(self, i: int) -> Any:
@@ -303,28 +304,39 @@ class Exercise:
 
     def _by_part(self, values: list[Floats], expected: list[Floats]) -> tuple[Mistake, ...]:
         """What gives the numbers of each wrong part of the result, where something does."""
-        both = list(zip(values, expected, strict=True))
         singles = [*self.single_mistakes(), *self._edits[1], *self._edits[2]]
         found: list[Mistake] = []
-        for i, name in enumerate(self.parts):
-            at = self._part(i)
-            if not all(self._agrees(v[at], e[at]) for v, e in both):
-                alike = (m for m in singles if self._explains((m,), values, at))
-                found += [
-                    replace(m, says=f"in {name}: {m.says}", name=f"{m.name}, in {name}")
-                    for m in itertools.islice(alike, 1)
-                ]
+        for name, at in self._off(values, expected):
+            some = any(v[at].any() for v in values)  # of nothing but 0 only that can be said
+            alike = (m for m in singles if some or m.of_result)
+            mistake = next((m for m in alike if self._explains((m,), values, at)), None)
+            if mistake:
+                says = mistake.says if name in mistake.says else f"in {name}: {mistake.says}"
+                found.append(replace(mistake, says=says, name=f"{mistake.name}, in {name}"))
         return tuple(found)
+
+    def _off(self, values: list[Floats], expected: list[Floats]) -> list[tuple[str, Any]]:
+        """The parts of the result that are not right in all cases, each with its place."""
+        both = list(zip(values, expected, strict=True))
+        parts = [(name, self._part(i)) for i, name in enumerate(self.parts)]
+        return [
+            (name, at) for name, at in parts if not all(self._agrees(v[at], e[at]) for v, e in both)
+        ]
 
     def _parts_off(self, values: list[Floats], expected: list[Floats]) -> str:
         """Says which parts of the result are wrong, where others are right."""
-        both = list(zip(values, expected, strict=True))
-        off = [
-            name
-            for i, name in enumerate(self.parts)
-            if not all(self._agrees(v[self._part(i)], e[self._part(i)]) for v, e in both)
-        ]
+        off = [name for name, _ in self._off(values, expected)]
         return f" Look at {_listed(off)}: all else is right." if len(off) < len(self.parts) else ""
+
+    def _factors_off(self, values: list[Floats], expected: list[Floats]) -> str:
+        """Says which parts of the result are off by one factor in every case."""
+        text = ""
+        for name, at in self._off(values, expected):
+            got, want = (np.concatenate([np.ravel(v[at]) for v in of]) for of in (values, expected))
+            factor = np.vdot(want, got) / np.vdot(want, want)
+            if factor and np.allclose(got, factor * want, 1e-5, 1e-9):
+                text += f" In every case {name} is {factor:.4g} times what it should be."
+        return text
 
     def _found(self, values: list[Floats], told: bool) -> tuple[Mistake, ...]:
         """The first mistakes that give these values; told: without the device's."""
@@ -358,6 +370,11 @@ class Exercise:
             "sign_of_all": square
             and all(
                 ok or abs(np.vdot(e, v) + 1) < 1e-6 for ok, (v, e) in zip(right, both, strict=True)
+            ),
+            "hole_spreads": any(np.isnan(v).any() for v in values)
+            and all(
+                np.isnan(v).any() == _has_hole(args)
+                for v, args in zip(values, self.cases, strict=True)
             ),
             "runs_away": all(wild) or (any(wild) and not self.nan_answers),
             "nothing": same and not values[0].any(),
@@ -416,6 +433,9 @@ class Exercise:
         yield from ((m,) for m in (*single, *double))
         common = [m for m in of_result if m.name in FOUND["common"] and "each of" not in m.says]
         yield from itertools.product(self.mistakes, common)
+        for a, b in itertools.combinations(listed, 2):
+            if a.name == b.name and a.step != b.step:
+                yield from ((a, b, edit) for edit in common)
         yield from itertools.combinations(common, 2)
 
     def single_mistakes(self) -> list[Mistake]:
@@ -460,10 +480,9 @@ class Exercise:
                 continue
             if value.shape != wrong.shape or not self._agrees(value[at], wrong[at]):
                 return False
-            off, size = np.abs(value[at] - wrong[at]), np.abs(wrong[at])
-            if mistakes[-1].device and np.nanmax(off, initial=0) > 1e-3 * np.nanmax(
-                size, initial=0
-            ):
+            size = np.nanmax(np.abs(wrong[at]), initial=0)
+            off = np.nanmax(np.abs(value[at] - wrong[at]), initial=0)
+            if mistakes[-1].device and off > max(1e-3 * size, 1e-12):
                 return False  # next to nothing is not nothing
             right = self._answer((), args)
             shown = shown or right is None or not self._agrees(wrong[at], right[at])
@@ -521,6 +540,10 @@ class Exercise:
         return Verdict(self.name, kind, f"{self.function}: {text}", lines, named)
 
 
+def _has_hole(args: tuple[Any, ...]) -> bool:
+    return any(a.dtype.kind == "f" and np.isnan(a).any() for a in args if isinstance(a, np.ndarray))
+
+
 def _nothing() -> None:
     return None
 
@@ -571,7 +594,11 @@ def _names_in(code: Any) -> set[str]:
 def _in_words(mistake: Mistake, known: set[str]) -> Mistake:
     """The device's words without names that the learner has not seen, and without many."""
     names = set(re.findall(r"`(\w+)`", mistake.says))
-    if not mistake.device or (len(names) <= MOST_NAMES and known.issuperset(names)):
+    if (
+        not mistake.device
+        or FOUND["line"] in mistake.says
+        or (len(names) <= MOST_NAMES and known.issuperset(names))
+    ):
         return mistake
     return replace(mistake, says=_NAMED.sub(FOUND["unseen"], mistake.says))
 
@@ -662,7 +689,15 @@ def _all_edits(exercise: Exercise) -> tuple[list[Mistake], list[Mistake], list[M
         for name, (n, kind, where, new) in rewritten
         if n == 2
     ]
-    return _result_edits(exercise), [_device(*edit) for edit in found], pairs
+    known = {*inspect.signature(exercise.model()).parameters, *exercise.seen.split()}
+
+    def vague(edit: tuple[str, str, str, Step]) -> tuple[bool, bool]:
+        kind, where = edit[:2]
+        line, names = FOUND["line"] in where, set(re.findall(r"`(\w+)`", where))
+        return not (line or (names and names <= known)), line and kind in FOUND["wrapped"]
+
+    edits = [_device(*edit) for edit in sorted(found, key=vague)]
+    return _result_edits(exercise), edits, pairs
 
 
 def _device(kind: str, where: str, step: str, wrong: Step, before: str = "") -> Mistake:
@@ -788,7 +823,7 @@ def _rewritten(step: Step, whole: bool = False) -> list[tuple[int, str, str, Ste
             if whole and id(node) in lines:
                 line = _rebuilt(lines[id(node)], {id(node): new})
                 text = ast.unparse(ast.fix_missing_locations(line)).splitlines()[0]
-                where = f"{where or FOUND['unseen']} in a line like `{text}`"
+                where = f"{where or FOUND['value']} {FOUND['line']} `{text}`"
             sites.append((1, kind, where, {id(node): new}))
             for like in ((), fields, beside, where):
                 groups.setdefault((kind, detail, like), (kind, where, {}))[2][id(node)] = new
@@ -897,10 +932,16 @@ def _wrapped(node: Any) -> Iterator[tuple[str, Any, ast.AST]]:
             for keyword in keywords:
                 rest = [k for k in keywords if k is not keyword]
                 yield "argument_missing", keyword.arg, ast.Call(function, arguments, rest)
-        case ast.Tuple([*parts], context):
-            for i in range(len(parts) - 1):
-                turned = [*parts[:i], parts[i + 1], parts[i], *parts[i + 2 :]]
-                yield "exchanged", i, ast.Tuple(turned, context)
+        case ast.Tuple([_, _, *rest] as parts, context) if len(rest) < MOST_NAMES - 1:
+            for order in list(itertools.permutations(parts))[1:]:
+                yield "exchanged", 0, ast.Tuple(list(order), context)
+        case ast.Call(function, [ast.BinOp(left, op, right)], []):  # f(a * b): f(a) * b
+            yield "bracket", 0, ast.BinOp(ast.Call(function, [left], []), op, right)
+            yield "bracket", 0, ast.BinOp(left, op, ast.Call(function, [right], []))
+        case ast.BinOp(
+            left, op, ast.Call(function, [ast.BinOp(a, ast.Mult() | ast.Div() as by, b)], [])
+        ):
+            yield "bracket", 0, ast.BinOp(ast.BinOp(left, op, ast.Call(function, [a], [])), by, b)
         case ast.Call(function, [first, second, *rest], keywords):
             yield "exchanged", 0, ast.Call(function, [second, first, *rest], keywords)
 

@@ -199,10 +199,10 @@ def _half_by_motions(R_A: Floats, R_B: Floats) -> Any:
     return Rotation.align_vectors(a, b)[0].as_matrix()
 
 
-def _half_by_null_space(R_A: Floats, R_B: Floats) -> Any:
+def _half_by_null_space(R_A: Floats, R_B: Floats, row: int = -1) -> Any:
     eye = np.eye(3)
     M = np.vstack([np.kron(A, eye) - np.kron(eye, B.T) for A, B in zip(R_A, R_B, strict=True)])
-    X = np.linalg.svd(M)[2][-1].reshape(3, 3)
+    X = np.linalg.svd(M)[2][row].reshape(3, 3)
     X = X * np.sign(np.linalg.det(X))
     U, _, Vt = np.linalg.svd(X)
     return U @ Vt
@@ -261,6 +261,8 @@ def _kabsch(product: Callable[[Floats, Floats, Floats], Floats]) -> Step:
 ROTATION_HALF.add_mistakes(
     ("result", "inverse_of_x", lambda R: R.T),
     ("turn", "not_a_rotation", lambda a, b: np.linalg.lstsq(b, a, rcond=None)[0].T),
+    ("turn", "not_a_rotation", lambda a, b: a.T @ b),
+    ("turn", "not_a_rotation", lambda a, b: a.T @ b / len(a)),
     ("used", "first_motion_only", lambda a, b: (a[:1], b[:1])),
     ("result", "negative", lambda R: -R),
     ("used", "mean_taken_off", lambda a, b: (a - a.mean(axis=0), b - b.mean(axis=0))),
@@ -272,9 +274,17 @@ ROTATION_HALF.add_mistakes(
     ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: U @ D @ Vt.T)),
     ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: Vt @ D @ U.T)),
     ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: U @ Vt.T)),
+    ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: U.T @ D @ Vt)),
     ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: Vt @ U.T)),
     ("axes", "axis_without_sign", _no_signs),
     ("", "same_frame", lambda _: lambda A, B: A[0] @ B[0].T),
+    ("", "largest_singular", lambda _: lambda A, B: _half_by_null_space(A, B, 0)),
     ("", "same_frame", lambda _: _same_frame),
     ("", "same_frame", lambda _: lambda *AB: Rotation.from_matrix(_same_frame(*AB)).as_matrix()),
+    ("", "same_frame", lambda _: lambda A, B: _same_frame(*np.swapaxes([A, B], 2, 3))),
+    (
+        "",
+        "same_frame",
+        lambda _: lambda A, B: Rotation.from_matrix(np.swapaxes(A, 1, 2) @ B).mean().as_matrix(),
+    ),
 )
