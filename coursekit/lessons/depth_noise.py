@@ -464,7 +464,7 @@ def _build_standard_errors(steps: Mapping[str, Step]) -> Model:
         spread, root, sides = steps["spread"], steps["root"], steps["sides"]()
         areas = [steps["area"](*z[0].shape, side) for side in sides]
         stays = spread(np.nanmean(z, axis=0)) / root(steps["patches"](areas[0], sides[0]))
-        moves = spread(np.nanmean(z, axis=(1, 2))) / root(steps["frames"](len(z)))
+        moves = spread(steps["levels"](z)) / root(steps["frames"](len(z)))
         nu = steps["squares"](steps["count"](z), areas[1], sides[1])
         return np.array([steps["sum"](stays, moves), steps["pooled"](z) / math.sqrt(nu)])
 
@@ -473,6 +473,11 @@ def _build_standard_errors(steps: Mapping[str, Step]) -> Model:
 
 def _freedom(z: Floats) -> Any:
     return (np.isfinite(z).sum(axis=0) - 1).mean()
+
+
+def _lines(z: Floats, axis: int) -> Any:
+    """Each frame's mean, by the means of its rows or columns."""
+    return np.nanmean(np.nanmean(z, axis=3 - axis), axis=1)
 
 
 def _errors_case(shape: tuple[int, int, int], seed: int) -> tuple[Floats]:
@@ -509,6 +514,7 @@ STANDARD_ERRORS = Exercise(
     name="depth_noise.standard_errors",
     build=_build_standard_errors,
     steps={
+        "levels": lambda z: np.nanmean(z, axis=(1, 2)),
         "spread": lambda means: np.nanstd(means, ddof=1),
         "root": math.sqrt,
         "sides": lambda: (12, 8),
@@ -532,6 +538,10 @@ STANDARD_ERRORS = Exercise(
     ways=[
         ("n = each pixel's valid samples" + mix, {"count": _freedom, "pooled": std})
         for mix, std in (("", _pooled), _BY_SAMPLES)
+    ]
+    + [
+        ("n = frames, the rows of a frame alike", {"levels": lambda z: _lines(z, 1)}),
+        ("n = frames, the columns of a frame alike", {"levels": lambda z: _lines(z, 2)}),
     ],
 )
 

@@ -73,14 +73,6 @@ def _pair_by_halves(gripper_i: Floats, gripper_j: Floats, board_i: Floats, board
     return A, B
 
 
-def _pair_by_inverses(
-    gripper_i: Floats, gripper_j: Floats, board_i: Floats, board_j: Floats
-) -> Any:
-    A = np.linalg.inv(gripper_j) @ gripper_i
-    B = board_j @ np.linalg.inv(board_i)
-    return A, B
-
-
 MOTION_PAIR = Exercise(
     name="hand_eye.motion_pair",
     build=_build_pair,
@@ -98,7 +90,7 @@ MOTION_PAIR = Exercise(
     unit="m",
     describe=_describe_pair,
     show=lambda row: f"translations of A and B {_vector(row[0])} and {_vector(row[1])}",
-    styles=[_pair_by_halves, _pair_by_inverses],
+    styles=[_pair_by_halves],
 )
 
 
@@ -193,12 +185,6 @@ def _half_by_kabsch(R_A: Floats, R_B: Floats) -> Any:
     return U @ np.diag([1, 1, sign]) @ Vt
 
 
-def _half_by_motions(R_A: Floats, R_B: Floats) -> Any:
-    a = np.array([Rotation.from_matrix(A).as_rotvec() for A in R_A])
-    b = np.array([Rotation.from_matrix(B).as_rotvec() for B in R_B])
-    return Rotation.align_vectors(a, b)[0].as_matrix()
-
-
 def _half_by_null_space(R_A: Floats, R_B: Floats, row: int = -1) -> Any:
     eye = np.eye(3)
     M = np.vstack([np.kron(A, eye) - np.kron(eye, B.T) for A, B in zip(R_A, R_B, strict=True)])
@@ -232,7 +218,7 @@ ROTATION_HALF = Exercise(
         else f"{len(args[0])} motions" + ", the first two about one axis" * _parallel(args[0])
     ),
     show=lambda R: "; ".join(" ".join(f"{v:.3f}" for v in row) for row in np.atleast_2d(R)),
-    styles=[_half_by_kabsch, _half_by_motions, _half_by_null_space],
+    styles=[_half_by_kabsch, _half_by_null_space],
 )
 
 
