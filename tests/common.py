@@ -3,6 +3,7 @@
 import json
 import os
 import symtable
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from scipy.stats import binom
 from coursekit.boards import Board
 from coursekit.geometry import Intrinsics
 
+EXPECTED = tomllib.loads(Path(__file__).with_name("expected.toml").read_text(encoding="utf-8"))
 NIGHTLY = os.environ.get("COURSEKIT_NIGHTLY") == "1"
 nightly = pytest.mark.skipif(not NIGHTLY, reason="COURSEKIT_NIGHTLY is not 1")
 CHARUCO = Board("charuco", (9, 6), 0.025)

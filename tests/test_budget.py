@@ -36,15 +36,6 @@ def test_the_lessons_sums() -> None:
     assert 1e3 * held.worst_case_m[0] == pytest.approx(8.9)
 
 
-def test_the_lessons_random_model() -> None:
-    draws = eb.lesson_budget().draw(1_000_000, seed=0, directions="isotropic")
-    assert 1e3 * draws.mean_m == pytest.approx(5.4, abs=0.05)
-    assert 1e3 * draws.percentile_m(95) == pytest.approx(9.1, abs=0.05)
-    assert draws.share_over(0.007) == pytest.approx(0.23, abs=0.005)
-    for axis in eb.AXES:  # isotropic: every axis alike
-        assert draws.share_over(0.007, axis) == pytest.approx(0.034, abs=0.0006)
-
-
 def test_converted_rows() -> None:
     budget = eb.lesson_budget(stated=False)
     at = {row.term.name: (1e3 * row.low_m, 1e3 * row.high_m) for row in budget.rows}

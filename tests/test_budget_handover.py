@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from common import EXPECTED
 
 from coursekit import results
 from coursekit.budget import HandOver, hand_over, independent_frames
@@ -99,17 +100,7 @@ def test_nothing_yet(folders: tuple[Path, Path]) -> None:
     assert at_object_mm(handed)["depth bias"] == pytest.approx((1.6, 5.6))
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "named"),
-    [
-        ("}", "", "not a JSON file"),
-        ('"format": 2', '"format": 0', "another version"),
-        ('"value": 0.0', '"value": null', "value"),
-        ('"04_hand_eye"', '"03_intrinsics"', "lesson: got '03_intrinsics', want 04_hand_eye"),
-        ('"rz"', '"turn"', "holds no rz with a sigma"),
-        ('"sigma": 0.05', '"sigma": null', "holds no rx with a sigma"),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "named"), EXPECTED["bad_hand_over"])
 def test_a_bad_file_is_named_and_replaced(folders, old: str, new: str, named: str) -> None:
     write(YOURS)
     path = folders[0] / "04_hand_eye.json"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from common import EXPECTED
 from fake_realsense import SERIAL, real_library
 
 from coursekit.cameras import CameraError, open_camera, realsense
@@ -86,17 +87,7 @@ def test_a_serial_number_that_is_not_there_lists_those_that_are(plug_in):
 # --- what goes wrong ---
 
 
-@pytest.mark.parametrize(
-    ("error", "advice"),
-    [
-        ("xioctl(VIDIOC_S_FMT) failed, errno=16 Last Error: Device or resource busy", "another pr"),
-        ("failed to set power state", "another program uses it: close the RealSense Viewer"),
-        ("failed to open usb interface: 0, error: RS2_USB_STATUS_ACCESS", "udev rules"),
-        ("Cannot open '/dev/video2': Permission denied", "udev rules"),
-        ("Couldn't resolve requests", "USB 3 port with a USB 3 cable"),
-        ("something new", r"something new\): unplug it"),
-    ],
-)
+@pytest.mark.parametrize(("error", "advice"), EXPECTED["does_not_start"])
 @pytest.mark.parametrize("which", ["auto", SERIAL])
 def test_a_camera_that_does_not_start_is_never_replaced(plug_in, which, error, advice):
     plug_in(start_error=error)

@@ -371,36 +371,6 @@ def test_damage_inside_is_noticed(good, tmp_path, k):
             assert len(played.frames(k - 1)) == k - 1
 
 
-# --- recordings without depth, named for what they are ---
-
-
-def ros2(*topics):
-    def make(path):
-        robot(path)
-        with sqlite3.connect(path) as file:
-            rows = [(i, topic, "", "", "") for i, topic in enumerate(topics)]
-            file.executemany("INSERT INTO topics VALUES (?, ?, ?, ?, ?)", rows)
-
-    return make
-
-
-ORBBEC = ("/tf", "/camera/depth/camera_info", "/camera/depth/image_rect_raw", "/joint_states")
-
-
-@pytest.mark.parametrize(
-    ("name", "make", "topic"),
-    [
-        ("ros2.db3", ros2(*ORBBEC), "/camera/depth/image_rect_raw"),
-        ("arm.db3", ros2("/joint_states", "/tf"), "/joint_states"),
-    ],
-)
-def test_a_recording_of_ros_topics_is_named_for_what_it_is(rs, tmp_path, name, make, topic):
-    make(tmp_path / name)
-    what = rf"is a recording of ROS topics \({topic} \.\.\.\) without depth images"
-    with pytest.raises(CameraError, match=what):
-        open_camera(tmp_path / name)
-
-
 # --- a folder of depth images ---
 
 

@@ -7,6 +7,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from common import EXPECTED
 from fake_realsense import real_library
 
 from coursekit import cli
@@ -19,6 +20,7 @@ from coursekit.simulation.arm_sessions import truth_of
 CHARUCO = Board("charuco", (9, 6), 0.025)
 
 
+@pytest.mark.usefixtures("small_cameras")
 def test_record_writes_a_recording_and_says_how_to_play_it(tmp_path, capsys):
     real_library()
     path = tmp_path / "a.db3"
@@ -42,21 +44,7 @@ def test_it_says_which_course_this_is(capsys):
     assert capsys.readouterr().out == f"coursekit {cli.doctor.edition()}\n"
 
 
-FAILURES = [
-    ("record --out a.bag --frames 3 --camera simulated", "--out: got 'a.bag', want"),
-    ("record --out a.db3 --frames 0 --camera simulated", "--frames: got 0, want a whole"),
-    ("record --out a.db3 --frames 3 --camera bogus", "--camera: got 'bogus', want"),
-    ("record --out a.db3 --frames 3 --camera=", "--camera: got '', want"),
-    ("board --out a.pdf --squares 9x6 --square-mm 40", "--paper: a board of 360 x 240 mm does"),
-    ("board --out a.pdf --squares 9x1 --square-mm 25", "--squares: got (9, 1), want (columns, "),
-    (
-        "board --out a.pdf --squares 9x6 --square-mm -1",
-        "--square-mm (here in m): got -0.001, want 0.000",
-    ),
-]
-
-
-@pytest.mark.parametrize(("arguments", "message"), FAILURES)
+@pytest.mark.parametrize(("arguments", "message"), EXPECTED["cli_failures"])
 def test_a_failure_is_one_line_and_exit_code_1(arguments, message, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert cli.main(arguments.split()) == 1

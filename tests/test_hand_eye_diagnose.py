@@ -13,11 +13,10 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from common import NIGHTLY, check_named
-from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from coursekit.arm import ArmErrors, pose_difference, widowx
-from coursekit.causes import CauseSearch, likelihood_ratios
+from coursekit.causes import CauseSearch
 from coursekit.geometry import invert_transform, make_transform
 from coursekit.hand_eye import causes, misread
 from coursekit.hand_eye.causes import Arms, MendedPairs, PosePairs
@@ -236,29 +235,3 @@ def test_velocities_come_from_the_times_of_small_steps() -> None:
     assert finding.name == "late_time_stamps"
     delay = float(finding.evidence.split()[0])
     assert delay == pytest.approx(50, abs=4)
-
-
-# --- the parts ---
-
-
-def test_gain_is_that_of_the_full_likelihood() -> None:
-    """A scale's gain against a direct minimisation over X, Y, scale, at one covariance."""
-    given, _ = session(FIRST_SEED + 2, M(square_scale=1.02), n=12)
-    pairs = PosePairs.of(given)
-    model = MendedPairs(Arms(widowx(), None, given.q), pairs.fit)
-    [hypothesis] = [h for h in model.hypotheses() if h.cause == causes.SCALE]
-    residuals, covariance = pairs.fit.twists.ravel(), next(model.covariances())
-    J = pairs.fit.columns.reshape(len(residuals), -1)
-    [scale] = likelihood_ratios(residuals, J, [hypothesis], [covariance])
-    root = np.linalg.inv(np.linalg.cholesky(covariance))
-    columns, right = root @ J, root @ residuals
-    extra = np.zeros((len(pairs), 6))
-    extra[:, 3:] = -pairs.T_camera_board[:, :3, 3]
-
-    def squares(size: np.ndarray) -> float:
-        left = right - root @ extra.ravel() * size[0]
-        return float(((left - columns @ np.linalg.lstsq(columns, left, rcond=None)[0]) ** 2).sum())
-
-    found = minimize(squares, [0.0], method="Nelder-Mead", options={"xatol": 1e-8})
-    assert scale.coefficients[0] == pytest.approx(found.x[0], rel=1e-3)
-    assert scale.gain == pytest.approx(squares(np.zeros(1)) - found.fun, rel=1e-3)

@@ -84,10 +84,10 @@ FAR_LENS = Intrinsics(1280, 720, 900.0, 900.0, 640.0, 360.0)
 
 @claim("I2", "right")
 def test_i2_tilt_makes_the_focal_length_known() -> None:
-    """Exact sigmas of fx, the spread of fits, and that residuals show neither.
+    """Exact sigmas of fx, and that residuals do not show them.
 
-    Nine by six inner corners, every view tilted by the angle, to all sides. Fits scatter, and say
-    that they do, as the exact sigma; at 1 degree one in a hundred finds no camera at all.
+    Nine by six inner corners, every view tilted by the angle, to all sides. That fits scatter as
+    their sigmas say is shown in test_intrinsics_uncertainty.py.
     """
     percent = {1: 41.0, 2: 10.0, 5: 1.8, 10: 0.52, 20: 0.20, 45: 0.10}
     ROWS["I2"].says(" / ".join(f"{p:.2f}" if p < 1 else f"{p:g}" for p in percent.values()))
@@ -101,22 +101,6 @@ def test_i2_tilt_makes_the_focal_length_known() -> None:
         exact = evaluate(FAR_LENS, poses, clean, CHECKERBOARD, CHECKERBOARD.points, names, "none")
         sigma = 0.2 * math.sqrt(exact.equations.shared_covariance[0, 0])
         assert 100 * sigma / FAR_LENS.fx == pytest.approx(wanted, rel=0.15)
-        if tilt not in (percent if NIGHTLY else (2, 20)):
-            continue
-        rng, focal, sigmas = np.random.default_rng(tilt), [], []
-        for _ in range(300 if NIGHTLY else 20):
-            noisy = [replace(d, pixels=d.pixels + rng.normal(0, 0.2, (54, 2))) for d in clean]
-            try:
-                found = intrinsics.calibrate(noisy, CHECKERBOARD, model="none")
-            except intrinsics.CalibrationFailed:
-                assert tilt == 1
-                continue
-            focal.append(100 * found.value("fx") / FAR_LENS.fx)
-            sigmas.append(100 * found.sigma("fx") / found.value("fx"))
-        low, high = np.quantile(focal, [0.1587, 0.8413])  # robust: at 1 deg a few run away
-        factor = 1.3 if tilt >= 5 else 1.6  # far from linear below
-        assert 1 / factor < (high - low) / 2 / wanted < factor
-        assert 1 / factor < np.median(sigmas) / wanted < factor
     flat = fits(CHECKERBOARD, effects=Effects(max_tilt_deg=3.0))
     tilted = fits(CHECKERBOARD)
     for useless, useful in zip(flat, tilted, strict=True):

@@ -9,6 +9,7 @@ from statistics import median
 import numpy as np
 import pytest
 
+from coursekit import stereo
 from coursekit.lessons import CHECKPOINTS
 from coursekit.lessons.depth_noise import DEPTH_NOISE, IMAGE, ROBUST_DEPTH
 from tools import build_notebooks
@@ -61,8 +62,8 @@ def pixel_by_pixel(depth_m, u, v, half=2, min_valid=5):
     return median(found) if len(found) >= min_valid else math.nan
 
 
-def test_the_model_is_an_independent_ones_everywhere_in_and_around_the_image() -> None:
-    model = ROBUST_DEPTH.model()
+@pytest.mark.parametrize("model", [ROBUST_DEPTH.model(), stereo.robust_depth])
+def test_robust_depth_is_an_independent_ones_everywhere_in_and_around_the_image(model) -> None:
     for u in range(-4, 20):
         for v in range(-4, 16):
             for half, min_valid in ((0, 1), (1, 5), (2, 5), (3, 12)):

@@ -8,6 +8,7 @@ import shutil
 
 import numpy as np
 import pytest
+from common import EXPECTED
 from fake_realsense import real_library
 
 from coursekit.cameras import CameraError, open_camera, place
@@ -292,20 +293,7 @@ def test_a_bad_set_is_refused(tmp_path, arguments, message):
     assert not list(tmp_path.rglob("*.*"))
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("{", "not a JSON file"),
-        ("{}", "'scenes'"),
-        ('{"scenes": []}', "it lists no scenes"),
-        ('{"scenes": [{"name": "wall"}]}', "missing"),
-        ('{"scenes": [{"name": "wall", "distance_m": 0, "file": "a.db3"}]}', "distance_m: got 0"),
-        (
-            '{"scenes": [{"name": "wall", "distance_m": 1, "file": "../a.db3"}]}',
-            "want a name in the set's own folder",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("content", "message"), EXPECTED["damaged_index"])
 def test_a_damaged_index_says_so(tmp_path, content, message):
     (tmp_path / "index.json").write_text(content, encoding="utf-8")
     with pytest.raises(CameraError, match=rf"index\.json is damaged \(.*{message}"):

@@ -20,6 +20,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import pytest
+from common import EXPECTED
 from packaging.markers import Marker
 
 from coursekit.doctor import NEWEST_TESTED, OLDEST, pins
@@ -249,19 +250,7 @@ def faults_of(name: str) -> str:
     return "its length" if len(name) > 120 else ""  # of 259, the rest is the user's folder
 
 
-@pytest.mark.parametrize(
-    ("name", "fault"),
-    [
-        ("data/aux.csv", "a device"),
-        ("COM1", "a device"),
-        ("a/b:c.txt", "a character"),
-        ("a./b", "a dot or space at the end"),
-        ("été.txt", "a letter that systems store in different ways"),
-        ("a/" * 70, "its length"),
-        ("data/auxiliary.csv", ""),
-        (".ci/run", ""),
-    ],
-)
+@pytest.mark.parametrize(("name", "fault"), EXPECTED["names_of_files"])
 def test_names_that_windows_cannot_have(name: str, fault: str) -> None:
     assert faults_of(name) == fault
 

@@ -186,30 +186,6 @@ def test_the_wall_has_a_line_every_100_mm():
     assert np.abs(dark[:, None] - lines).min(axis=1).max() <= 2
 
 
-def test_a_hit_names_the_face_and_where_on_it():
-    """Rays from outside to chosen points of each face of a turned box."""
-    size = np.array([0.2, 0.3, 0.4])
-    T = pose((25, -40, 70), (0.1, -0.2, 1.5))
-    row = np.concatenate([T[:3, 3], size / 2, T[:3, :3].ravel()])[None]
-    rng = np.random.default_rng(8)
-    for face in range(6):
-        axis, sign = face // 2, 2 * (face % 2) - 1
-        others = [k for k in range(3) if k != axis]
-        point = rng.uniform(-0.45, 0.45, 3) * size
-        point[axis] = sign * size[axis] / 2
-        start = rng.uniform(-0.3, 0.3, 3)
-        start[axis] = sign * 0.9
-        start_out, point_out = T[:3, :3] @ start + T[:3, 3], T[:3, :3] @ point + T[:3, 3]
-        half_way = (point_out - start_out) / 2
-        t, index, hit_face, p, q = raycast.nearest_hit(row, *start_out, *half_way)
-        assert (index, hit_face) == (0, face)
-        assert (t, p, q) == pytest.approx((2, *point[others]), abs=1e-12)
-        outwards = start_out - point_out
-        assert raycast.nearest_hit(row, *start_out, *outwards)[1] == -1
-        assert raycast.nearest_hit(row, *T[:3, 3], *outwards)[1] == -1  # from inside
-    assert raycast.nearest_hit(row, 0.0, 0.0, 0.0, np.nan, 0.0, 1.0)[1] == -1
-
-
 def test_a_ray_along_a_face_hits_where_it_should():
     unit = np.array([[0, 0, 2, 0.5, 0.5, 0.5, 1, 0, 0, 0, 1, 0, 0, 0, 1]], float)
     assert raycast.nearest_hit(unit, 0.4, -0.2, 0.0, 0.0, 0.0, 1.0) == (1.5, 0, 4, 0.4, -0.2)

@@ -10,7 +10,7 @@ from collections import Counter
 
 import pytest
 from bs4 import BeautifulSoup
-from common import contrast
+from common import EXPECTED, contrast
 
 import coursekit as ck
 from coursekit.plots.style import COLORS
@@ -365,19 +365,7 @@ def test_every_formula_is_drawn(pages):
         assert "\\" not in page.text
 
 
-@pytest.mark.parametrize(
-    ("latex", "wanted"),
-    [
-        (r"\boxed{u}", r'<mrow class="boxed"><mrow><mi>u</mi></mrow></mrow>'),
-        (r"\begin{aligned} a &= b\\ c &= d\end{aligned}", r'<mtable class="aligned".*(<mtr>.*){2}'),
-        (r"s\begin{pmatrix} u\\ v\end{pmatrix}", r"</mi><mrow>(<mrow>)?<mo>&#x00028;</mo><mtable>"),
-        (r"\underbrace{A}_{K}", r"<munder>.*&#x23DF;.*<mi>K</mi>"),
-        (r"\mathbf r^\top", r"<mi>&#x1D42B;</mi>"),
-        (r"Z + X \sin\alpha", r'<mi>sin</mi><mspace width="0.167em" ?/><mi>&#x003B1;</mi>'),
-        (r"X/Z", r'<mo lspace="0" rspace="0">/</mo>'),
-        (r"a \qquad \text{and so on}", r'<mspace width="2em" ?/><mtext>and&#x000A0;so&#x000A0;on'),
-    ],
-)
+@pytest.mark.parametrize(("latex", "wanted"), EXPECTED["mathematics"])
 def test_what_the_converter_leaves_to_us(latex, wanted):
     assert re.search(wanted, mathml(latex)), mathml(latex)
 

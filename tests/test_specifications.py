@@ -142,7 +142,6 @@ def test_published_noise_implies_the_published_exponents() -> None:
     np.testing.assert_allclose(pixels.std_mm, 1e3 * std, atol=5e-3)
     implied = std / depth_noise(z, model["fx_baseline_px_m"], 1.0, 1.0)
     np.testing.assert_allclose(model["sigma_d_px"], implied, atol=6e-4)
-    assert implied == pytest.approx([0.147, 0.083, 0.045, 0.055, 0.061], abs=0.003)
 
 
 def test_the_848_crop_follows_the_rule_that_published_units_follow():

@@ -54,33 +54,6 @@ def test_depth_from_disparity_and_its_slope_by_numerical_derivative():
     assert np.isnan(stereo.depth_from_disparity([0.0, -1.0, np.nan, np.inf], FX, BASELINE)).all()
 
 
-# --- robust depth ---
-
-
-def test_robust_depth_is_the_median_of_what_is_valid():
-    image = np.full((20, 30), 0.5)
-    image[8:13, 8:13] = np.arange(25).reshape(5, 5) / 1000 + 0.4
-    image[8, 8:13] = [0.0, np.nan, -1.0, np.inf, 0.0]
-    want = np.median(np.arange(5, 25)) / 1000 + 0.4
-    assert stereo.robust_depth(image, 10, 10) == pytest.approx(want)
-    assert stereo.robust_depth(image, 10.49, 9.51) == pytest.approx(want)
-    counts = np.full((20, 30), 450, np.uint16)
-    assert stereo.robust_depth(counts, 3, 3) == 450.0
-
-
-def test_robust_depth_at_the_border_cuts_and_wants_enough_valid_pixels():
-    image = np.full((20, 30), 9.0)
-    image[:3, :3] = 0.5
-    assert stereo.robust_depth(image, 0, 0) == 0.5
-    assert stereo.robust_depth(image, 29, 19) == 9.0
-    assert np.isnan([stereo.robust_depth(image, *at) for at in ((-3, 0), (500, 500))]).all()
-    image = np.zeros((9, 9))
-    image[4, 2:6] = 0.5
-    assert math.isnan(stereo.robust_depth(image, 4, 4))
-    assert stereo.robust_depth(image, 4, 4, min_valid=4) == 0.5
-    assert math.isnan(stereo.robust_depth(np.zeros((9, 9)), 4, 4, min_valid=1))
-
-
 # --- rounding ---
 
 
