@@ -361,6 +361,7 @@ class Exercise:
             square and np.linalg.det(v) < 0 and self._agrees(v @ v.T, np.eye(3)) for v in values
         ]
         wild = [not (np.abs(v) <= 1e6 * (1 + np.nanmax(np.abs(e)))).all() for v, e in both]
+        holes = [bool(np.isnan(v).any()) for v in values]
         same = all(np.array_equal(v, values[0], equal_nan=True) for v in values)
         holds = {
             "digits": all(np.allclose(v, e, 1e-5, 10 * self.tolerance, True) for v, e in both),
@@ -371,11 +372,8 @@ class Exercise:
             and all(
                 ok or abs(np.vdot(e, v) + 1) < 1e-6 for ok, (v, e) in zip(right, both, strict=True)
             ),
-            "hole_spreads": any(np.isnan(v).any() for v in values)
-            and all(
-                np.isnan(v).any() == _has_hole(args)
-                for v, args in zip(values, self.cases, strict=True)
-            ),
+            "hole_spreads": 0 < sum(holes) < len(both)
+            and holes == list(map(_has_hole, self.cases)),
             "runs_away": all(wild) or (any(wild) and not self.nan_answers),
             "nothing": same and not values[0].any(),
             "constant": same,
