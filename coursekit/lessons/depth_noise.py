@@ -398,9 +398,11 @@ def _wraps_round(row: Model) -> Model:
     return lambda *args: np.r_[bias(*args), row(*args)[1:]]
 
 
-def _about_the_distance(counts: Any, scale: float, distance: float) -> Any:
-    error = 1e3 * (np.where(counts > 0, scale * counts, np.nan) - distance)
-    return np.nanmean(error), np.sqrt(np.nanmean(error**2)), np.mean(counts == 0)
+def _about_the_distance(row: Model) -> Model:
+    def std(c: Any, scale: float, distance: float) -> Any:
+        return 1e3 * np.sqrt(np.nanmean((np.where(c > 0, scale * c, np.nan) - distance) ** 2))
+
+    return lambda *args: np.array([row(*args)[0], std(*args), row(*args)[2]])
 
 
 # Tried two at a time are only these steps': with eight ways to be right, all would take too long.
@@ -430,7 +432,7 @@ TABLE_ROW.add_mistakes(
     ("std", "over_space", lambda z: np.nanstd(np.nanmean(z, axis=0), ddof=1)),
     ("std", "over_everything", np.nanstd),
     ("std", "over_everything", lambda z: np.nanstd(z, ddof=1)),
-    ("", "about_the_distance", lambda _: _about_the_distance),
+    ("", "about_the_distance", _about_the_distance),
     ("keep", "mixed_treatment", lambda z: (_left_out(z), z)),
     ("keep", "mixed_treatment", lambda z: (z, _left_out(z))),
     ("keep", "median_of_all", lambda z: (_left_out(z, None),) * 2),
@@ -551,14 +553,13 @@ def _samples_independent(z: Floats) -> Floats:
     return np.array([np.nanstd(z, ddof=1) / math.sqrt(n), _pooled(z) / math.sqrt(2 * (n - 1))])
 
 
-def _patches_of_every_frame(z: Floats) -> Floats:
-    n = z.size / 12**2
-    return np.array([np.nanstd(z, ddof=1) / math.sqrt(n), 0])
+def _patches_of_every_frame(errors: Model) -> Model:
+    return lambda z: np.array([12 * np.nanstd(z, ddof=1) / math.sqrt(z.size), errors(z)[1]])
 
 
 STANDARD_ERRORS.add_mistakes(
     ("", "pixels_independent", lambda _: _samples_independent),
-    ("", "patches_of_every_frame", lambda _: _patches_of_every_frame),
+    ("", "patches_of_every_frame", _patches_of_every_frame),
     ("patches", "pattern_forgotten", lambda area, side: math.inf),
     ("patches", "pixels_independent", lambda area, side: area),
     ("squares", "pixels_independent", lambda dof, area, side: 2 * dof * area),

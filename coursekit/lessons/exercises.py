@@ -152,7 +152,9 @@ class Exercise:
             warnings.simplefilter("ignore")
             verdicts = [exercise._verdict(function) for exercise in (*self._others, self)]
         known = ("right", *(m.name for m in self.mistakes))
-        return min(verdicts[::-1], key=lambda v: (v.named or v.kind) not in known)
+        return min(
+            verdicts[::-1], key=lambda v: (v.kind != "right", (v.named or v.kind) not in known)
+        )
 
     @cached_property
     def _others(self) -> list[Exercise]:
@@ -279,6 +281,10 @@ class Exercise:
         if formal:
             return self._several(formal[0], count, evidence)
         mistakes = self._found(values, relation in FOUND["told"])
+        if len(mistakes) == 1 and FOUND["unseen"] in _in_words(mistakes[0], known).says:
+            lines = (m for m in self._edits[1] if FOUND["line"] in m.says)
+            clearer = (m for m in lines if self._explains((m,), values))
+            mistakes = (next(clearer, mistakes[0]),)
         if self.core and not mistakes:  # what is wrong there may hide behind the rest
             of_core = [i for i, args in enumerate(self.cases) if self.is_core(args)]
             ours, wanted = ([of[i] for i in of_core] for of in (values, expected))
@@ -667,10 +673,11 @@ def _all_edits(exercise: Exercise) -> tuple[list[Mistake], list[Mistake], list[M
     inputs = [f"`{name}`" for name in inspect.signature(exercise.model()).parameters]
     rewritten = [(name, edit) for name, step in steps.items() for edit in _rewritten(step)]
     found: list[tuple[str, str, str, Step]] = []
-    for style in exercise.styles:
-        for n, kind, where, new in _rewritten(style, whole=True):
-            if n == 1:
-                found.append((kind, where, "", lambda _, new=new: new))
+    lines = [
+        (kind, where, "", lambda _, new=new: new)
+        for style in exercise.styles
+        for n, kind, where, new in _rewritten(style, whole=True)
+    ]
     found += [(kind, where, name, new) for name, (n, kind, where, new) in rewritten if n == 1]
     for kind, where, edit in _edits_of(args, _listed(inputs), inputs):
         found.append((kind, where, "", lambda f, e=edit: lambda *a: f(*e(a))))
@@ -687,15 +694,12 @@ def _all_edits(exercise: Exercise) -> tuple[list[Mistake], list[Mistake], list[M
         for name, (n, kind, where, new) in rewritten
         if n == 2
     ]
-    known = {*inspect.signature(exercise.model()).parameters, *exercise.seen.split()}
-
-    def vague(edit: tuple[str, str, str, Step]) -> tuple[bool, bool]:
-        kind, where = edit[:2]
-        line, names = FOUND["line"] in where, set(re.findall(r"`(\w+)`", where))
-        return not (line or (names and names <= known)), line and kind in FOUND["wrapped"]
-
-    edits = [_device(*edit) for edit in sorted(found, key=vague)]
+    edits = [_device(*edit) for edit in (*found, *sorted(lines, key=_is_wrapped))]
     return _result_edits(exercise), edits, pairs
+
+
+def _is_wrapped(edit: tuple[str, str, str, Step]) -> bool:
+    return edit[0] in FOUND["wrapped"]
 
 
 def _device(kind: str, where: str, step: str, wrong: Step, before: str = "") -> Mistake:
