@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import re
 import sys
 import tomllib
 from collections.abc import Callable, Sequence
@@ -19,6 +20,7 @@ import coursekit as ck
 from coursekit import doctor
 from coursekit.boards import Board
 from coursekit.boards.board import Skipped
+from coursekit.checks import want
 from coursekit.words import Estimate, Findings, say, wrapped
 
 SHOWN = 3  # images that were not used
@@ -26,7 +28,12 @@ SHOWN = 3  # images that were not used
 OPTIONS = {"path": "--out", "n": "--frames", "which": "--camera", "distance_m": "--distance"}
 OPTIONS |= {f"{name}_m": f"--{name}-mm (here in m)" for name in ("square", "marker")}
 OPTIONS |= {name: f"--{name}" for name in ("squares", "paper", "dictionary", "workers", "timeout")}
-INSTEAD = {"overwrite=True": "--overwrite", "run this cell again": "run this again"}
+SAID = r"\b(mount|rotation|length|angle)=[\"'](\w+)[\"']"
+INSTEAD = {
+    "in_order=True": "--in-order",
+    "overwrite=True": "--overwrite",
+    "run this cell again": "run this again",
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -58,7 +65,7 @@ def _typed(text: str) -> str:
     """The text as somebody reads it who types options and not Python."""
     for python, option in INSTEAD.items():
         text = text.replace(python, option)
-    return text
+    return re.sub(SAID, r"--\1 \2", text)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -123,6 +130,7 @@ def _calibrate(options: argparse.Namespace) -> None:
 
 
 def _hand_eye(options: argparse.Namespace) -> None:
+    want(Path(options.lens).is_file(), "--lens", options.lens, "the file of a lens")
     lens = ck.geometry.Intrinsics.from_file(options.lens)
     said = {name: getattr(options, name) for name in ("rotation", "length", "angle", "in_order")}
     what = options.folder, options.mount, _described(options), lens
@@ -145,7 +153,11 @@ def _say_how_good(
         print(f"not used: {len(skipped) - SHOWN} more")
     for number, finding in enumerate(findings, 1):
         print(wrapped(f"{number}. {finding.title}: {finding.says}"))
-    print(wrapped(f"Do first: {findings[0].remedy}") if findings else result.verdict())
+        if number == 1:
+            print(wrapped(_typed(f"  {finding.evidence}")))
+            print(wrapped(_typed(f"  Do first: {finding.remedy}")))
+    if not findings:
+        print(result.verdict())
     print("Numbers, evidence, and what else there is to do: the same with --details.")
 
 

@@ -268,11 +268,6 @@ def read(path: Path) -> Result:
 
 # --- to other programs ---
 
-FROM = "a file, or a result that notebook 03 or 04 kept in {}/; `ck.export(result)` takes your own"
-UNSAID_PARENT = (
-    "in {parent}, for nobody said `parent`: it is the frame of your arm's poses (on a Universal "
-    "Robots arm tool0, beside it base, which is turned by 180 deg from base_link)"
-)
 COMMENTS = {"urdf": "<!-- {} -->\n"} | dict.fromkeys(("ros", "tf2", "moveit"), "# {}\n")
 
 
@@ -326,7 +321,10 @@ def export(
         checks.choice("to (of a camera's place)", to, (*pose_files.PLACE_FORMATS, "json"))
         placed = replace(found, parent=parent or found.parent, child=optical)
         text, notes = _place_text(placed, to, link, T_link_optical)
-        verdict, unsaid = found.verdict, "" if parent else UNSAID_PARENT.format(parent=found.parent)
+        verdict, unsaid = (
+            found.verdict,
+            "" if parent else say("others.unsaid_parent", parent=found.parent),
+        )
     comment = COMMENTS.get(to, "")
     text = (
         "".join(comment.format(one.replace("--", "-")) for one in (verdict, unsaid) if one) + text
@@ -364,7 +362,7 @@ def _exportable(what: Any) -> Intrinsics | Placement:
         return checks.instance("what", what.intrinsics, Intrinsics)
     want(isinstance(what, (str, os.PathLike)), "what", what, "a result, or the path of a file")
     path = Path(what) if Path(what).exists() else folder() / f"{what}.json"
-    want(path.is_file(), "what", os.fspath(what), FROM.format(folder().name))
+    want(path.is_file(), "what", os.fspath(what), say("others.no_result", folder=folder().name))
     try:
         result = read(path)
     except ValueError:  # no result of a notebook: a lens, whose reader says what else it is

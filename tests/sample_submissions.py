@@ -22,7 +22,7 @@ from coursekit import specifications
 from coursekit.submission import format as bundle
 from coursekit.submission.flags import Fingerprint, data_flags, fingerprint
 from coursekit.submission.format import CameraFacts, Outcome, Plot, Stack, Submission, TableRow
-from coursekit.submission.recompute import Recomputed, recompute
+from coursekit.submission.recompute import AtDistance, Recomputed, recompute
 from coursekit.submission.rubric import JUDGES, Grade, Item, judged
 
 DISTANCES = (0.30, 0.45, 0.60)
@@ -261,7 +261,11 @@ def mistaken(seed: int = 0) -> dict[str, tuple[str, Submission]]:
     tapes = {"tape_only": 0.0001, "no_tape": 0}
     wrong = {}
     for code, (topic, value) in numbers.items():
-        changed = with_row(good, 1, **{JUDGES[topic][0]: value})
+        changed = good
+        for i in (
+            range(3) if code == "tape_only" else [1]
+        ):  # the others' errors hold the tape's, too
+            changed = with_row(changed, i, **{JUDGES[topic][0]: value})
         wrong[code] = topic, replace(changed, tape_sigma_m=tapes.get(code, good.tape_sigma_m))
     coarse = honest(seed)
     near = recompute(coarse).at[0]
@@ -301,6 +305,236 @@ def mistaken(seed: int = 0) -> dict[str, tuple[str, Submission]]:
         "short": ("paragraph", concluding(paragraph="so")),
         "incomplete": ("data", weak(seed)),
     }
+
+
+# --- sloppy: one cause each -----------------------------------------------------------------------
+
+
+def _samples_mm(m: AtDistance) -> NDArray[np.float64]:
+    """The raw depths (N, h, w) in mm, NaN where there is none."""
+    return np.where(m.stack.counts > 0, 1e3 * m.scale_m * m.stack.counts, np.nan)
+
+
+def _in_rows(field: str, wrong: Callable[[AtDistance, TableRow], float]):
+    """What makes the same mistake in one column of the table at every distance."""
+
+    def make(good: Submission, found: Recomputed) -> Submission:
+        pairs = zip(found.at, good.claims.rows, strict=True)
+        rows = tuple(replace(row, **{field: wrong(m, row)}) for m, row in pairs)
+        return with_part(good, "claims", rows=rows)
+
+    return make
+
+
+def _of_all(part: str, wrong: Callable[[Submission, Recomputed], dict[str, Any]]):
+    """What makes a mistake in the claims, the plot or the conclusion as a whole."""
+    return lambda good, found: with_part(good, part, **wrong(good, found))
+
+
+def _swapped(good: Submission, _: Recomputed) -> Submission:
+    """The rows of 0.30 and 0.60 m mixed up."""
+    near, middle, far = good.claims.rows
+    near, far = replace(far, distance_m=0.30), replace(near, distance_m=0.60)
+    return with_part(good, "claims", rows=(near, middle, far))
+
+
+def _columns(good: Submission, _: Recomputed) -> Submission:
+    """The columns of bias and std mixed up."""
+    rows = tuple(
+        replace(row, depth_bias_mm=row.depth_std_mm, depth_std_mm=abs(row.depth_bias_mm))
+        for row in good.claims.rows
+    )
+    return with_part(good, "claims", rows=rows)
+
+
+def _all_in_metres(good: Submission, _: Recomputed) -> Submission:
+    lengths = ("depth_bias_mm", "depth_bias_se_mm", "depth_std_mm", "depth_std_se_mm")
+    rows = tuple(
+        replace(row, **{name: getattr(row, name) / 1e3 for name in lengths})
+        for row in good.claims.rows
+    )
+    return with_part(good, "claims", rows=rows)
+
+
+def _another_table(good: Submission, _: Recomputed) -> Submission:
+    return replace(good, claims=honest(int(good.student.split()[1]) + 500).claims)
+
+
+def _scaled_sigma_d(factor: float):
+    def wrong(good: Submission, _: Recomputed) -> dict[str, Any]:
+        low, high = good.claims.sigma_d_interval_px
+        ends = factor * low, factor * high
+        return {"sigma_d_px": factor * good.claims.sigma_d_px, "sigma_d_interval_px": ends}
+
+    return _of_all("claims", wrong)
+
+
+def _one_sigma(good: Submission, found: Recomputed) -> dict[str, Any]:
+    law = found.law
+    near, far = np.exp(np.array([-1, 1]) * law.covariance[0, 0] ** 0.5) * law.sigma_d_px
+    return {"sigma_d_interval_px": (float(near), float(far))}
+
+
+def _times(factor: float):
+    return lambda _, row: factor * row.depth_std_mm
+
+
+BIAS, BIAS_SE, STD, STD_SE = (f"depth_{name}_mm" for name in ("bias", "bias_se", "std", "std_se"))
+TABLE = {"bias", "bias_se", "std", "std_se", "invalid"}
+SLOPPY: dict[str, tuple[set[str], str, Callable[[Submission, Recomputed], Submission]]] = {
+    # how: the topics it may cost, the reason that is the real one ("": none has a name), the change
+    "sign": ({"bias"}, "sign", _in_rows(BIAS, lambda _, row: -row.depth_bias_mm)),
+    "depth for bias": (
+        {"bias"},
+        "level",
+        _in_rows(BIAS, lambda m, row: 1e3 * m.distance_m + row.depth_bias_mm),
+    ),
+    "zeros in bias": (
+        {"bias"},
+        "zeros",
+        _in_rows(
+            BIAS, lambda m, _: float(np.nan_to_num(_samples_mm(m)).mean()) - 1e3 * m.distance_m
+        ),
+    ),
+    "from the glass": ({"bias"}, "", _in_rows(BIAS, lambda _, row: row.depth_bias_mm + 4.2)),
+    "metres": (TABLE, "metres", _all_in_metres),
+    "ddof 0": (
+        set(),
+        "",
+        _in_rows(STD, lambda m, _: float(np.sqrt(np.nanvar(_samples_mm(m), axis=0).mean()))),
+    ),
+    "variance": ({"std"}, "variance", _in_rows(STD, lambda _, row: row.depth_std_mm**2)),
+    "zeros in std": (
+        {"std"},
+        "zeros",
+        _in_rows(
+            STD,
+            lambda m, _: float(np.sqrt(np.nan_to_num(_samples_mm(m)).var(axis=0, ddof=1).mean())),
+        ),
+    ),
+    "all samples": ({"std"}, "mixed", _in_rows(STD, lambda m, _: float(np.nanstd(_samples_mm(m))))),
+    "over the pixels": (
+        {"std"},
+        "spatial",
+        _in_rows(STD, lambda m, _: 1e3 * m.stats.spatial_std_m),
+    ),
+    "of the mean": (
+        {"std"},
+        "of_the_mean",
+        _in_rows(STD, lambda m, _: float(np.nanmean(_samples_mm(m), axis=(1, 2)).std(ddof=1))),
+    ),
+    "over root N": ({"std"}, "standard_error", _in_rows(STD, lambda _, row: row.depth_std_mm / 10)),
+    "one pixel": (
+        {"std"},
+        "middle_pixel",
+        _in_rows(
+            STD,
+            lambda m, _: float(
+                _samples_mm(m)[:, m.stack.counts.shape[1] // 2, m.stack.counts.shape[2] // 2].std(
+                    ddof=1
+                )
+            ),
+        ),
+    ),
+    "1.2 times": ({"std"}, "", _in_rows(STD, _times(1.2))),
+    "half": ({"std"}, "", _in_rows(STD, _times(0.5))),
+    "one digit": (
+        {"std"},
+        "rounded",
+        _in_rows(STD, lambda _, row: float(f"{row.depth_std_mm:.0e}")),
+    ),
+    "std for error": (
+        {"bias_se"},
+        "not_divided",
+        _in_rows(BIAS_SE, lambda _, row: row.depth_std_mm),
+    ),
+    "independent": (
+        {"bias_se"},
+        "independent",
+        _in_rows(BIAS_SE, lambda m, row: row.depth_std_mm / m.stack.counts.size**0.5),
+    ),
+    "its own std": ({"std_se"}, "not_divided", _in_rows(STD_SE, lambda _, row: row.depth_std_mm)),
+    "error of one pixel": (
+        {"std_se"},
+        "one_pixel",
+        _in_rows(STD_SE, lambda _, row: row.depth_std_mm / 198**0.5),
+    ),
+    "percent": (
+        {"invalid"},
+        "percent",
+        _in_rows("invalid_fraction", lambda _, row: 100 * row.invalid_fraction),
+    ),
+    "valid": (
+        {"invalid"},
+        "complement",
+        _in_rows("invalid_fraction", lambda _, row: 1 - row.invalid_fraction),
+    ),
+    "ever": (
+        {"invalid"},
+        "ever",
+        _in_rows("invalid_fraction", lambda m, _: float((m.stack.counts == 0).any(axis=0).mean())),
+    ),
+    "rows": (TABLE, "", _swapped),
+    "columns": ({"bias", "std"}, "", _columns),
+    "another's table": ({*TABLE, "sigma_d", "sigma_d_interval"}, "", _another_table),
+    "baseline of a D455": ({"sigma_d", "sigma_d_interval"}, "", _scaled_sigma_d(1.9)),
+    "mm and m": ({"sigma_d"}, "millimetres", _scaled_sigma_d(1e3)),
+    "no interval": (
+        {"sigma_d_interval"},
+        "",
+        _of_all("claims", lambda *_: {"sigma_d_interval_px": None}),
+    ),
+    "one sigma": ({"sigma_d_interval"}, "one_sigma", _of_all("claims", _one_sigma)),
+    "exponent alone": (
+        {"exponent"},
+        "no_interval",
+        _of_all("claims", lambda _, found: {"exponent": found.free.exponent}),
+    ),
+    "plot in metres": (
+        {"plot"},
+        "",
+        _of_all(
+            "plot", lambda good, _: {"measured_mm": tuple(v / 1e3 for v in good.plot.measured_mm)}
+        ),
+    ),
+    "law of Z": (
+        {"plot"},
+        "proportional",
+        _of_all(
+            "plot", lambda good, _: {"predicted_mm": tuple(2 * z for z in good.plot.distances_m)}
+        ),
+    ),
+    "no prediction": (
+        {"plot"},
+        "no_prediction",
+        _of_all("plot", lambda *_: {"predicted_mm": None}),
+    ),
+    "copied": (
+        {"plot"},
+        "copied_prediction",
+        _of_all("plot", lambda good, _: {"predicted_mm": good.plot.measured_mm}),
+    ),
+    "the other": (
+        {"verdict"},
+        "other_dominates",
+        _of_all(
+            "conclusion",
+            lambda good, _: {
+                "dominates": "bias" if good.conclusion.dominates == "noise" else "noise"
+            },
+        ),
+    ),
+    "centimetres": (
+        {"verdict"},
+        "not_measured_there",
+        _of_all("conclusion", lambda *_: {"distance_m": 45.0}),
+    ),
+    "three words": (
+        {"paragraph"},
+        "short",
+        _of_all("conclusion", lambda *_: {"paragraph": "bias, I think"}),
+    ),
+}
 
 
 # --- copied and made up -------------------------------------------------------------------------

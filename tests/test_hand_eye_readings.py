@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from common import NIGHTLY
 from scipy.spatial.transform import Rotation
+from simulated_corners import ordinary_arm_session
 from simulated_hand_eye import free_session
 
 from coursekit.arm import widowx
@@ -162,6 +163,20 @@ def test_intrinsics_of_another_image_size(factor: float) -> None:
     smaller = replace(lens, width=320, height=240)
     with pytest.raises(ValueError, match="320"):
         diagnose(replace(given, intrinsics=smaller))
+
+
+@pytest.mark.parametrize("factor", [0.9, 1.1, 1.3])
+def test_intrinsics_of_another_camera(factor: float) -> None:
+    """Its focal length contradicts the images'."""
+    given = ordinary_arm_session(900_060, scatter_tails=False)[0]
+    lens = given.intrinsics
+    assert lens is not None
+    assert "foreign_lens" not in diagnose(given).names
+    wrong = replace(lens, fx=factor * lens.fx, fy=factor * lens.fy)
+    finding = diagnose(replace(given, intrinsics=wrong))[0]
+    assert finding.name == "foreign_lens"
+    own = float(finding.evidence.split("make it ")[1].split()[0])
+    assert own == pytest.approx(lens.fx, rel=0.03)
 
 
 @pytest.mark.parametrize("scatter_m", [0.0, 1e-5])

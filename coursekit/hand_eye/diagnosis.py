@@ -23,6 +23,7 @@ from coursekit.hand_eye.closed_form import FEWEST_POSES
 from coursekit.hand_eye.poses import camera_board, observability
 from coursekit.hand_eye.session import SENTENCES, HandEyeSession
 from coursekit.hand_eye.views import nearer
+from coursekit.intrinsics import CalibrationFailed, calibrate
 from coursekit.words import Finding, Findings
 
 _FARTHEST_M = 10.0  # that an arm reaches or a board is seen at; more is in millimetres
@@ -34,6 +35,9 @@ BELONGS_M = 1e-2  # joint angles that are off by more tell nothing of the arm's 
 POOR_RAD, POOR_M = np.radians(2.0), 0.02  # residuals that no working arm has
 HOPELESS_RAD = np.radians(10.0)  # beyond any slip, delay or wrong zero
 VIDEO_STEP_M, VIDEO_STEP_RAD = 0.1, np.radians(20.0)  # at most, for velocities from positions
+# What paper that is not flat does to the focal length of a session's images, besides their scatter:
+# 5 % in one of 60 simulated sessions, 2 % on real webcams.
+FOCAL_SPREAD, FOREIGN_SIGMAS = 0.02, 3.0
 FAR_FROM_MIDDLE = 0.12  # of the image: no camera's principal point is so far off
 
 
@@ -60,14 +64,15 @@ def diagnose(
     case.joints_in_degrees()
     if case.design():
         return case.findings("design")
+    untested = case.focal_length()
     case.readings()
     case.ambiguous_boards()
-    repeats = ["repeats"] * (session is not given)
+    untested += ["repeats"] * (session is not given)
     if len(case.pairs) < causes.FEWEST_PAIRS:
-        return case.findings("few", *repeats)
+        return case.findings("few", *untested)
     if case.hopeless:
-        return case.findings("residuals", *repeats)
-    return case.findings(*case.residuals(), *repeats)
+        return case.findings("residuals", *untested)
+    return case.findings(*case.residuals(), *untested)
 
 
 @dataclass(eq=False)
@@ -111,6 +116,24 @@ class _Case:
         figures = {"cx": lens.cx, "cy": lens.cy, "factor": factor}
         size = {"width": lens.width, "height": lens.height}
         self.add("lens_of_another_size", **figures, **size, **_change(given, mended.fit))
+
+    def focal_length(self) -> list[str]:
+        """Intrinsics of another camera: the images' own focal length tells; what is untested."""
+        lens, seen, board = self.session.intrinsics, self.session.detections, self.session.board
+        if self.found or lens is None or seen is None or board is None:
+            return []
+        try:
+            own = calibrate(seen, board, model="k1k2", same_focal=True, guess=lens)
+        except (CalibrationFailed, ValueError):  # too few views or corners for that
+            return ["lens"]
+        given, focal = float(np.sqrt(lens.fx * lens.fy)), own.value("f")
+        sigma = float(np.hypot(own.sigma("f") / focal, FOCAL_SPREAD))
+        if abs(np.log(focal / given)) > FOREIGN_SIGMAS * sigma:
+            mended = PosePairs.of(replace(self.session, intrinsics=own.intrinsics))
+            off = {"given": given, "own": focal, "half": 1.96 * own.sigma("f")}
+            self.add("foreign_lens", **off, **_change(self.pairs.fit, mended.fit))
+            self.pairs = mended
+        return []
 
     def units(self) -> None:
         """Millimetres, by size alone: neither an arm nor a camera reaches 10 m."""

@@ -225,7 +225,8 @@ class Number(Checkpoint):
 
         says = f"Your answer ({self.unit})" if self.unit != "1" else "Your answer"
         style = {"description_width": "initial"}
-        return ipywidgets.Text(placeholder="a number", description=says, style=style)
+        whole = {"continuous_update": False, "style": style}  # no half of a number is judged
+        return ipywidgets.Text(placeholder="a number", description=says, **whole)
 
 
 def _readings(given: Any, unit: str) -> list[float]:
@@ -256,15 +257,30 @@ def panel(checkpoint: Checkpoint, say: Callable[[str], None]) -> Any:
 
     field = checkpoint.input_widget()
     button = ipywidgets.Button(description="Commit", tooltip="Commit this answer")
+    judged, waiting = "", False  # Enter is told before the number that it commits
 
     def commit(*_: Any) -> None:
+        nonlocal judged, waiting
+        judged, waiting = field.value, False
         said = "<em>Choose or type an answer first.</em>"
         if field.value not in (None, ""):
             said = checkpoint.answer(field.value)._repr_html_()
         say(f'<div role="alert">{said}</div>')  # which is read out
 
+    def entered(_: Any, told: dict[str, Any], __: Any) -> None:
+        nonlocal waiting
+        if told.get("event") == "submit":
+            waiting = field.value == judged
+            if not waiting:  # it came when the field was left
+                commit()
+
+    def changed(_: Any) -> None:
+        if waiting:
+            commit()
+
     button.on_click(commit)
-    field.on_msg(lambda _, told, __: commit() if told.get("event") == "submit" else None)  # Enter
+    field.on_msg(entered)
+    field.observe(changed, "value")
     return words.stacked(field, button)
 
 

@@ -222,7 +222,8 @@ def choose(cell, letter):
 
 def type_in(cell, value):
     field = cell.get_by_label("Your answer")
-    field.fill(f"{value:.6g}")
+    field.fill("")
+    field.press_sequentially(f"{value:.6g}")
     field.press("Enter")
 
 
