@@ -253,10 +253,7 @@ def _flat(sigma_px: float) -> str:
 
 def _wrong_lens(start: Calibration) -> Finding | None:
     """A lens that the model cannot follow, or folds under corners that were seen."""
-    fold = fold_radius(np.array(start.camera.coeffs))
-    R, t = start.poses[start.corners.view, :3, :3], start.poses[start.corners.view, :3, 3]
-    points = np.einsum("nij,nj->ni", R, start.corners.points) + t
-    out = float((np.hypot(points[:, 0], points[:, 1]) / points[:, 2]).max())
+    fold, out = fold_radius(np.array(start.camera.coeffs)), start.widest
     if out > fold:
         beyond = {"out": math.degrees(math.atan(out)), "fold": math.degrees(math.atan(fold))}
         return _TEXTS.finding("lens_folds", rms=_flat(start.left_px), **beyond)
