@@ -179,6 +179,21 @@ def test_a_mistake_is_named_and_keeps_a_part_of_its_points(mistake):
     assert 0 < found[0].points < found[0].of
 
 
+@pytest.mark.parametrize("how", samples.SLOPPY)
+def test_a_sloppy_bundle_is_told_its_one_cause_and_no_other(how):
+    """Of honest work with one thing wrong everywhere; seeds by day: two."""
+    topics, code, make = samples.SLOPPY[how]
+    given = set()
+    for seed in range(3, 3 + (8 if NIGHTLY else 2)):
+        good = honest(seed)
+        wrong = [i for i in samples.items(make(good, recompute(good))) if i.verdict != "right"]
+        assert {i.topic for i in wrong} <= topics, seed
+        assert {i.mistake for i in wrong} <= {"", "close", code}, seed
+        given |= {i.mistake for i in wrong}
+    assert not code or code in given
+    assert not topics or given
+
+
 def test_every_item_has_one_sentence():
     for submission in (GOOD, samples.weak(2), *(wrong for _, wrong in MISTAKEN.values())):
         for one in samples.items(submission):

@@ -185,6 +185,18 @@ class Calibration:
         """The place (N,) of each corner's view among `views`."""
         return np.searchsorted(self.views, self.corners.view)
 
+    @property
+    def seen(self) -> Floats:
+        """The corners (N, 3) of a flat board in the camera's frame, m."""
+        R, t = self.poses[self.corners.view, :3, :3], self.poses[self.corners.view, :3, 3]
+        return np.einsum("nij,nj->ni", R, self.corners.points) + t
+
+    @property
+    def widest(self) -> float:
+        """The tangent of the largest angle from the optical axis at which a corner is."""
+        x, y, z = self.seen.T
+        return float((np.hypot(x, y) / z).max())
+
     @cached_property
     def linear(self) -> Linear:
         """Residuals and derivatives at the corners."""
@@ -475,11 +487,8 @@ def as_fisheye(model: Calibration) -> tuple[Calibration, float]:
     """
     from scipy.stats import ttest_1samp
 
-    camera, corners = model.camera, model.corners
-    R, t = model.poses[corners.view, :3, :3], model.poses[corners.view, :3, 3]
-    points = np.einsum("nij,nj->ni", R, corners.points) + t
-    out = float((np.hypot(points[:, 0], points[:, 1]) / points[:, 2]).max())
-    tangent, parameters = np.linspace(0.0, out, 100), derivatives.parameter_vector(camera)
+    camera, tangent = model.camera, np.linspace(0.0, model.widest, 100)
+    parameters = derivatives.parameter_vector(camera)
     straight = parameters[4:] * [1, 1, 0, 0, 1]  # without the tangential ones
     radius = distort(np.column_stack([tangent, 0.0 * tangent]), straight)[:, 0]
     series = np.linalg.lstsq(
@@ -716,11 +725,9 @@ def turned_over(model: Calibration) -> Calibration:
 
 def _squares_by_view(model: Calibration) -> Floats:
     """Squared residuals (views,), infinite where a corner would be behind the camera."""
-    R, t = model.poses[model.corners.view, :3, :3], model.poses[model.corners.view, :3, 3]
-    behind = np.einsum("nj,nj->n", R[:, 2], model.corners.points) + t[:, 2] <= 0
     with np.errstate(all="ignore"):
         squares = np.bincount(model.index, (model.linear.residuals**2).sum(axis=1))
-    squares[model.index[behind]] = np.inf
+    squares[model.index[model.seen[:, 2] <= 0]] = np.inf
     return np.nan_to_num(squares, nan=np.inf, posinf=np.inf)
 
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from coursekit.arrays import ArrayLike, Floats
 from coursekit.boards import Board, Detection, Detections, Skipped
+from coursekit.boards.board import by_reason
 from coursekit.causes import Accepted, CauseSearch, DiagnosisTexts
 from coursekit.checks import array, want
 from coursekit.geometry import fold_radius
@@ -143,16 +144,16 @@ def _images(detections: Sequence[Detection], board: Board) -> tuple[list[Finding
     common = max(set(sizes), key=sizes.count) if sizes else (0, 0)
     others = [d.name or f"view {i}" for i, d in enumerate(detections) if d.size != common]
     skipped: Sequence[Skipped] = getattr(detections, "skipped", ())
-    others += [s.name for s in skipped if s.kind == "other_size"]
     if others and sizes:
         width, height = common
         listed = _listed(others)
         found.append(_TEXTS.finding("mixed_sizes", width=width, height=height, others=listed))
     used = [i for i, d in enumerate(detections) if d.size == common and len(d.ids) >= MIN_CORNERS]
     layout = _layout([detections[i] for i in used], board)
-    refused = [s.reason for s in skipped if s.kind == "other_board"]
+    refused = [s for s in skipped if s.kind == "other_board"]
     if not layout and len(refused) > len(used):  # the detector saw other squares in most images
-        figures = {"images": len(refused), "reason": refused[0], "board": board.text}
+        reason = by_reason(refused)[0][0].reason
+        figures = {"images": len(refused), "reason": reason, "board": board.text}
         layout = _TEXTS.finding("other_squares_seen", **figures)
     if layout:
         return [*found, layout], used
@@ -253,10 +254,7 @@ def _flat(sigma_px: float) -> str:
 
 def _wrong_lens(start: Calibration) -> Finding | None:
     """A lens that the model cannot follow, or folds under corners that were seen."""
-    fold = fold_radius(np.array(start.camera.coeffs))
-    R, t = start.poses[start.corners.view, :3, :3], start.poses[start.corners.view, :3, 3]
-    points = np.einsum("nij,nj->ni", R, start.corners.points) + t
-    out = float((np.hypot(points[:, 0], points[:, 1]) / points[:, 2]).max())
+    fold, out = fold_radius(np.array(start.camera.coeffs)), start.widest
     if out > fold:
         beyond = {"out": math.degrees(math.atan(out)), "fold": math.degrees(math.atan(fold))}
         return _TEXTS.finding("lens_folds", rms=_flat(start.left_px), **beyond)

@@ -398,6 +398,13 @@ def _wraps_round(row: Model) -> Model:
     return lambda *args: np.r_[bias(*args), row(*args)[1:]]
 
 
+def _about_the_distance(row: Model) -> Model:
+    def std(c: Any, scale: float, distance: float) -> Any:
+        return 1e3 * np.sqrt(np.nanmean((np.where(c > 0, scale * c, np.nan) - distance) ** 2))
+
+    return lambda *args: np.array([row(*args)[0], std(*args), row(*args)[2]])
+
+
 # Tried two at a time are only these steps': with eight ways to be right, all would take too long.
 TABLE_ROW.add_mistakes(
     ("bias", "bias_is_depth", lambda level, distance: level),
@@ -425,6 +432,7 @@ TABLE_ROW.add_mistakes(
     ("std", "over_space", lambda z: np.nanstd(np.nanmean(z, axis=0), ddof=1)),
     ("std", "over_everything", np.nanstd),
     ("std", "over_everything", lambda z: np.nanstd(z, ddof=1)),
+    ("", "about_the_distance", _about_the_distance),
     ("keep", "mixed_treatment", lambda z: (_left_out(z), z)),
     ("keep", "mixed_treatment", lambda z: (z, _left_out(z))),
     ("keep", "median_of_all", lambda z: (_left_out(z, None),) * 2),
@@ -458,7 +466,7 @@ def _build_standard_errors(steps: Mapping[str, Step]) -> Model:
         spread, root, sides = steps["spread"], steps["root"], steps["sides"]()
         areas = [steps["area"](*z[0].shape, side) for side in sides]
         stays = spread(np.nanmean(z, axis=0)) / root(steps["patches"](areas[0], sides[0]))
-        moves = spread(np.nanmean(z, axis=(1, 2))) / root(steps["frames"](len(z)))
+        moves = spread(steps["levels"](z)) / root(steps["frames"](len(z)))
         nu = steps["squares"](steps["count"](z), areas[1], sides[1])
         return np.array([steps["sum"](stays, moves), steps["pooled"](z) / math.sqrt(nu)])
 
@@ -467,6 +475,11 @@ def _build_standard_errors(steps: Mapping[str, Step]) -> Model:
 
 def _freedom(z: Floats) -> Any:
     return (np.isfinite(z).sum(axis=0) - 1).mean()
+
+
+def _lines(z: Floats, axis: int) -> Any:
+    """Each frame's mean, by the means of its rows or columns."""
+    return np.nanmean(np.nanmean(z, axis=3 - axis), axis=1)
 
 
 def _errors_case(shape: tuple[int, int, int], seed: int) -> tuple[Floats]:
@@ -503,6 +516,7 @@ STANDARD_ERRORS = Exercise(
     name="depth_noise.standard_errors",
     build=_build_standard_errors,
     steps={
+        "levels": lambda z: np.nanmean(z, axis=(1, 2)),
         "spread": lambda means: np.nanstd(means, ddof=1),
         "root": math.sqrt,
         "sides": lambda: (12, 8),
@@ -526,9 +540,26 @@ STANDARD_ERRORS = Exercise(
     ways=[
         ("n = each pixel's valid samples" + mix, {"count": _freedom, "pooled": std})
         for mix, std in (("", _pooled), _BY_SAMPLES)
+    ]
+    + [
+        ("n = frames, the rows of a frame alike", {"levels": lambda z: _lines(z, 1)}),
+        ("n = frames, the columns of a frame alike", {"levels": lambda z: _lines(z, 2)}),
     ],
 )
+
+
+def _samples_independent(z: Floats) -> Floats:
+    n = np.isfinite(z).sum()
+    return np.array([np.nanstd(z, ddof=1) / math.sqrt(n), _pooled(z) / math.sqrt(2 * (n - 1))])
+
+
+def _patches_of_every_frame(errors: Model) -> Model:
+    return lambda z: np.array([12 * np.nanstd(z, ddof=1) / math.sqrt(z.size), errors(z)[1]])
+
+
 STANDARD_ERRORS.add_mistakes(
+    ("", "pixels_independent", lambda _: _samples_independent),
+    ("", "patches_of_every_frame", _patches_of_every_frame),
     ("patches", "pattern_forgotten", lambda area, side: math.inf),
     ("patches", "pixels_independent", lambda area, side: area),
     ("squares", "pixels_independent", lambda dof, area, side: 2 * dof * area),

@@ -189,7 +189,7 @@ ADD_UP = Exercise(
           (1.0, 4.0, _tilted(25, -1), "bias"), (1.0, 3.0, _tilted(40), "bias"),
           (0.0, 2.0, None, "bias")], 3.0),
         ([(2.0, 4.0, None, "bias"), (0.8, 0.8, _tilted(30), "noise"),
-          (0.5, 5.0, (0.6, 0.0, -0.8), "bias"), (0.4, 0.4, None, "noise")], 4.0),
+          (0.5, 5.0, (0.6, 0.0, -0.8), "bias"), (0.4, 0.4, None, "noise")], 0.8),
     ],
     parts=("the noise", "the worst case", "the quadrature", "the share"),
     unit="(mm, mm, mm and a share)",

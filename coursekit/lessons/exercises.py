@@ -152,7 +152,9 @@ class Exercise:
             warnings.simplefilter("ignore")
             verdicts = [exercise._verdict(function) for exercise in (*self._others, self)]
         known = ("right", *(m.name for m in self.mistakes))
-        return min(verdicts[::-1], key=lambda v: (v.named or v.kind) not in known)
+        return min(
+            verdicts[::-1], key=lambda v: (v.kind != "right", (v.named or v.kind) not in known)
+        )
 
     @cached_property
     def _others(self) -> list[Exercise]:
@@ -279,6 +281,10 @@ class Exercise:
         if formal:
             return self._several(formal[0], count, evidence)
         mistakes = self._found(values, relation in FOUND["told"])
+        if len(mistakes) == 1 and FOUND["unseen"] in _in_words(mistakes[0], known).says:
+            lines = (m for m in self._edits[1] if FOUND["line"] in m.says)
+            clearer = (m for m in lines if self._explains((m,), values))
+            mistakes = (next(clearer, mistakes[0]),)
         if self.core and not mistakes:  # what is wrong there may hide behind the rest
             of_core = [i for i, args in enumerate(self.cases) if self.is_core(args)]
             ours, wanted = ([of[i] for i in of_core] for of in (values, expected))
@@ -289,12 +295,13 @@ class Exercise:
         if relation and not mistakes:
             mistakes = (_device(relation, "your result", "", replace),)
         mistakes = mistakes or self._by_part(values, expected)
-        if len({m.name for m in mistakes}) > 1:
+        if len({m.name.partition(",")[0] for m in mistakes}) > 1:
             seen = self._seen_in(first, mistakes, expected[first])
             return self._several(_in_words(seen, known), count, evidence)
         if mistakes:
             where = where * mistakes[0].device
             return self._one(_in_words(mistakes[0], known), count + where, evidence)
+        where += self._factors_off(values, expected)
         return self._say("wrong", f"not right yet. {count}{where}", evidence, FOUND["by_hand"])
 
     def _part(self, i: int) -> Any:
@@ -303,28 +310,39 @@ class Exercise:
 
     def _by_part(self, values: list[Floats], expected: list[Floats]) -> tuple[Mistake, ...]:
         """What gives the numbers of each wrong part of the result, where something does."""
-        both = list(zip(values, expected, strict=True))
         singles = [*self.single_mistakes(), *self._edits[1], *self._edits[2]]
         found: list[Mistake] = []
-        for i, name in enumerate(self.parts):
-            at = self._part(i)
-            if not all(self._agrees(v[at], e[at]) for v, e in both):
-                alike = (m for m in singles if self._explains((m,), values, at))
-                found += [
-                    replace(m, says=f"in {name}: {m.says}", name=f"{m.name}, in {name}")
-                    for m in itertools.islice(alike, 1)
-                ]
+        for name, at in self._off(values, expected):
+            some = any(v[at].any() for v in values)  # of nothing but 0 only that can be said
+            alike = (m for m in singles if some or m.of_result)
+            mistake = next((m for m in alike if self._explains((m,), values, at)), None)
+            if mistake:
+                says = mistake.says if name in mistake.says else f"in {name}: {mistake.says}"
+                found.append(replace(mistake, says=says, name=f"{mistake.name}, in {name}"))
         return tuple(found)
+
+    def _off(self, values: list[Floats], expected: list[Floats]) -> list[tuple[str, Any]]:
+        """The parts of the result that are not right in all cases, each with its place."""
+        both = list(zip(values, expected, strict=True))
+        parts = [(name, self._part(i)) for i, name in enumerate(self.parts)]
+        return [
+            (name, at) for name, at in parts if not all(self._agrees(v[at], e[at]) for v, e in both)
+        ]
 
     def _parts_off(self, values: list[Floats], expected: list[Floats]) -> str:
         """Says which parts of the result are wrong, where others are right."""
-        both = list(zip(values, expected, strict=True))
-        off = [
-            name
-            for i, name in enumerate(self.parts)
-            if not all(self._agrees(v[self._part(i)], e[self._part(i)]) for v, e in both)
-        ]
+        off = [name for name, _ in self._off(values, expected)]
         return f" Look at {_listed(off)}: all else is right." if len(off) < len(self.parts) else ""
+
+    def _factors_off(self, values: list[Floats], expected: list[Floats]) -> str:
+        """Says which parts of the result are off by one factor in every case."""
+        text = ""
+        for name, at in self._off(values, expected):
+            got, want = (np.concatenate([np.ravel(v[at]) for v in of]) for of in (values, expected))
+            factor = np.vdot(want, got) / np.vdot(want, want)
+            if factor and np.allclose(got, factor * want, 1e-5, 1e-9):
+                text += f" In every case {name} is {factor:.4g} times what it should be."
+        return text
 
     def _found(self, values: list[Floats], told: bool) -> tuple[Mistake, ...]:
         """The first mistakes that give these values; told: without the device's."""
@@ -349,6 +367,7 @@ class Exercise:
             square and np.linalg.det(v) < 0 and self._agrees(v @ v.T, np.eye(3)) for v in values
         ]
         wild = [not (np.abs(v) <= 1e6 * (1 + np.nanmax(np.abs(e)))).all() for v, e in both]
+        holes = [bool(np.isnan(v).any()) for v in values]
         same = all(np.array_equal(v, values[0], equal_nan=True) for v in values)
         holds = {
             "digits": all(np.allclose(v, e, 1e-5, 10 * self.tolerance, True) for v, e in both),
@@ -359,6 +378,8 @@ class Exercise:
             and all(
                 ok or abs(np.vdot(e, v) + 1) < 1e-6 for ok, (v, e) in zip(right, both, strict=True)
             ),
+            "hole_spreads": 0 < sum(holes) < len(both)
+            and holes == list(map(_has_hole, self.cases)),
             "runs_away": all(wild) or (any(wild) and not self.nan_answers),
             "nothing": same and not values[0].any(),
             "constant": same,
@@ -416,6 +437,9 @@ class Exercise:
         yield from ((m,) for m in (*single, *double))
         common = [m for m in of_result if m.name in FOUND["common"] and "each of" not in m.says]
         yield from itertools.product(self.mistakes, common)
+        for a, b in itertools.combinations(listed, 2):
+            if a.name == b.name and a.step != b.step:
+                yield from ((a, b, edit) for edit in common)
         yield from itertools.combinations(common, 2)
 
     def single_mistakes(self) -> list[Mistake]:
@@ -460,10 +484,9 @@ class Exercise:
                 continue
             if value.shape != wrong.shape or not self._agrees(value[at], wrong[at]):
                 return False
-            off, size = np.abs(value[at] - wrong[at]), np.abs(wrong[at])
-            if mistakes[-1].device and np.nanmax(off, initial=0) > 1e-3 * np.nanmax(
-                size, initial=0
-            ):
+            size = np.nanmax(np.abs(wrong[at]), initial=0)
+            off = np.nanmax(np.abs(value[at] - wrong[at]), initial=0)
+            if mistakes[-1].device and off > max(1e-3 * size, 1e-12):
                 return False  # next to nothing is not nothing
             right = self._answer((), args)
             shown = shown or right is None or not self._agrees(wrong[at], right[at])
@@ -521,6 +544,10 @@ class Exercise:
         return Verdict(self.name, kind, f"{self.function}: {text}", lines, named)
 
 
+def _has_hole(args: tuple[Any, ...]) -> bool:
+    return any(a.dtype.kind == "f" and np.isnan(a).any() for a in args if isinstance(a, np.ndarray))
+
+
 def _nothing() -> None:
     return None
 
@@ -571,7 +598,11 @@ def _names_in(code: Any) -> set[str]:
 def _in_words(mistake: Mistake, known: set[str]) -> Mistake:
     """The device's words without names that the learner has not seen, and without many."""
     names = set(re.findall(r"`(\w+)`", mistake.says))
-    if not mistake.device or (len(names) <= MOST_NAMES and known.issuperset(names)):
+    if (
+        not mistake.device
+        or FOUND["line"] in mistake.says
+        or (len(names) <= MOST_NAMES and known.issuperset(names))
+    ):
         return mistake
     return replace(mistake, says=_NAMED.sub(FOUND["unseen"], mistake.says))
 
@@ -642,10 +673,11 @@ def _all_edits(exercise: Exercise) -> tuple[list[Mistake], list[Mistake], list[M
     inputs = [f"`{name}`" for name in inspect.signature(exercise.model()).parameters]
     rewritten = [(name, edit) for name, step in steps.items() for edit in _rewritten(step)]
     found: list[tuple[str, str, str, Step]] = []
-    for style in exercise.styles:
-        for n, kind, where, new in _rewritten(style, whole=True):
-            if n == 1:
-                found.append((kind, where, "", lambda _, new=new: new))
+    lines = [
+        (kind, where, "", lambda _, new=new: new)
+        for style in exercise.styles
+        for n, kind, where, new in _rewritten(style, whole=True)
+    ]
     found += [(kind, where, name, new) for name, (n, kind, where, new) in rewritten if n == 1]
     for kind, where, edit in _edits_of(args, _listed(inputs), inputs):
         found.append((kind, where, "", lambda f, e=edit: lambda *a: f(*e(a))))
@@ -662,7 +694,12 @@ def _all_edits(exercise: Exercise) -> tuple[list[Mistake], list[Mistake], list[M
         for name, (n, kind, where, new) in rewritten
         if n == 2
     ]
-    return _result_edits(exercise), [_device(*edit) for edit in found], pairs
+    edits = [_device(*edit) for edit in (*found, *sorted(lines, key=_is_wrapped))]
+    return _result_edits(exercise), edits, pairs
+
+
+def _is_wrapped(edit: tuple[str, str, str, Step]) -> bool:
+    return edit[0] in FOUND["wrapped"]
 
 
 def _device(kind: str, where: str, step: str, wrong: Step, before: str = "") -> Mistake:
@@ -788,7 +825,7 @@ def _rewritten(step: Step, whole: bool = False) -> list[tuple[int, str, str, Ste
             if whole and id(node) in lines:
                 line = _rebuilt(lines[id(node)], {id(node): new})
                 text = ast.unparse(ast.fix_missing_locations(line)).splitlines()[0]
-                where = f"{where or FOUND['unseen']} in a line like `{text}`"
+                where = f"{where or FOUND['value']} {FOUND['line']} `{text}`"
             sites.append((1, kind, where, {id(node): new}))
             for like in ((), fields, beside, where):
                 groups.setdefault((kind, detail, like), (kind, where, {}))[2][id(node)] = new
@@ -897,10 +934,16 @@ def _wrapped(node: Any) -> Iterator[tuple[str, Any, ast.AST]]:
             for keyword in keywords:
                 rest = [k for k in keywords if k is not keyword]
                 yield "argument_missing", keyword.arg, ast.Call(function, arguments, rest)
-        case ast.Tuple([*parts], context):
-            for i in range(len(parts) - 1):
-                turned = [*parts[:i], parts[i + 1], parts[i], *parts[i + 2 :]]
-                yield "exchanged", i, ast.Tuple(turned, context)
+        case ast.Tuple([_, _, *rest] as parts, context) if len(rest) < MOST_NAMES - 1:
+            for order in list(itertools.permutations(parts))[1:]:
+                yield "exchanged", 0, ast.Tuple(list(order), context)
+        case ast.Call(function, [ast.BinOp(left, op, right)], []):  # f(a * b): f(a) * b
+            yield "bracket", 0, ast.BinOp(ast.Call(function, [left], []), op, right)
+            yield "bracket", 0, ast.BinOp(left, op, ast.Call(function, [right], []))
+        case ast.BinOp(
+            left, op, ast.Call(function, [ast.BinOp(a, ast.Mult() | ast.Div() as by, b)], [])
+        ):
+            yield "bracket", 0, ast.BinOp(ast.BinOp(left, op, ast.Call(function, [a], [])), by, b)
         case ast.Call(function, [first, second, *rest], keywords):
             yield "exchanged", 0, ast.Call(function, [second, first, *rest], keywords)
 

@@ -73,14 +73,6 @@ def _pair_by_halves(gripper_i: Floats, gripper_j: Floats, board_i: Floats, board
     return A, B
 
 
-def _pair_by_inverses(
-    gripper_i: Floats, gripper_j: Floats, board_i: Floats, board_j: Floats
-) -> Any:
-    A = np.linalg.inv(gripper_j) @ gripper_i
-    B = board_j @ np.linalg.inv(board_i)
-    return A, B
-
-
 MOTION_PAIR = Exercise(
     name="hand_eye.motion_pair",
     build=_build_pair,
@@ -98,7 +90,7 @@ MOTION_PAIR = Exercise(
     unit="m",
     describe=_describe_pair,
     show=lambda row: f"translations of A and B {_vector(row[0])} and {_vector(row[1])}",
-    styles=[_pair_by_halves, _pair_by_inverses],
+    styles=[_pair_by_halves],
 )
 
 
@@ -193,16 +185,10 @@ def _half_by_kabsch(R_A: Floats, R_B: Floats) -> Any:
     return U @ np.diag([1, 1, sign]) @ Vt
 
 
-def _half_by_motions(R_A: Floats, R_B: Floats) -> Any:
-    a = np.array([Rotation.from_matrix(A).as_rotvec() for A in R_A])
-    b = np.array([Rotation.from_matrix(B).as_rotvec() for B in R_B])
-    return Rotation.align_vectors(a, b)[0].as_matrix()
-
-
-def _half_by_null_space(R_A: Floats, R_B: Floats) -> Any:
+def _half_by_null_space(R_A: Floats, R_B: Floats, row: int = -1) -> Any:
     eye = np.eye(3)
     M = np.vstack([np.kron(A, eye) - np.kron(eye, B.T) for A, B in zip(R_A, R_B, strict=True)])
-    X = np.linalg.svd(M)[2][-1].reshape(3, 3)
+    X = np.linalg.svd(M)[2][row].reshape(3, 3)
     X = X * np.sign(np.linalg.det(X))
     U, _, Vt = np.linalg.svd(X)
     return U @ Vt
@@ -232,7 +218,7 @@ ROTATION_HALF = Exercise(
         else f"{len(args[0])} motions" + ", the first two about one axis" * _parallel(args[0])
     ),
     show=lambda R: "; ".join(" ".join(f"{v:.3f}" for v in row) for row in np.atleast_2d(R)),
-    styles=[_half_by_kabsch, _half_by_motions, _half_by_null_space],
+    styles=[_half_by_kabsch, _half_by_null_space],
 )
 
 
@@ -261,6 +247,8 @@ def _kabsch(product: Callable[[Floats, Floats, Floats], Floats]) -> Step:
 ROTATION_HALF.add_mistakes(
     ("result", "inverse_of_x", lambda R: R.T),
     ("turn", "not_a_rotation", lambda a, b: np.linalg.lstsq(b, a, rcond=None)[0].T),
+    ("turn", "not_a_rotation", lambda a, b: a.T @ b),
+    ("turn", "not_a_rotation", lambda a, b: a.T @ b / len(a)),
     ("used", "first_motion_only", lambda a, b: (a[:1], b[:1])),
     ("result", "negative", lambda R: -R),
     ("used", "mean_taken_off", lambda a, b: (a - a.mean(axis=0), b - b.mean(axis=0))),
@@ -272,9 +260,17 @@ ROTATION_HALF.add_mistakes(
     ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: U @ D @ Vt.T)),
     ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: Vt @ D @ U.T)),
     ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: U @ Vt.T)),
+    ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: U.T @ D @ Vt)),
     ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: Vt @ U.T)),
     ("axes", "axis_without_sign", _no_signs),
     ("", "same_frame", lambda _: lambda A, B: A[0] @ B[0].T),
+    ("", "largest_singular", lambda _: lambda A, B: _half_by_null_space(A, B, 0)),
     ("", "same_frame", lambda _: _same_frame),
     ("", "same_frame", lambda _: lambda *AB: Rotation.from_matrix(_same_frame(*AB)).as_matrix()),
+    ("", "same_frame", lambda _: lambda A, B: _same_frame(*np.swapaxes([A, B], 2, 3))),
+    (
+        "",
+        "same_frame",
+        lambda _: lambda A, B: Rotation.from_matrix(np.swapaxes(A, 1, 2) @ B).mean().as_matrix(),
+    ),
 )

@@ -156,8 +156,7 @@ def _least_squares(seed: int, rows: int, columns: int, sigma: float) -> tuple[Fl
 
 def _sigma_by_covariance(J: Floats, residuals: Floats) -> Any:
     M, P = J.shape
-    variance = np.sum(residuals**2) / (M - P)
-    covariance = variance * np.linalg.inv(J.T @ J)
+    covariance = np.linalg.inv(J.T @ J) * np.sum(residuals**2) / (M - P)
     return np.sqrt(covariance[0, 0])
 
 
@@ -169,9 +168,9 @@ def _sigma_by_root(J: Floats, residuals: Floats) -> Any:
 
 def _sigma_by_pinv(J: Floats, residuals: Floats) -> Any:
     M, P = J.shape
-    noise = np.sqrt(np.sum(residuals**2) / (M - P))
+    variance = np.sum(residuals**2) / (M - P)
     gain = np.linalg.pinv(J)[0]
-    return noise * np.sqrt(np.sum(gain**2))
+    return np.sqrt(variance * np.sum(gain**2))
 
 
 FOCAL_SIGMA = Exercise(

@@ -8,7 +8,8 @@ is named, and keeps a part of its points.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from functools import partial
@@ -34,9 +35,10 @@ from coursekit.words import counted
 Judgement = Literal["right", "partial", "wrong", "missing"]
 
 SAME_DISTANCE_M = 0.005  # a row or a point of the plot belongs to the stack this near
-EXPLAINED_WITHIN = 0.03  # a wrong number is explained by a mistake that gives it to this part,
+EXPLAINED_WITHIN = 0.01  # a wrong number is explained by a mistake that gives it to this part,
 EXACTLY = 0.002  # and to this one where the mistake's number is near the right one
 NEAR_RIGHT = 0.15  # of the right number
+COARSE = 0.015  # half a unit of the last digit of a claim that is too coarse to tell the two apart
 ONE_DIGIT = ("bias_se", "std_se", "invalid")  # is enough of these
 
 UNIT_OF = {"sigma_d": " px", "sigma_d_interval": " px", "exponent": "", "invalid": " %"}  # else mm
@@ -99,11 +101,15 @@ class _Mistake(NamedTuple):
 
 
 class _Question(NamedTuple):
-    """One thing that is asked for: its topic, what it is worth, and where (" at 0.45 m")."""
+    """One thing that is asked for: its topic, what it is worth, and where (" at 0.45 m").
+
+    only: the one mistake that may explain a wrong number, "" for none; None where any may.
+    """
 
     topic: str
     of: float
     at: str = ""
+    only: str | None = None
 
     @property
     def name(self) -> str:
@@ -173,15 +179,32 @@ def judged(submission: Submission, found: Recomputed) -> tuple[Item, ...]:
 # --- at each distance -----------------------------------------------------------------------------
 
 
-def _at_distances(submission: Submission, found: Recomputed) -> Iterator[Item]:
+def _at_distances(submission: Submission, found: Recomputed) -> list[Item]:
     """The items at each distance that is asked for, and at others that were measured."""
     points, wanted = grading_rules()["points"], grading_rules()["exercise"]["distances_m"]
     chosen = _chosen(wanted, found.at)
-    for z in wanted:
-        yield from _one_distance(submission, z, chosen.get(z), points)
+    places: list[tuple[float, AtDistance | None, dict[str, float]]]
+    places = [(z, chosen.get(z), points) for z in wanted]
     for m in found.at:  # beyond what is asked for: compared, but not counted
         if m not in chosen.values() and _row(submission, m.distance_m) is not None:
-            yield from _one_distance(submission, m.distance_m, m, dict.fromkeys(points, 0.0))
+            places.append((m.distance_m, m, dict.fromkeys(points, 0.0)))
+    items = [item for place in places for item in _one_distance(submission, *place, {})]
+    only = {topic: _reason([item for item in items if item.topic == topic]) for topic in JUDGES}
+    if {*only.values()} != {None}:
+        items = [item for place in places for item in _one_distance(submission, *place, only)]
+    return items
+
+
+def _reason(items: Sequence[Item]) -> str | None:
+    """The one mistake that explains most wrong numbers of a topic, "" where none explains more than
+    half of them: who makes a mistake makes it at every distance, and a number by itself is near
+    that of some mistake by chance. None where there is no such choice."""
+    codes = Counter(item.mistake for item in items if item.verdict in ("wrong", "partial"))
+    del codes["close"]
+    if len(codes) < 2:
+        return None
+    code, n = codes.most_common(1)[0]
+    return code if 2 * n > codes.total() else ""
 
 
 def _chosen(wanted: Sequence[float], at: Sequence[AtDistance]) -> dict[float, AtDistance]:
@@ -202,13 +225,19 @@ def _row(submission: Submission, z: float) -> TableRow | None:
 
 
 def _one_distance(
-    submission: Submission, z: float, m: AtDistance | None, points: dict[str, float]
+    submission: Submission,
+    z: float,
+    m: AtDistance | None,
+    points: dict[str, float],
+    only: Mapping[str, str | None],
 ) -> Iterator[Item]:
-    """Raw depths and the five numbers of the table at z; m: what was measured there."""
+    """Raw depths and the five numbers of the table at z; m: what was measured there. only: by
+    topic, see `_Question`."""
     yield _data(_Question("data", points["data"], f" at {z:.2f} m"), z, m)
     row = None if m is None else _row(submission, m.distance_m)
     for topic, (field, judge) in JUDGES.items():
-        asked = _Question(topic, points[topic], f" at {z if m is None else m.distance_m:.2f} m")
+        at = f" at {z if m is None else m.distance_m:.2f} m"
+        asked = _Question(topic, points[topic], at, only.get(topic))
         claim = getattr(row, field, None)
         if m is None:
             yield asked.missing("there are no raw depths at it")
@@ -253,12 +282,12 @@ def _bias(asked: _Question, submission: Submission, m: AtDistance, claim: float)
         for value in () if said else kept:
             yield _Mistake("mismatches", value, EXACTLY * abs(value), _mismatches(m))
         yield _Mistake("middle_pixel", float(m.z_mm[:, *_middle(m)].mean()) - z)
-        yield _Mistake("sign", -found, tolerance)
+        yield _Mistake("sign", -found, 0.3 * tolerance)  # of the same data, so nearer than that
         yield from _other_units(found, tolerance, step)
-        yield _Mistake("percent", 100 * found / z, 100 * tolerance / z)
+        yield _Mistake("percent", 100 * found / z)
         yield _Mistake("level", z + found, 0.01 * z)
         yield _Mistake("level", (z + found) / 1e3, 1e-5 * z)
-        yield _Mistake("zeros", float(m.stack.counts.mean()) * step - z, tolerance)
+        yield _Mistake("zeros", float(m.stack.counts.mean()) * step - z)
 
     return _judge(asked, claim, found, tolerance, mistakes)
 
@@ -321,7 +350,7 @@ def _std(asked: _Question, submission: Submission, m: AtDistance, claim: float) 
             yield _Mistake("unpooled", float(value), fact=kind)
         yield _Mistake("of_the_mean", 1e3 * stats.mean_std_m)
         yield _Mistake("standard_error", found / math.sqrt(n))
-        yield _Mistake("variance", found**2)
+        yield _Mistake("variance", found**2, found * tolerance)
         yield _Mistake("spatial", 1e3 * stats.spatial_std_m)
         yield _Mistake("mixed", float(m.z_mm[np.isfinite(m.z_mm)].std()))
         filled = np.nan_to_num(m.z_mm)
@@ -524,7 +553,7 @@ def _sigma_d(asked: _Question, submission: Submission, found: Recomputed) -> Ite
             ("spatial", [m.stats.spatial_std_m for m in known]),
             ("of_the_mean", [m.stats.mean_std_m for m in known]),
         ):
-            yield _Mistake(key, mean(stds, 2), 0.06 * mean(stds, 2))
+            yield _Mistake(key, mean(stds, 2), 0.02 * mean(stds, 2))
 
     return _judge(asked, claim, value, tolerance, mistakes)
 
@@ -758,7 +787,7 @@ def _verdict(
     answer = partial(asked.item, tolerance=tolerance)
     if off <= 1:
         return answer("right", f"{says}: right.")
-    mistake = _explanation(asked.topic, claim, found, tolerance, mistakes())
+    mistake = _explanation(asked, claim, found, tolerance, mistakes())
     if mistake is not None:
         says, code = f"{says}: wrong because {mistake.why(asked.topic)}.", mistake.key
         return answer("partial", says, code.partition(".")[0])
@@ -769,20 +798,21 @@ def _verdict(
 
 
 def _explanation(
-    topic: str, claim: float, found: float, tolerance: float, mistakes: Iterable[_Mistake]
+    asked: _Question, claim: float, found: float, tolerance: float, mistakes: Iterable[_Mistake]
 ) -> _Mistake | None:
     """The mistake whose number is nearest to a claim, if it is near enough to be the reason.
 
     A mistake whose number is near the right one explains only a claim that has its digits.
     """
-    best, least = None, math.inf
-    if topic not in ONE_DIGIT and claim == float(f"{found:.0e}"):
-        return _Mistake("rounded", claim)
-    for mistake in mistakes:
+    topic, best, least = asked.topic, None, math.inf
+    rounded = topic not in ONE_DIGIT and claim == float(f"{found:.0e}")
+    for mistake in [_Mistake("rounded", claim)] if rounded else mistakes:
+        if asked.only not in (None, mistake.key.partition(".")[0]):
+            continue
         value, off = mistake.value, abs(claim - mistake.value)
         within = max(mistake.within, EXPLAINED_WITHIN * abs(value))
         if abs(value - found) < max(2 * tolerance, NEAR_RIGHT * abs(found)):
-            coarse = _written(claim) > EXPLAINED_WITHIN / 2 * abs(value)
+            coarse = _written(claim) > COARSE * abs(value)
             within = 0.0 if coarse else max(_half_digit(topic), EXACTLY * abs(value))
         if off <= within and off < least:
             best, least = mistake, off
