@@ -73,7 +73,7 @@ def check_page(text: str) -> Page:
 
 def page_of(submission: Submission) -> str:
     """A student's page, which is well nested and has no figure that is infinite or unknown."""
-    body = report.measured(samples.graded(submission), submission)
+    body = report.page_body(samples.graded(submission), submission)
     text = report.student_page(line_of(submission), body)
     check_page(text)
     assert "nan" not in text.replace("nano", "")

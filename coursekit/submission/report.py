@@ -172,7 +172,7 @@ def not_graded(file: str, reason: str, says: str) -> ReportLine:
 
 
 def grade_file(path: str, name: str) -> tuple[ReportLine, str]:
-    """What a process of the grader does: the line of a bundle, and what `measured` says of it.
+    """What a process of the grader does: the line of a bundle, and what `page_body` says of it.
 
     name: what to call the file at `path`. Importing this module loads all that grading needs, so
     that nothing is loaded on first use, when memory is limited.
@@ -180,7 +180,7 @@ def grade_file(path: str, name: str) -> tuple[ReportLine, str]:
     try:
         submission = read_bundle(Path(path))
         found = grade(submission)
-        return graded(name, found, submission), measured(found, submission)
+        return graded(name, found, submission), page_body(found, submission)
     except Refused as refused:
         return not_graded(name, refused.reason, str(refused)), ""
     except MemoryError:
@@ -330,7 +330,7 @@ def _copy_flag(copy: Copy) -> Flag:
 def student_page(line: ReportLine, body: str) -> str:
     """A student's page: whose it is, the points with the instructor's own, and what was measured.
 
-    line: after `across`. body: of `measured`, or "" where the bundle was not graded.
+    line: after `across`. body: of `page_body`, or "" where the bundle was not graded.
     """
     lost = [item for item in line.items if item.points < item.of]
     facts = {"told": _told(line), "decided": _decided(line), "body": Markup(body)}
@@ -354,7 +354,7 @@ def _told(line: ReportLine) -> str:
     return line.says if line.reason == "missing" else AGAIN
 
 
-def measured(grade: Grade, submission: Submission) -> str:
+def page_body(grade: Grade, submission: Submission) -> str:
     """The part of a student's page that the bundle decides: plot, table, a sentence on everything.
 
     No flags, which are the instructor's.
@@ -362,7 +362,7 @@ def measured(grade: Grade, submission: Submission) -> str:
     camera = submission.camera
     baseline = "unknown" if camera.baseline_m is None else f"{1e3 * camera.baseline_m:.2f} mm"
     return _page(
-        what="measured",
+        what="body",
         submission=submission,
         made=_date(submission.made),
         grade=grade,
