@@ -7,11 +7,13 @@ It calls what a notebook would, by the same names: `ck` loads a room when it is 
 from __future__ import annotations
 
 import argparse
+import copy
 import io
 import re
 import sys
 import tomllib
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -19,29 +21,27 @@ from typing import Any
 import coursekit as ck
 from coursekit import doctor
 from coursekit.boards import Board
-from coursekit.boards.board import Skipped
+from coursekit.boards.board import Skipped, by_reason
 from coursekit.checks import want
+from coursekit.results import Exported
 from coursekit.words import Estimate, Findings, say, wrapped
 
-SHOWN = 3  # images that were not used
+SHOWN = 1  # reason, the commonest, for which images were not used
+NOT_TRUSTED = 3  # the exit code; what was found is written nevertheless
 
 OPTIONS = {"path": "--out", "n": "--frames", "which": "--camera", "distance_m": "--distance"}
 OPTIONS |= {f"{name}_m": f"--{name}-mm (here in m)" for name in ("square", "marker")}
 OPTIONS |= {name: f"--{name}" for name in ("squares", "paper", "dictionary", "workers", "timeout")}
-SAID = r"\b(mount|rotation|length|angle)=[\"'](\w+)[\"']"
-INSTEAD = {
-    "in_order=True": "--in-order",
-    "overwrite=True": "--overwrite",
-    "run this cell again": "run this again",
-}
+COMMANDS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
+INSTEAD = COMMANDS.pop("instead")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `coursekit ARGUMENTS` and return its exit code: 0 done, 1 failed, 130 Ctrl-C.
 
-    The doctor's is 1 when it found a problem. A report of graded bundles is done whatever is in the
-    bundles; a bundle to hand in is done when it is written. Wrong usage exits with 2, as argparse
-    does.
+    3 is a result that is written and not to be trusted. The doctor's is 1 when it found a problem.
+    A report of graded bundles is done whatever is in the bundles; a bundle to hand in is done when
+    it is written. Wrong usage exits with 2, as argparse does.
     """
     if (sys.argv[1:] if arguments is None else list(arguments)) == ["--version"]:
         print(f"coursekit {doctor.edition()}")
@@ -51,6 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal or a file may not know every sign
     try:
+        _refuse_existing(options)
         return options.run(options) or 0
     except (ck.cameras.CameraError, OSError, ValueError) as error:
         name, colon, said = str(error).partition(": ")
@@ -61,18 +62,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 130
 
 
+def _refuse_existing(options: argparse.Namespace) -> None:
+    """Say that a file is there before the work and not after it; a report of grades goes on."""
+    out = getattr(options, "out", None)
+    if out and Path(out).is_file() and not options.overwrite:
+        raise FileExistsError(f"{out} exists already: choose another name or --overwrite")
+
+
 def _typed(text: str) -> str:
     """The text as somebody reads it who types options and not Python."""
     for python, option in INSTEAD.items():
-        text = text.replace(python, option)
-    return re.sub(SAID, r"--\1 \2", text)
+        text = re.sub(python, option, text)
+    return text
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="coursekit", description="The course's tools.")
     parser.add_argument("--version", action="store_true", help="say which course this is, and end")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    table = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
+    table = copy.deepcopy(COMMANDS)
     table["export"]["options"]["--to"]["help"] = "/".join(ck.results.EXPORTS)
     shared = table.pop("shared")
     for name, about in table.items():
@@ -121,44 +129,54 @@ def _board(options: argparse.Namespace) -> None:
     print(f"In Python: {board!r}")
 
 
-def _calibrate(options: argparse.Namespace) -> None:
+def _calibrate(options: argparse.Namespace) -> int:
     board = _described(options)
     views = ck.boards.detect_all(options.folder, board)
     lens = ck.intrinsics.calibrate(views, board)
-    _say_how_good(lens, views.skipped, ck.intrinsics.diagnose(views, board), options.details)
-    print(ck.export(lens, options.to, options.out, overwrite=options.overwrite))
+    findings = ck.intrinsics.diagnose(views, board)
+    code = _say_how_good(lens, views.skipped, findings, options.details)
+    done = ck.export(lens, options.to, options.out, overwrite=options.overwrite)
+    print(replace(done, notes=done.notes[1:]))  # the first is the verdict
+    return code
 
 
-def _hand_eye(options: argparse.Namespace) -> None:
+def _hand_eye(options: argparse.Namespace) -> int:
     want(Path(options.lens).is_file(), "--lens", options.lens, "the file of a lens")
     lens = ck.geometry.Intrinsics.from_file(options.lens)
     said = {name: getattr(options, name) for name in ("rotation", "length", "angle", "in_order")}
     what = options.folder, options.mount, _described(options), lens
     session = ck.hand_eye.HandEyeSession.from_folder(*what, **said)
     place = session.solve()
-    _say_how_good(place, session.skipped, ck.hand_eye.diagnose(session), options.details)
-    _export_place(place, options)
+    findings = ck.hand_eye.diagnose(session)
+    code = _say_how_good(place, session.skipped, findings, options.details)
+    done = _exported_place(place, options)
+    print(replace(done, notes=done.notes[1:]))
+    return code
 
 
 def _say_how_good(
     result: Estimate, skipped: Sequence[Skipped], findings: Findings, details: bool
-) -> None:
-    """What was not used, how far to trust the result, and what to do first."""
-    for skip in skipped if details else skipped[:SHOWN]:
-        print(f"not used: {skip!r}")
+) -> int:
+    """How far to trust the result, what to do first, what was not used; returns the exit code."""
+    first, *weak = (" ".join(part.split()) for part in re.split(r"\n(?=\S)", result.verdict()))
     if details:
-        print(result, result.verdict(), findings, sep="\n")
-        return
-    if len(skipped) > SHOWN:
-        print(f"not used: {len(skipped) - SHOWN} more")
-    for number, finding in enumerate(findings, 1):
-        print(wrapped(f"{number}. {finding.title}: {finding.says}"))
-        if number == 1:
-            print(wrapped(_typed(f"  {finding.evidence}")))
-            print(wrapped(_typed(f"  Do first: {finding.remedy}")))
-    if not findings:
-        print(result.verdict())
-    print("Numbers, evidence, and what else there is to do: the same with --details.")
+        print(_typed(f"{result.verdict()}\n{result}\n{findings!r}"))
+    else:
+        says = [first, *weak]
+        if findings:
+            titles = "; ".join(finding.title for finding in findings)
+            says = [first, f"Do first: {findings[0].remedy}", f"Found: {titles}."]
+        print("\n".join(wrapped(_typed(line)) for line in says))
+    reasons = by_reason(skipped)
+    shown = len(reasons) if details else SHOWN
+    for group in reasons[:shown]:
+        names = ", ".join(skip.name for skip in group)
+        print(wrapped(_typed(f"not used: {names}: {group[0].reason}")))
+    if rest := [skip.name for group in reasons[shown:] for skip in group]:
+        print(wrapped(f"not used, either: {', '.join(rest)}"))
+    if not details:
+        print("Numbers, evidence and the other remedies: the same with --details.")
+    return NOT_TRUSTED if first.startswith("Not to be trusted") else 0
 
 
 def _submit(options: argparse.Namespace) -> None:
@@ -186,15 +204,15 @@ def _grade(options: argparse.Namespace) -> None:
 
 
 def _export(options: argparse.Namespace) -> None:
-    _export_place(options.what, options)
+    print(_exported_place(options.what, options))
 
 
-def _export_place(what: Any, options: argparse.Namespace) -> None:
+def _exported_place(what: Any, options: argparse.Namespace) -> Exported:
     """A place, with the frames that were named; or a lens, which has none."""
     names = ("parent", "optical", "link", "T_link_optical", "overwrite")
     frames = {name: getattr(options, name) for name in names}
     given = {name: value for name, value in frames.items() if value is not None}
-    print(ck.export(what, options.to, options.out, **given))
+    return ck.export(what, options.to, options.out, **given)
 
 
 def _doctor(options: argparse.Namespace) -> int:

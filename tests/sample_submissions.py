@@ -233,38 +233,22 @@ def mistaken(seed: int = 0) -> dict[str, tuple[str, Submission]]:
     good = finished(facts, stacks_of(random, make), f"Student {seed}")
     found = recompute(good)
     m, row, law, free = found.at[1], good.claims.rows[1], found.law, found.free
-    z, bias, std = m.z_mm, row.depth_bias_mm, row.depth_std_mm
-    invalid, product = row.invalid_fraction, facts.fx * facts.baseline_m
-    numbers = {  # of the row at 0.45 m
-        "sign": ("bias", -bias),
-        "metres": ("bias", bias / 1000),
-        "counts": ("bias", bias / (1e3 * facts.depth_scale_m)),
-        "level": ("bias", 1e3 * m.distance_m + bias),
-        "zeros": ("bias", float(np.nan_to_num(z).mean()) - 450),
-        "not_divided": ("bias_se", std),
-        "independent": ("bias_se", std / z.size**0.5),
+    product, sloppy = facts.fx * facts.baseline_m, reversed(SLOPPY_ROWS.values())
+    # of a mistake in two columns the first
+    numbers = {code: (topic, float(wrong(m, row))) for topic, code, wrong in sloppy if code}
+    numbers |= {
+        "metres": ("bias", row.depth_bias_mm / 1000),
+        "counts": ("bias", row.depth_bias_mm / (1e3 * facts.depth_scale_m)),
         "tape_only": ("bias_se", 0.1),
         "no_tape": ("bias_se", m.bias.se),
-        "of_the_mean": ("std", float(np.nanmean(z, axis=(1, 2)).std(ddof=1))),
-        "standard_error": ("std", std / 10),
-        "variance": ("std", std**2),
-        "spatial": ("std", 1e3 * m.stats.spatial_std_m),
-        "mixed": ("std", float(np.nanstd(z))),
-        "middle_pixel": ("std", float(z[:, 20, 20].std(ddof=1))),
-        "rounded": ("std", float(f"{std:.0e}")),
-        "one_pixel": ("std_se", std / 198**0.5),
         "close": ("std_se", 1.7 * row.depth_std_se_mm),
-        "percent": ("invalid", 100 * invalid),
-        "complement": ("invalid", 1 - invalid),
-        "ever": ("invalid", float(np.isnan(z).any(axis=0).mean())),
     }
     tapes = {"tape_only": 0.0001, "no_tape": 0}
     wrong = {}
     for code, (topic, value) in numbers.items():
         changed = good
-        for i in (
-            range(3) if code == "tape_only" else [1]
-        ):  # the others' errors hold the tape's, too
+        rows = range(3) if code == "tape_only" else [1]  # the others' errors hold the tape's, too
+        for i in rows:
             changed = with_row(changed, i, **{JUDGES[topic][0]: value})
         wrong[code] = topic, replace(changed, tape_sigma_m=tapes.get(code, good.tape_sigma_m))
     coarse = honest(seed)
@@ -310,17 +294,33 @@ def mistaken(seed: int = 0) -> dict[str, tuple[str, Submission]]:
 # --- sloppy: one cause each -----------------------------------------------------------------------
 
 
-def _samples_mm(m: AtDistance) -> NDArray[np.float64]:
+def _raw(m: AtDistance) -> NDArray[np.float64]:
     """The raw depths (N, h, w) in mm, NaN where there is none."""
     return np.where(m.stack.counts > 0, 1e3 * m.scale_m * m.stack.counts, np.nan)
 
 
-def _in_rows(field: str, wrong: Callable[[AtDistance, TableRow], float]):
+def _zeros(m: AtDistance) -> NDArray[np.float64]:
+    """The same, 0 where there is none."""
+    return np.nan_to_num(_raw(m))
+
+
+def _middle(m: AtDistance) -> NDArray[np.float64]:
+    """The depths of the pixel in the middle."""
+    _, height, width = m.stack.counts.shape
+    return _raw(m)[:, height // 2, width // 2]
+
+
+def _pooled(variances: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.nanmean(variances)))
+
+
+def _in_rows(topic: str, wrong: Callable[[AtDistance, TableRow], float]):
     """What makes the same mistake in one column of the table at every distance."""
+    field = JUDGES[topic][0]
 
     def make(good: Submission, found: Recomputed) -> Submission:
         pairs = zip(found.at, good.claims.rows, strict=True)
-        rows = tuple(replace(row, **{field: wrong(m, row)}) for m, row in pairs)
+        rows = tuple(replace(row, **{field: float(wrong(m, row))}) for m, row in pairs)
         return with_part(good, "claims", rows=rows)
 
     return make
@@ -375,165 +375,87 @@ def _one_sigma(good: Submission, found: Recomputed) -> dict[str, Any]:
     return {"sigma_d_interval_px": (float(near), float(far))}
 
 
-def _times(factor: float):
-    return lambda _, row: factor * row.depth_std_mm
+def _the_other(good: Submission, _: Recomputed) -> dict[str, Any]:
+    return {"dominates": "bias" if good.conclusion.dominates == "noise" else "noise"}
 
 
-BIAS, BIAS_SE, STD, STD_SE = (f"depth_{name}_mm" for name in ("bias", "bias_se", "std", "std_se"))
-TABLE = {"bias", "bias_se", "std", "std_se", "invalid"}
-SLOPPY: dict[str, tuple[set[str], str, Callable[[Submission, Recomputed], Submission]]] = {
-    # how: the topics it may cost, the reason that is the real one ("": none has a name), the change
-    "sign": ({"bias"}, "sign", _in_rows(BIAS, lambda _, row: -row.depth_bias_mm)),
-    "depth for bias": (
-        {"bias"},
-        "level",
-        _in_rows(BIAS, lambda m, row: 1e3 * m.distance_m + row.depth_bias_mm),
-    ),
-    "zeros in bias": (
-        {"bias"},
-        "zeros",
-        _in_rows(
-            BIAS, lambda m, _: float(np.nan_to_num(_samples_mm(m)).mean()) - 1e3 * m.distance_m
-        ),
-    ),
-    "from the glass": ({"bias"}, "", _in_rows(BIAS, lambda _, row: row.depth_bias_mm + 4.2)),
-    "metres": (TABLE, "metres", _all_in_metres),
-    "ddof 0": (
-        set(),
-        "",
-        _in_rows(STD, lambda m, _: float(np.sqrt(np.nanvar(_samples_mm(m), axis=0).mean()))),
-    ),
-    "variance": ({"std"}, "variance", _in_rows(STD, lambda _, row: row.depth_std_mm**2)),
-    "zeros in std": (
-        {"std"},
-        "zeros",
-        _in_rows(
-            STD,
-            lambda m, _: float(np.sqrt(np.nan_to_num(_samples_mm(m)).var(axis=0, ddof=1).mean())),
-        ),
-    ),
-    "all samples": ({"std"}, "mixed", _in_rows(STD, lambda m, _: float(np.nanstd(_samples_mm(m))))),
-    "over the pixels": (
-        {"std"},
-        "spatial",
-        _in_rows(STD, lambda m, _: 1e3 * m.stats.spatial_std_m),
-    ),
-    "of the mean": (
-        {"std"},
-        "of_the_mean",
-        _in_rows(STD, lambda m, _: float(np.nanmean(_samples_mm(m), axis=(1, 2)).std(ddof=1))),
-    ),
-    "over root N": ({"std"}, "standard_error", _in_rows(STD, lambda _, row: row.depth_std_mm / 10)),
-    "one pixel": (
-        {"std"},
-        "middle_pixel",
-        _in_rows(
-            STD,
-            lambda m, _: float(
-                _samples_mm(m)[:, m.stack.counts.shape[1] // 2, m.stack.counts.shape[2] // 2].std(
-                    ddof=1
-                )
-            ),
-        ),
-    ),
-    "1.2 times": ({"std"}, "", _in_rows(STD, _times(1.2))),
-    "half": ({"std"}, "", _in_rows(STD, _times(0.5))),
-    "one digit": (
-        {"std"},
-        "rounded",
-        _in_rows(STD, lambda _, row: float(f"{row.depth_std_mm:.0e}")),
-    ),
-    "std for error": (
-        {"bias_se"},
-        "not_divided",
-        _in_rows(BIAS_SE, lambda _, row: row.depth_std_mm),
-    ),
+def _plot_in_metres(good: Submission, _: Recomputed) -> dict[str, Any]:
+    return {"measured_mm": tuple(v / 1e3 for v in good.plot.measured_mm)}
+
+
+def _law_of_Z(good: Submission, _: Recomputed) -> dict[str, Any]:
+    return {"predicted_mm": tuple(2 * z for z in good.plot.distances_m)}
+
+
+SLOPPY_ROWS = {
+    # how: the column, the reason that is the real one ("": none has a name), what stands there
+    "sign": ("bias", "sign", lambda m, row: -row.depth_bias_mm),
+    "depth for bias": ("bias", "level", lambda m, row: 1e3 * m.distance_m + row.depth_bias_mm),
+    "zeros in bias": ("bias", "zeros", lambda m, row: _zeros(m).mean() - 1e3 * m.distance_m),
+    "from the glass": ("bias", "", lambda m, row: row.depth_bias_mm + 4.2),
+    "variance": ("std", "variance", lambda m, row: row.depth_std_mm**2),
+    "zeros in std": ("std", "zeros", lambda m, row: _pooled(_zeros(m).var(axis=0, ddof=1))),
+    "all samples": ("std", "mixed", lambda m, row: np.nanstd(_raw(m))),
+    "over the pixels": ("std", "spatial", lambda m, row: 1e3 * m.stats.spatial_std_m),
+    "of the mean": ("std", "of_the_mean", lambda m, row: np.nanmean(_raw(m), (1, 2)).std(ddof=1)),
+    "over root N": ("std", "standard_error", lambda m, row: row.depth_std_mm / 10),
+    "one pixel": ("std", "middle_pixel", lambda m, row: _middle(m).std(ddof=1)),
+    "1.2 times": ("std", "", lambda m, row: 1.2 * row.depth_std_mm),
+    "half": ("std", "", lambda m, row: 0.5 * row.depth_std_mm),
+    "one digit": ("std", "rounded", lambda m, row: f"{row.depth_std_mm:.0e}"),
+    "std for error": ("bias_se", "not_divided", lambda m, row: row.depth_std_mm),
     "independent": (
-        {"bias_se"},
+        "bias_se",
         "independent",
-        _in_rows(BIAS_SE, lambda m, row: row.depth_std_mm / m.stack.counts.size**0.5),
+        lambda m, row: row.depth_std_mm / _raw(m).size ** 0.5,
     ),
-    "its own std": ({"std_se"}, "not_divided", _in_rows(STD_SE, lambda _, row: row.depth_std_mm)),
-    "error of one pixel": (
-        {"std_se"},
-        "one_pixel",
-        _in_rows(STD_SE, lambda _, row: row.depth_std_mm / 198**0.5),
-    ),
-    "percent": (
-        {"invalid"},
-        "percent",
-        _in_rows("invalid_fraction", lambda _, row: 100 * row.invalid_fraction),
-    ),
-    "valid": (
-        {"invalid"},
-        "complement",
-        _in_rows("invalid_fraction", lambda _, row: 1 - row.invalid_fraction),
-    ),
-    "ever": (
-        {"invalid"},
-        "ever",
-        _in_rows("invalid_fraction", lambda m, _: float((m.stack.counts == 0).any(axis=0).mean())),
-    ),
-    "rows": (TABLE, "", _swapped),
-    "columns": ({"bias", "std"}, "", _columns),
-    "another's table": ({*TABLE, "sigma_d", "sigma_d_interval"}, "", _another_table),
-    "baseline of a D455": ({"sigma_d", "sigma_d_interval"}, "", _scaled_sigma_d(1.9)),
-    "mm and m": ({"sigma_d"}, "millimetres", _scaled_sigma_d(1e3)),
-    "no interval": (
-        {"sigma_d_interval"},
-        "",
-        _of_all("claims", lambda *_: {"sigma_d_interval_px": None}),
-    ),
-    "one sigma": ({"sigma_d_interval"}, "one_sigma", _of_all("claims", _one_sigma)),
+    "its own std": ("std_se", "not_divided", lambda m, row: row.depth_std_mm),
+    "error of one pixel": ("std_se", "one_pixel", lambda m, row: row.depth_std_mm / 198**0.5),
+    "percent": ("invalid", "percent", lambda m, row: 100 * row.invalid_fraction),
+    "valid": ("invalid", "complement", lambda m, row: 1 - row.invalid_fraction),
+    "ever": ("invalid", "ever", lambda m, row: (m.stack.counts == 0).any(axis=0).mean()),
+}
+SLOPPY_PARTS = {
+    # how: the part, the topic, the reason, what of the part is another
+    "no interval": ("claims", "sigma_d_interval", "", lambda *_: {"sigma_d_interval_px": None}),
+    "one sigma": ("claims", "sigma_d_interval", "one_sigma", _one_sigma),
     "exponent alone": (
-        {"exponent"},
-        "no_interval",
-        _of_all("claims", lambda _, found: {"exponent": found.free.exponent}),
+        "claims", "exponent", "no_interval", lambda _, found: {"exponent": found.free.exponent}
     ),
-    "plot in metres": (
-        {"plot"},
-        "",
-        _of_all(
-            "plot", lambda good, _: {"measured_mm": tuple(v / 1e3 for v in good.plot.measured_mm)}
-        ),
-    ),
-    "law of Z": (
-        {"plot"},
-        "proportional",
-        _of_all(
-            "plot", lambda good, _: {"predicted_mm": tuple(2 * z for z in good.plot.distances_m)}
-        ),
-    ),
-    "no prediction": (
-        {"plot"},
-        "no_prediction",
-        _of_all("plot", lambda *_: {"predicted_mm": None}),
-    ),
+    "plot in metres": ("plot", "plot", "", _plot_in_metres),
+    "law of Z": ("plot", "plot", "proportional", _law_of_Z),
+    "no prediction": ("plot", "plot", "no_prediction", lambda *_: {"predicted_mm": None}),
     "copied": (
-        {"plot"},
-        "copied_prediction",
-        _of_all("plot", lambda good, _: {"predicted_mm": good.plot.measured_mm}),
+        "plot", "plot", "copied_prediction", lambda good, _: {"predicted_mm": good.plot.measured_mm}
     ),
-    "the other": (
-        {"verdict"},
-        "other_dominates",
-        _of_all(
-            "conclusion",
-            lambda good, _: {
-                "dominates": "bias" if good.conclusion.dominates == "noise" else "noise"
-            },
-        ),
-    ),
+    "the other": ("conclusion", "verdict", "other_dominates", _the_other),
     "centimetres": (
-        {"verdict"},
-        "not_measured_there",
-        _of_all("conclusion", lambda *_: {"distance_m": 45.0}),
+        "conclusion", "verdict", "not_measured_there", lambda *_: {"distance_m": 45.0}
     ),
     "three words": (
-        {"paragraph"},
-        "short",
-        _of_all("conclusion", lambda *_: {"paragraph": "bias, I think"}),
+        "conclusion", "paragraph", "short", lambda *_: {"paragraph": "bias, I think"}
     ),
+}  # fmt: skip
+TABLE = {"bias", "bias_se", "std", "std_se", "invalid"}
+LAW = {"sigma_d", "sigma_d_interval"}
+NAIVE = _in_rows("std", lambda m, row: _pooled(np.nanvar(_raw(m), axis=0)))
+SLOPPY: dict[str, tuple[set[str], str, Callable[[Submission, Recomputed], Submission]]] = {
+    # how: the topics it may cost, the reason, the change
+    "metres": (TABLE, "metres", _all_in_metres),
+    "ddof 0": (set(), "", NAIVE),
+    "rows": (TABLE, "", _swapped),
+    "columns": ({"bias", "std"}, "", _columns),
+    "another's table": (TABLE | LAW, "", _another_table),
+    "baseline of a D455": (LAW, "", _scaled_sigma_d(1.9)),
+    "mm and m": ({"sigma_d"}, "millimetres", _scaled_sigma_d(1e3)),
+}
+SLOPPY |= {
+    how: ({topic}, code, _in_rows(topic, wrong))
+    for how, (topic, code, wrong) in SLOPPY_ROWS.items()
+}
+SLOPPY |= {
+    how: ({topic}, code, _of_all(part, wrong))
+    for how, (part, topic, code, wrong) in SLOPPY_PARTS.items()
 }
 
 

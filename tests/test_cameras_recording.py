@@ -6,6 +6,8 @@ import itertools
 import json
 import shutil
 import sqlite3
+import subprocess
+import sys
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -262,6 +264,17 @@ def test_names_with_spaces_and_accents(rs, tmp_path):
     path = RandomCamera().record(folder / "erster Versuch?.db3", 2)
     with open_camera(path) as played:
         assert len(played.frames(2)) == 2
+
+
+def test_a_script_that_leaves_a_recording_open_ends_well(tabletop):
+    """Half read, kept in a cycle, with an exception: nothing is said and nothing aborts."""
+    code = (
+        f"import coursekit as ck; FILE = {str(tabletop)!r}; "
+        "c, d = map(ck.open_camera, (FILE, FILE)); s = c.stream(); next(s); d.itself = d; "
+        "raise SystemExit(0) from ValueError()"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert (ended.stdout, ended.stderr) == ("", "")
 
 
 # --- bad files ---

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import tomllib
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -12,11 +14,14 @@ from fake_realsense import real_library
 
 from coursekit import cli
 from coursekit.boards import Board, save_sheet
+from coursekit.boards.board import Skipped
 from coursekit.cameras import CameraError, open_camera
 from coursekit.cameras.simulated import SimulatedCamera
 from coursekit.results import ROOT
 from coursekit.simulation.arm_sessions import truth_of
+from coursekit.words import Estimate, Findings
 
+FINDINGS = Path(cli.__file__).with_name("findings.toml")
 CHARUCO = Board("charuco", (9, 6), 0.025)
 
 
@@ -107,13 +112,78 @@ def test_photographs_become_a_lens_and_a_place(tmp_path, capsys):
     session = ROOT / "data" / "hand_eye_in_hand"
     assert cli.main(f"calibrate {session} {board} --out {lens}".split()) == 0
     said = capsys.readouterr().out
-    assert re.search("(?s)not used: poses.csv: .*Wrote camera_info.yaml", said)
-    assert len(said.split()) < 150
+    assert said.startswith("Good: ")
+    assert said.splitlines()[-1] == "Wrote camera_info.yaml."
+    assert len(said.split()) < 80
     place = f"--lens {lens} --mount eye_in_hand --parent tool0 --out {urdf}"
     assert cli.main(f"hand-eye {session} {board} {place}".split()) == 0
-    assert len(capsys.readouterr().out.split()) < 150
+    assert len(capsys.readouterr().out.split()) < 120
     text = urdf.read_text("utf-8")
     written = ElementTree.fromstring(f"<robot>{text}</robot>").find("joint")
     xyz = [float(number) for number in written.find("origin").get("xyz").split()]
     assert written.find("parent").get("link") == "tool0"
     assert np.linalg.norm(xyz - truth_of(session).X[:3, 3]) < 0.01
+
+
+@pytest.mark.parametrize(
+    "command", ["calibrate", "hand-eye --lens a --mount eye_in_hand --parent b"]
+)
+def test_a_file_that_is_there_is_refused_before_the_work(command, tmp_path, capsys):
+    (tmp_path / "a.yaml").write_text("mine")
+    options = f"no_folder --squares 9x6 --square-mm 25 --out {tmp_path / 'a.yaml'}"
+    assert cli.main(f"{command} {options}".split()) == 1
+    assert capsys.readouterr().err.endswith("choose another name or --overwrite\n")
+
+
+REMEDIES = {
+    f"{room}.{name}": finding["remedy"]
+    for room in ("intrinsics", "hand_eye")
+    for name, finding in tomllib.loads(FINDINGS.read_text("utf-8"))[room]["findings"].items()
+    if "remedy" in finding and name != "camera_axes"  # of poses, which no command takes
+}
+
+
+@pytest.mark.parametrize("name", REMEDIES)
+def test_a_remedy_speaks_of_options(name):
+    said = cli._typed(REMEDIES[name])
+    assert len(said) > 30
+    assert not re.search(r"(?<!/)\b\w+\([^)]*\)|=['\"(\[]|`\w+[.(]|square_m|np\.|\[:", said), said
+
+
+ADVICE = {
+    "use squares=(10, 8)": "use --squares 10x8",
+    "say angle='rad'": "say --angle rad",
+    'rotation="rotation_vector"': "--rotation rotation_vector",
+    "use Board('checkerboard', (10, 7), ...)": "use --kind checkerboard --squares 10x7",
+    "print a board with ck.boards.save_sheet": "print a board with coursekit board",
+}
+
+
+@pytest.mark.parametrize("python", ADVICE)
+def test_advice_speaks_of_options(python):
+    assert cli._typed(python) == ADVICE[python]
+
+
+class Judged(Estimate):
+    """A result of which only the verdict is asked."""
+
+    def __init__(self, grade):
+        self.grade = grade
+
+    def verdict(self):
+        return f"{self.grade}: the intervals\n  hold.\n- turn the wrist."
+
+    def __repr__(self):
+        return "X"
+
+
+GRADES = [("Not to be trusted", 3), ("Not good enough", 0), ("Good", 0)]
+
+
+@pytest.mark.parametrize(("grade", "code"), GRADES)
+def test_the_verdict_comes_first_and_decides_the_exit_code(grade, code, capsys):
+    skipped = [Skipped(f"{k}.png", "blank" if k else "odd") for k in range(3)]
+    assert cli._say_how_good(Judged(grade), skipped, Findings(), False) == code
+    said = capsys.readouterr().out.splitlines()
+    assert said[:2] == [f"{grade}: the intervals hold.", "- turn the wrist."]
+    assert said[2:4] == ["not used: 1.png, 2.png: blank", "not used, either: 0.png"]

@@ -6,10 +6,10 @@ import tomllib
 import cv2
 import numpy as np
 import pytest
-from common import CHECKERBOARD
+from common import CHARUCO, CHECKERBOARD
 from lesson_claims import ROWS, claim, nominal_fx_px
 
-from coursekit import stereo
+from coursekit import intrinsics, stereo
 from coursekit.boards import detect
 from coursekit.cameras import conventions
 from coursekit.geometry import Intrinsics, deproject, distort, make_transform, pixel_grid, project
@@ -54,6 +54,15 @@ def test_p3_principal_point_is_near_the_centre_and_not_on_it() -> None:
         off = np.abs(np.array([stream.cx, stream.cy]) - centre)
         assert off.max() > 1.0
         assert (off < 0.05 * np.array(stream.size)).all()
+    # even where the truth is the centre an estimate is not; told not to estimate, OpenCV returns it
+    board, true = CHARUCO, Intrinsics(640, 480, 612, 610, 319.5, 239.5)
+    views, _ = corner_session(board, true, 3)
+    fitted = intrinsics.calibrate(views, board).intrinsics
+    assert 0.001 < math.hypot(fitted.cx - 319.5, fitted.cy - 239.5) < 5
+    points = [board.points[v.ids].astype(np.float32) for v in views]
+    pixels, how = [v.pixels.astype(np.float32) for v in views], cv2.CALIB_FIX_PRINCIPAL_POINT
+    _, fixed, *_ = cv2.calibrateCamera(points, pixels, (640, 480), None, None, flags=how)
+    assert (fixed[0, 2], fixed[1, 2]) == (319.5, 239.5)
 
 
 @claim("P4", "right")

@@ -73,6 +73,12 @@ def report(tmp_path_factory) -> Path:
     return out
 
 
+@pytest.fixture(autouse=True)
+def patient(monkeypatch) -> None:
+    """Beside other work processes may take minutes to start."""
+    monkeypatch.setattr(batch, "PATIENCE_S", 600.0)
+
+
 @pytest.fixture
 def in_process(monkeypatch) -> None:
     """Bundles are graded here: for what is not about processes, of which each takes its time."""
@@ -202,7 +208,6 @@ def test_a_bundle_that_wants_too_much_memory_is_a_row_and_its_process_lives():
 def test_processes_that_start_from_nothing_do_the_same(monkeypatch):
     """As on Windows and macOS."""
     monkeypatch.setattr(batch, "_context", lambda: multiprocessing.get_context("spawn"))
-    monkeypatch.setattr(batch, "PATIENCE_S", 600.0)  # however busy the machine is
     found = outcomes(["kill", "good"], Limits(1))
     assert (found["kill"].reason, found["good"].reason) == ("died", "well")
     assert found["good"].says.split()[1] == "1"

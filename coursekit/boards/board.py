@@ -380,16 +380,29 @@ class Detections(Listed[Detection]):
         lines += [f"  {view!r}" for view in self[:LISTED]]
         if len(self) > LISTED:
             lines.append(f"  and {len(self) - LISTED} more")
-        alike: dict[str, list[Skipped]] = {}  # by the reason, which is often that of all
-        for skip in self.skipped:
-            alike.setdefault(skip.reason, []).append(skip)
-        lines += [
-            f"  not used: {first!r}" + f" (and {len(others)} more)" * bool(others)
-            for first, *others in list(alike.values())[:LISTED_SKIPPED]
-        ]
-        if len(alike) > LISTED_SKIPPED:
-            lines.append(f"  and others, for {len(alike) - LISTED_SKIPPED} more reasons")
+        reasons = by_reason(self.skipped)
+        lines += [f"  not used: {_one_of(group)}" for group in reasons[:LISTED_SKIPPED]]
+        if len(reasons) > LISTED_SKIPPED:
+            lines.append(f"  and others, for {len(reasons) - LISTED_SKIPPED} more reasons")
         return "\n".join(lines)
+
+
+def by_reason(skipped: Iterable[Skipped]) -> list[list[Skipped]]:
+    """Images that were not used, by the reason, which is often that of all; the commonest first."""
+    groups: dict[str, list[Skipped]] = {}
+    for skip in skipped:
+        groups.setdefault(skip.reason, []).append(skip)
+    return sorted(groups.values(), key=len, reverse=True)
+
+
+def _one_of(group: Sequence[Skipped]) -> str:
+    """The first of images that were not used for one reason, and how many more there are."""
+    return f"{group[0]!r}" + f" (and {len(group) - 1} more)" * (len(group) > 1)
+
+
+def why_unused(skipped: Sequence[Skipped]) -> str:
+    """ "; 20 not used: ", with what is said of most of them; "" for none."""
+    return f"; {len(skipped)} not used: {_one_of(by_reason(skipped)[0])}" if skipped else ""
 
 
 def check_detections(
@@ -413,10 +426,11 @@ def check_detections(
     ValueError: detections[0] (a.png): has 3 corners, want at least 4
     """
     if len(detections) < least_views:
-        skipped = getattr(detections, "skipped", ())
-        unused = f"; {len(skipped)} not used, the first: {skipped[0]!r}" if skipped else ""
-        seen = counted(len(detections), "view")
-        raise ValueError(f"detections: got {seen}, want at least {least_views}{unused}")
+        seen, others = (
+            counted(len(detections), "view"),
+            why_unused(getattr(detections, "skipped", ())),
+        )
+        raise ValueError(f"detections: got {seen}, want at least {least_views}{others}")
     for index, view in enumerate(detections):
         fault = next(_faults(view, board, least_corners, size or detections[0].size), "")
         if fault:

@@ -33,6 +33,7 @@ NARROWEST = 40  # long sides to the short one
 MOST_PIXELS, MOST_BYTES = 250_000_000, 2_000_000_000  # more is no photograph
 RANGE = 12, 243  # grey levels of a hundredth and of 99 hundredths of a scaled image
 SESSION = "session.json"  # written beside the images by the course itself
+NO_PICTURE = r"^\.|\.(md|txt|csv|json|ya?ml|xml|html?|toml|ini|log|py|zip|db)$"  # of a file's name
 JPEG, PNG = b"\xff\xd8", b"\x89PNG"
 SIZE_SEGMENTS = b"\xc0\xc1\xc2\xc3\xc5\xc6\xc7\xc9\xca\xcb\xcd\xce\xcf"  # of a JPEG hold its size
 ALPHA = (b"\4", b"\6")  # PNG: kinds of colour with transparency
@@ -142,7 +143,7 @@ def detect_all(
 ) -> Detections:
     """The board in each of many images; what cannot be used is listed in `.skipped`, with why.
 
-    images: a folder (all its files, in natural order, not those of folders in it), or a sequence
+    images: a folder (its files, in natural order, without tables and texts), or a sequence
     of paths, of arrays (uint8, grey or RGB) or of a camera's frames, whose colour image is taken.
     Where sizes differ the commonest is used (of equally common ones the largest). Ctrl-C keeps
     what was detected until then, with one line.
@@ -183,9 +184,9 @@ def _sources(images: Any) -> list[tuple[str, Any]]:
         wanted = f"a folder that exists; there is no {folder.resolve()}"
         want(folder.is_dir(), "images", os.fspath(images), wanted)
         files = [p for p in folder.iterdir() if p.is_file() or not p.exists()]  # a broken link
-        files = [p for p in files if p.name != SESSION and not p.name.startswith(".")]
+        files = [p for p in files if not re.search(NO_PICTURE, p.name.lower())]
         if not files:
-            raise ValueError(f"images: {os.fspath(images)!r} holds no files")
+            raise ValueError(f"images: {os.fspath(images)!r} holds no pictures")
         return [(path.name, path) for path in sorted(files, key=natural)]
     if not isinstance(images, Iterable):
         kind = type(images).__name__

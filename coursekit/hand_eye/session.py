@@ -36,7 +36,7 @@ from scipy.spatial.transform import Rotation
 from coursekit.arm import Arm, FkErrors, fk_covariance, upright_errors, widowx
 from coursekit.arrays import ArrayLike, Floats, Integers
 from coursekit.boards import Board, Detection, Detections, detect_all
-from coursekit.boards.board import Skipped
+from coursekit.boards.board import Skipped, why_unused
 from coursekit.boards.detector import SESSION, natural
 from coursekit.causes import DiagnosisTexts
 from coursekit.checks import array, choice, instance, transform, want
@@ -290,8 +290,7 @@ class HandEyeSession:
         used = [file for file in rows if file in found]
         if len(used) < FEWEST_POSES:
             facts = {"used": len(used), "folder": os.fspath(folder), "fewest": FEWEST_POSES}
-            reasons = "".join(f"; {skip!r}" for skip in skipped[:3])
-            raise ValueError(say("hand_eye.few_pairs", **facts) + reasons)
+            raise ValueError(say("hand_eye.few_pairs", **facts) + why_unused(skipped))
         T, columns = _stacked(rows[file] for file in used)
         views_ = Detections(found[file] for file in used)
         size, wanted = views_.size, (intrinsics.width, intrinsics.height)

@@ -17,6 +17,7 @@ import numpy as np
 
 from coursekit.arrays import ArrayLike, Floats
 from coursekit.boards import Board, Detection, Detections, Skipped
+from coursekit.boards.board import by_reason
 from coursekit.causes import Accepted, CauseSearch, DiagnosisTexts
 from coursekit.checks import array, want
 from coursekit.geometry import fold_radius
@@ -143,16 +144,16 @@ def _images(detections: Sequence[Detection], board: Board) -> tuple[list[Finding
     common = max(set(sizes), key=sizes.count) if sizes else (0, 0)
     others = [d.name or f"view {i}" for i, d in enumerate(detections) if d.size != common]
     skipped: Sequence[Skipped] = getattr(detections, "skipped", ())
-    others += [s.name for s in skipped if s.kind == "other_size"]
     if others and sizes:
         width, height = common
         listed = _listed(others)
         found.append(_TEXTS.finding("mixed_sizes", width=width, height=height, others=listed))
     used = [i for i, d in enumerate(detections) if d.size == common and len(d.ids) >= MIN_CORNERS]
     layout = _layout([detections[i] for i in used], board)
-    refused = [s.reason for s in skipped if s.kind == "other_board"]
+    refused = [s for s in skipped if s.kind == "other_board"]
     if not layout and len(refused) > len(used):  # the detector saw other squares in most images
-        figures = {"images": len(refused), "reason": refused[0], "board": board.text}
+        reason = by_reason(refused)[0][0].reason
+        figures = {"images": len(refused), "reason": reason, "board": board.text}
         layout = _TEXTS.finding("other_squares_seen", **figures)
     if layout:
         return [*found, layout], used

@@ -66,6 +66,25 @@ def test_holds_two_depth_images_and_one_colour_image(camera, capsys):
     assert (frames[0].depth != frames[1].depth).mean() > 0.1
 
 
+def test_its_images_and_lenses_are_those_that_librealsense_plays(rs, folder, camera):
+    pipeline, config = rs.pipeline(), rs.config()
+    config.enable_device_from_file(str(folder / NAME), repeat_playback=False)
+    profile = pipeline.start(config)
+    profile.get_device().as_playback().set_real_time(False)
+    try:
+        theirs = pipeline.wait_for_frames(60_000)
+        depth, color = theirs.get_depth_frame(), theirs.get_color_frame()
+        [ours] = [frame for frame in camera.frames(5) if frame.number == depth.get_frame_number()]
+        np.testing.assert_array_equal(ours.depth, np.asanyarray(depth.get_data()))
+        np.testing.assert_array_equal(ours.color, np.asanyarray(color.get_data()))
+        assert ours.depth_scale_m == pytest.approx(depth.get_units(), rel=1e-6)
+        for lens, frame in ((camera.depth, depth), (camera.color, color)):
+            said = frame.profile.as_video_stream_profile().get_intrinsics()
+            assert (lens.fx, lens.fy, lens.cx, lens.cy) == (said.fx, said.fy, said.ppx, said.ppy)
+    finally:
+        pipeline.stop()
+
+
 def test_its_points_are_those_of_the_vendors_function(rs, camera):
     frame = camera.frame()
     points = frame.points()

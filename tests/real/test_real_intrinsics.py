@@ -139,7 +139,7 @@ STILL = {  # the board is paper and no more is wrong, or what is wrong has no na
     "doosan": {"bowed_board", "no_edge_corners"},
     "opencv": {"bowed_board"},
     # one photograph is 1281 px wide, and there are corners in no corner of the image
-    "udacity": {"mixed_sizes", "bowed_board", "unexplained", "motion_blur", "halves_disagree"},
+    "udacity": {"bowed_board", "unexplained", "motion_blur", "halves_disagree"},
 }
 HELD = {"bowed_board", "unexplained", "no_edge_corners", "rolling_shutter", "focus_drift"}
 

@@ -58,12 +58,6 @@ def rows_times_the_inverse(pixels, depth, K, dist=None):
     return rays * depth[:, None]
 
 
-@wrong("inverse_transposed")
-def rows_times_the_inverse_and_normalised(pixels, depth, K, dist=None):
-    rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(K)
-    return rays / rays[:, 2:] * depth[:, None]
-
-
 @wrong("too_few_rounds")
 def undistort_points_as_it_comes(pixels, depth, K, dist=None):
     rays = cv2.undistortPoints(pixels[:, None], K, np.zeros(5) if dist is None else dist)[:, 0]
