@@ -199,7 +199,7 @@ def _grade(options: argparse.Namespace) -> None:
     from coursekit.submission.batch import Choices, grade_folder
 
     how = options.folder, options.out, options.workers, options.timeout
-    choices = Choices(options.roster, options.late_after, options.separator)
+    choices = Choices(options.roster, options.late_after, options.separator, options.assignment)
     print(grade_folder(*how, overwrite=options.overwrite, choices=choices))
 
 
