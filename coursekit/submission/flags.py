@@ -378,13 +378,16 @@ def _stack_print(stack: Stack) -> StackPrint:
     off = (counts - mean.astype(np.float32)) * valid
     most = np.maximum(6 * np.median(np.abs(off), axis=(1, 2), keepdims=True), 3)
     off = np.clip(off, -most, most)
-    waves = np.arange(-LARGEST_WAVE, LARGEST_WAVE + 1)
-    power = np.abs(np.fft.fft2(off - off.mean(axis=(1, 2), keepdims=True))) ** 2
-    power = power[:, waves[:, None] % height, waves % width]
-    power = power + power[:, ::-1]
+    off = off - off.mean(axis=(1, 2), keepdims=True)
+    waves = np.arange(LARGEST_WAVE + 1)  # only these of a Fourier transform are needed
+    across, down = (
+        np.exp(-2j * np.pi / n * np.outer(np.arange(n), waves)).astype(np.complex64)
+        for n in (width, height)
+    )
+    rows = (off @ across).transpose(0, 2, 1)
+    power = np.square(np.abs(rows @ down)) + np.square(np.abs(rows @ down.conj()))
     power = power + power.transpose(0, 2, 1)
-    down, across = np.triu_indices(LARGEST_WAVE + 1)
-    spectra = power[:, LARGEST_WAVE + down[1:], LARGEST_WAVE + across[1:]] ** 0.25
+    spectra = power[:, *(part[1:] for part in np.triu_indices(LARGEST_WAVE + 1))] ** 0.25
     level = spectra.mean(axis=0)
     rounded = tuple(round(float(value), 3) for value in level)
     return named(rounded, _bytes(spectra - level))

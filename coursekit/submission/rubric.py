@@ -179,7 +179,7 @@ def judged(submission: Submission, found: Recomputed) -> tuple[Item, ...]:
 # --- at each distance -----------------------------------------------------------------------------
 
 
-def _at_distances(submission: Submission, found: Recomputed) -> Iterator[Item]:
+def _at_distances(submission: Submission, found: Recomputed) -> list[Item]:
     """The items at each distance that is asked for, and at others that were measured."""
     points, wanted = grading_rules()["points"], grading_rules()["exercise"]["distances_m"]
     chosen = _chosen(wanted, found.at)
@@ -190,8 +190,9 @@ def _at_distances(submission: Submission, found: Recomputed) -> Iterator[Item]:
             places.append((m.distance_m, m, dict.fromkeys(points, 0.0)))
     items = [item for place in places for item in _one_distance(submission, *place, {})]
     only = {topic: _reason([item for item in items if item.topic == topic]) for topic in JUDGES}
-    for place in places:
-        yield from _one_distance(submission, *place, only)
+    if {*only.values()} != {None}:
+        items = [item for place in places for item in _one_distance(submission, *place, only)]
+    return items
 
 
 def _reason(items: Sequence[Item]) -> str | None:
