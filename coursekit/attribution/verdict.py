@@ -256,12 +256,8 @@ def _undecided(
 
     needed: for each cause that has to show, whether it does in n trials. least: trials in any case.
     """
-    total = bisect_left(
-        range(MOST_TRIALS + 1),
-        True,
-        lo=n + 1,
-        key=lambda n: n >= least and all(shows(n) for shows in needed),
-    )
+    totals, first = range(MOST_TRIALS + 1), max(n + 1, least)
+    total = bisect_left(totals, True, first, key=lambda n: all(shows(n) for shows in needed))
     more = total - n if total <= MOST_TRIALS else None
     return Decision("cannot_tell_yet", says, more, remedy)
 

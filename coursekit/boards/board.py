@@ -205,9 +205,8 @@ class Board:
         if self.marker_m is None:
             raise ValueError("kind: a checkerboard has no cv2.aruco.CharucoBoard")
         numbers = self.first_marker + np.arange(self.white.sum())
-        board = cv2.aruco.CharucoBoard(
-            self.squares, self.square_m, self.marker_m, _dictionary(self.dictionary), numbers
-        )
+        known = _dictionary(self.dictionary)
+        board = cv2.aruco.CharucoBoard(self.squares, self.square_m, self.marker_m, known, numbers)
         board.setLegacyPattern(self.old_origin)
         return board
 
@@ -237,9 +236,8 @@ def _cover(first: float, share: float, cells: int, pixels: int) -> Floats:
 @cache
 def _dictionary(name: str) -> Any:
     """OpenCV's dictionary of a name; ValueError for an unknown one."""
-    return cv2.aruco.getPredefinedDictionary(
-        getattr(cv2.aruco, choice("dictionary", name, DICTIONARIES))
-    )
+    number = getattr(cv2.aruco, choice("dictionary", name, DICTIONARIES))
+    return cv2.aruco.getPredefinedDictionary(number)
 
 
 def _side(name: str, value: object) -> float:
@@ -426,10 +424,8 @@ def check_detections(
     ValueError: detections[0] (a.png): has 3 corners, want at least 4
     """
     if len(detections) < least_views:
-        seen, others = (
-            counted(len(detections), "view"),
-            why_unused(getattr(detections, "skipped", ())),
-        )
+        seen = counted(len(detections), "view")
+        others = why_unused(getattr(detections, "skipped", ()))
         raise ValueError(f"detections: got {seen}, want at least {least_views}{others}")
     for index, view in enumerate(detections):
         fault = next(_faults(view, board, least_corners, size or detections[0].size), "")

@@ -316,7 +316,6 @@ class HandEyeSession:
         if self.board is None or self.intrinsics is None:
             raise ValueError("board, intrinsics: a folder of images needs both")
         place = Path(folder)
-        place.mkdir(parents=True, exist_ok=True)
         for name in self.names:
             write_bytes(place / name, images[name])
         write_bytes(place / POSES, self._csv().encode())
