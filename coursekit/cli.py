@@ -158,15 +158,15 @@ def _say_how_good(
     result: Estimate, skipped: Sequence[Skipped], findings: Findings, details: bool
 ) -> int:
     """How far to trust the result, what to do first, what was not used; returns the exit code."""
-    first, *weak = (" ".join(part.split()) for part in re.split(r"\n(?=\S)", result.verdict()))
+    first, *more = (" ".join(part.split()) for part in re.split(r"\n(?=\S)", result.verdict()))
+    code = NOT_TRUSTED if first.startswith("Not to be trusted") else 0
     if details:
         print(_typed(f"{result.verdict()}\n{result}\n{findings!r}"))
     else:
-        says = [first, *weak]
-        if findings:
-            titles = "; ".join(finding.title for finding in findings)
-            says = [first, f"Do first: {findings[0].remedy}", f"Found: {titles}."]
-        print("\n".join(wrapped(_typed(line)) for line in says))
+        titles = "; ".join(finding.title for finding in findings)
+        told = [f"Do first: {findings[0].remedy}", f"Found: {titles}."] if findings else []
+        weak = [reason for reason in more if reason.startswith("- ") and not (findings and code)]
+        print("\n".join(wrapped(_typed(line)) for line in [first, *told, *weak]))
     reasons = by_reason(skipped)
     shown = len(reasons) if details else SHOWN
     for group in reasons[:shown]:
@@ -176,7 +176,7 @@ def _say_how_good(
         print(wrapped(f"not used, either: {', '.join(rest)}"))
     if not details:
         print("Numbers, evidence and the other remedies: the same with --details.")
-    return NOT_TRUSTED if first.startswith("Not to be trusted") else 0
+    return code
 
 
 def _submit(options: argparse.Namespace) -> None:
@@ -199,7 +199,7 @@ def _grade(options: argparse.Namespace) -> None:
     from coursekit.submission.batch import Choices, grade_folder
 
     how = options.folder, options.out, options.workers, options.timeout
-    choices = Choices(options.roster, options.late_after, options.separator)
+    choices = Choices(options.roster, options.late_after, options.separator, options.assignment)
     print(grade_folder(*how, overwrite=options.overwrite, choices=choices))
 
 

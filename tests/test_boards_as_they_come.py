@@ -121,6 +121,17 @@ def test_a_grid_of_circles_is_named(offset, black):
         assert "but a grid of circles: not usable here, print a bo" in not_found(image, board)
 
 
+def test_a_blurred_checkerboard_is_no_grid_of_circles():
+    sheet = np.pad(Board("checkerboard", (10, 8), 0.025).image(40), 60, constant_values=235)
+    height, width = sheet.shape
+    sheet_corners = np.float32([[0, 0], [width, 0], [width, height], [0, height]])
+    seen_at = np.float32([[301, 233], [433, 207], [426, 358], [283, 352]])
+    H = cv2.getPerspectiveTransform(sheet_corners, seen_at)
+    image = cv2.warpPerspective(sheet, H, (640, 480), borderValue=110)
+    said = not_found(cv2.GaussianBlur(image, (0, 0), 3.2), Board("checkerboard", (10, 7), 0.025))
+    assert said.startswith("no checkerboard of 10x7 squares")
+
+
 def test_part_of_a_checkerboard_is_no_smaller_board():
     image = shot(CHECKERBOARD)
     _, truth = view(CHECKERBOARD)

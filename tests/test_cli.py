@@ -143,6 +143,11 @@ REMEDIES = {
 }
 
 
+def test_the_mount_is_the_first_thing_to_check():
+    shared = tomllib.loads(FINDINGS.read_text("utf-8"))["shared"]["inconsistent_convention"]
+    assert cli._typed(shared["remedy"]).startswith("First check --mount: does the camera ride on")
+
+
 @pytest.mark.parametrize("name", REMEDIES)
 def test_a_remedy_speaks_of_options(name):
     said = cli._typed(REMEDIES[name])

@@ -85,7 +85,7 @@ def in_process(monkeypatch) -> None:
 
     def run(bundles, work, limits):
         for bundle in bundles:
-            yield bundle, work(str(bundle.path), bundle.name, bundle.page)
+            yield bundle, work(str(bundle.path), bundle.name)
 
     monkeypatch.setattr(batch, "work_through", run)
 
@@ -165,7 +165,7 @@ BEHAVIOUR = {  # by the name of a bundle that the reader let through
 }
 
 
-def misbehave(path: str, name: str, page: str) -> tuple[ReportLine, str]:
+def misbehave(path: str, name: str) -> tuple[ReportLine, str]:
     """What a bundle does to the process, or the process's number and how many threads it has."""
     BEHAVIOUR.get(name.removesuffix(".zip"), int)()
     return not_graded(name, "well", f"{os.getpid()} {os.environ['OPENBLAS_NUM_THREADS']}"), "page"
@@ -334,7 +334,7 @@ def test_only_bundles_are_looked_at(in_process, tmp_path):
     (folder / "linked").symlink_to(quick(tmp_path / "elsewhere", ["secret"]))
     summary = graded(folder, folder / "report")
     assert summary.left_out == ("essay.pdf", "linked")
-    assert "left out: 2 files: essay.pdf, linked" in str(summary)
+    assert "left out: 2 files: essay.pdf; linked" in str(summary)
     names = [row["file"] for row in table(folder / "report")]
     assert names == ["A.zip", "UPPER.ZIP", "b.zip", "late/Ada_17/studio.zip"]
     again = graded(folder, folder / "report", overwrite=True)
@@ -467,6 +467,76 @@ def test_everybody_of_a_class_has_a_row_and_nobodys_grade_is_anothers(
         assert of(names[15], 15, "feedback.html" if lms == "Moodle" else "studio_1.html") in (
             packed.namelist()
         )
+
+
+GRADEBOOK = """Student,ID,SIS User ID,SIS Login ID,Section,Homework depth noise (4711)
+    Points Possible,,,,,100
+"Martin, Eve",1000,s0,eve,A,
+"Żółć, Łukasz",1001,s1,luk,B,
+"Lee, Bo",1002,s2,bo,B,
+"Absent, Ann",1003,s3,ann,B,
+"Student, Test",1004,,,B,
+"""
+
+
+@pytest.mark.parametrize("lms", LMS)
+def test_what_the_instructor_decides_reaches_everybody(lms, in_process, tmp_path, monkeypatch):
+    """From zip to import, with a gradebook of Canvas: a copied bundle, one that is late, a broken
+    one, and nothing."""
+    monkeypatch.chdir(tmp_path)
+    Path("class.csv").write_text(GRADEBOOK, encoding="utf-8")
+    typed = {"Eve Martin": "Hana Sato", "Łukasz Żółć": "lukasz zolc", "Bo Lee": ""}
+    of, where = LMS[lms][0], {}
+    with zipfile.ZipFile("all.zip", "w") as packed:
+        for i, (name, said) in enumerate(typed.items()):
+            file = of(name, i if name != "Bo Lee" else 2, "s.zip").replace("_LATE", "")
+            where[name] = of(name, i, "feedback.html" if lms == "Moodle" else "s.html")
+            data = bundle_bytes(replace(ZOE, student=said)) if said else b"no"
+            packed.writestr(zipfile.ZipInfo(file, (2026, 3, 2 + i, 13, 0, 0)), data)
+    where["Bo Lee"] = where["Bo Lee"].replace("_LATE", "")
+    how = batch.Choices("class.csv", datetime(2026, 3, 2, 14), assignment="depth noise")
+    out = Path("all_report")
+
+    def run() -> tuple[str, dict[str, dict[str, str]], dict[str, str]]:
+        said = str(batch.grade_folder("all.zip", progress=False, overwrite=True, choices=how))
+        text = (out / "canvas.csv").read_text(encoding="utf-8-sig")
+        rows = {row["Student"]: row for row in csv.DictReader(io.StringIO(text))}
+        with zipfile.ZipFile(out / "feedback.zip") as packed:
+            pages = {name: packed.read(file).decode() for name, file in where.items()}
+        return said, rows, pages
+
+    said, rows, pages = run()
+    assert "Missing: 1 student: Absent, Ann\n" in said
+    assert "--assignment" not in said
+    assert "Your file could not be read: hand it in again." in pages["Bo Lee"]
+    assert "<h1>Studio exercise 1: Martin, Eve</h1>" in pages["Eve Martin"]
+    assert "The name in the file is Hana Sato." in pages["Eve Martin"]
+    assert "Handed in 3 March 2026, 13:00: 23 hours late." in pages["Łukasz Żółć"]
+    index = (out / "index.html").read_text(encoding="utf-8")
+    assert "Lee, Bo is asked to hand it in again." in index
+    assert index.count("Absent, Ann") == 3  # missing, and twice among everybody
+    assert "other_name" not in {row["student"]: row["flags"] for row in table(out)}["Żółć, Łukasz"]
+    assert len(list((out / "students").glob("martin_eve_*.html"))) == 1
+    assert (out / "moodle.csv").exists() == (lms == "Moodle")
+
+    own = "who,overrule,comment\n1000,50,well tried\n1002,0,too late\n1003,,excused\n"
+    (out / "own_points.csv").write_text(own, encoding="utf-8")
+    said, rows, pages = run()
+    assert said.startswith("3 bundles: 2 graded, 1 refused")
+    column = "Homework depth noise (4711)"
+    assert [rows[name][column] for name in ("Martin, Eve", "Lee, Bo", "Absent, Ann")] == [
+        *("50", "0", "")
+    ]
+    assert [*rows["Lee, Bo"].values()][:5] == ["Lee, Bo", "1002", "s2", "bo", "B"]
+    assert "<strong>50 of 100 points." in pages["Eve Martin"]
+    assert "Points that your instructor set: 50 in all (" in pages["Eve Martin"]
+    assert "well tried" in pages["Eve Martin"]
+    assert "<strong>0 of 100 points." in pages["Bo Lee"]
+    assert "50 of 100 (yours; " in (out / "index.html").read_text(encoding="utf-8")
+    if lms == "Moodle":
+        text = (out / "moodle.csv").read_text(encoding="utf-8-sig")
+        (bo,) = [row for row in csv.DictReader(io.StringIO(text)) if row["Full name"] == "Lee, Bo"]
+        assert (bo["Grade"], bo["Feedback comments"]) == ("0", "too late")
 
 
 def test_own_points_survive_a_regrade_which_says_what_changed(in_process, tmp_path, monkeypatch):

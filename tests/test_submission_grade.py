@@ -26,7 +26,7 @@ from coursekit.submission import rubric
 from coursekit.submission.flags import Fingerprint, as_json, copies, fingerprint
 from coursekit.submission.format import Claims, Conclusion, Plot, Stack, Submission
 from coursekit.submission.recompute import MISTAKES, RULES, WHY, grading_rules, recompute
-from coursekit.submission.report import student_page
+from coursekit.submission.report import page_body
 from coursekit.submission.rubric import JUDGES, Item, grade, shortcomings
 
 MANY = 8 if NIGHTLY else 1
@@ -277,7 +277,7 @@ def test_no_prediction_is_none_and_keeps_little():
     found = item(replace(EXACT, plot=two), "plot")
     assert (found.points, found.mistake) == (1.47, "no_prediction")
     assert found.says.endswith("0.60 m missing and without your prediction.")
-    assert student_page(samples.graded(silent), silent)
+    assert page_body(samples.graded(silent), silent)
     assert item(replace(EXACT, plot=Plot((), (), ())), "plot").verdict == "missing"
 
 

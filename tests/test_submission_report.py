@@ -73,7 +73,8 @@ def check_page(text: str) -> Page:
 
 def page_of(submission: Submission) -> str:
     """A student's page, which is well nested and has no figure that is infinite or unknown."""
-    text = report.student_page(samples.graded(submission), submission)
+    body = report.page_body(samples.graded(submission), submission)
+    text = report.student_page(line_of(submission), body)
     check_page(text)
     assert "nan" not in text.replace("nano", "")
     assert not re.search(r'="-?inf', text)
@@ -82,7 +83,7 @@ def page_of(submission: Submission) -> str:
 
 def line_of(submission: Submission, file: str = "a.zip", page: str = "") -> report.ReportLine:
     """The line of a graded submission."""
-    return report.graded(file, samples.graded(submission), submission, page)
+    return replace(report.graded(file, samples.graded(submission), submission), page=page)
 
 
 def own_words(submission: Submission, seed: int) -> Submission:
@@ -191,7 +192,7 @@ def test_a_students_text_stays_text(text):
 def test_the_class_page_has_everything(lines):
     page = check_page(report.class_page(lines))
     assert "6 bundles graded, 1 not graded, 3 flagged." in page.text
-    assert "zip_bomb" in page.text
+    assert "It grows a thousand times." in page.text
     assert "sign of the bias turned (1)" in page.text
     assert "nearly identical" in page.text
     links = {attributes["href"] for tag, attributes in page.tags if tag == "a"}

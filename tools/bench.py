@@ -261,7 +261,7 @@ def bench_grading() -> list[Row]:
             path.write_bytes(data)
 
         def one() -> object:
-            return grade_file(str(paths[0]), "00.zip", "")
+            return grade_file(str(paths[0]), "00.zip")
 
         def graded_by(workers: int) -> object:
             out = Path(tempfile.mkdtemp(dir=scratch))

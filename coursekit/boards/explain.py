@@ -141,11 +141,15 @@ def _is_cut(grey: Grey, grid: Floats) -> bool:
 
 
 def _has_circles(grey: Grey) -> bool:
-    """Whether there are many round blobs, dark or bright, most of them in rows of three."""
+    """Whether there are many round blobs, dark or bright, most of them in rows of three.
+
+    Where both are, they are the squares of a chessboard, blurred.
+    """
     opencv: Any = cv2  # whose type stubs lack the blobs
     settings = opencv.SimpleBlobDetector_Params()
     settings.minArea, settings.maxArea = 20, grey.size / 50
     settings.filterByCircularity, settings.minCircularity = True, LEAST_ROUND
+    seen = 0
     for image in (grey, 255 - grey):
         blobs = opencv.SimpleBlobDetector_create(settings).detect(image)
         if len(blobs) < FEWEST_CIRCLES:
@@ -155,9 +159,8 @@ def _has_circles(grey: Grey) -> bool:
         distance, index = tree.query(centres, k=2)
         step = centres[index[:, 1]] - centres
         off = [tree.query(third)[0] for third in (centres - step, centres + 2 * step)]
-        if (np.min(off, axis=0) < OFF_ROW * distance[:, 1]).mean() > 0.8:
-            return True
-    return False
+        seen += (np.min(off, axis=0) < OFF_ROW * distance[:, 1]).mean() > 0.8
+    return seen == 1
 
 
 # --- other markers, or the same on another plan ---

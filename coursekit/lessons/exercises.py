@@ -310,7 +310,7 @@ class Exercise:
 
     def _by_part(self, values: list[Floats], expected: list[Floats]) -> tuple[Mistake, ...]:
         """What gives the numbers of each wrong part of the result, where something does."""
-        singles = [*self.single_mistakes(), *self._edits[1], *self._edits[2]]
+        singles = [*self.single_mistakes(), *self._edits[1]]
         found: list[Mistake] = []
         for name, at in self._off(values, expected):
             some = any(v[at].any() for v in values)  # of nothing but 0 only that can be said

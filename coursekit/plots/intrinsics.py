@@ -172,7 +172,10 @@ def uncertainty(results: Mapping[str, IntrinsicsResult], range_m: float) -> Less
         ends_at = np.array([width, height]) - 1
         drawn = [path.vertices for path in lines.get_paths() if len(path)]
         inside = [at[np.minimum(at, ends_at - at).min(axis=1).argmax()] for at in drawn]
-        whole = [at for at in inside if np.minimum(at, ends_at - at).min() > LABEL_PART * width]
+        whole: list[Floats] = []  # places of labels that neither the rim nor another one cuts
+        for at in (at for at in inside if np.minimum(at, ends_at - at).min() > LABEL_PART * width):
+            if all(np.abs((at - other) / (0.25, 0.12)).max() > width for other in whole):
+                whole.append(at)
         ax.clabel(lines, fmt="%g px", fontsize=9, inline_spacing=1, manual=whole)
         for text in lines.labelTexts:
             text.set_path_effects(edge)

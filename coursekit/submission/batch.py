@@ -46,7 +46,7 @@ from tqdm.auto import tqdm
 from coursekit import results
 from coursekit.checks import positive, want
 from coursekit.submission import report
-from coursekit.submission.flags import Roster, as_json, class_table, place_of
+from coursekit.submission.flags import Roster, as_json, class_table, place_of, words_of
 from coursekit.submission.format import DOCUMENTS, MANIFEST, NO_TEXT, TURNING_SIGNS, is_junk, slug
 from coursekit.submission.recompute import LABELS, grading_rules
 from coursekit.words import counted
@@ -60,7 +60,6 @@ AHEAD = 3  # bundles a worker that wait in the pool
 MAX_LEVELS = 100  # of folders in an LMS's zip
 HASHED_BYTES = 6 * 2**20  # of a file; larger ones are refused anyway
 
-FAILED = ("timeout", "died", "memory", "error", "lost")  # tried anew by the next run
 CSV, PAGE, PARAGRAPHS = "grades.csv", "index.html", "paragraphs.html"
 SECOND, OWN_POINTS, FEEDBACK = "second_marker.html", "own_points.csv", "feedback.zip"
 STUDENTS, ROWS, CLASS = "students", ".rows", "class.json"
@@ -73,8 +72,8 @@ CANNOT_START = (
     "too, more memory is needed, or the installation is broken (run `python3 course.py test`)"
 )
 
-Graded = tuple[report.ReportLine, str]  # a line in the class, and the page of the student
-Work = Callable[[str, str, str], Graded]  # of the file's path, its name and the page's
+Graded = tuple[report.ReportLine, str]  # a line in the class, and most of the student's page
+Work = Callable[[str, str], Graded]  # of the file's path and its name
 
 
 class Stopped(KeyboardInterrupt):
@@ -85,18 +84,22 @@ class Stopped(KeyboardInterrupt):
 class Bundle:
     """A file to grade: its path, its name in the folder, what its line is kept under.
 
-    page: the link to its page. Both it and the key come from a hash; nobody's text is a path.
+    The key comes from a hash; nobody's text is a path.
     """
 
     path: Path
     name: str
     key: str
 
-    @property
-    def page(self) -> str:
-        """Where the page of its student stands in the report."""
-        plain = unicodedata.normalize("NFKD", self.path.stem).encode("ascii", "ignore").decode()
+    def page(self, line: report.ReportLine) -> str:
+        """Where the student's page stands in the report; a name that is only typed is not in it."""
+        name = line.name if line.row or place_of(self.name).lms else self.path.stem
+        plain = "_".join(words_of(name)).encode("ascii", "ignore").decode()
         return f"{STUDENTS}/{slug(plain)}_{self.key[:12]}.html"
+
+    def body(self, out: Path) -> Path:
+        """Where what was measured is kept in a report's folder, for the page."""
+        return out / ROWS / f"{self.key}.html"
 
 
 @dataclass(frozen=True)
@@ -105,7 +108,7 @@ class Summary:
 
     kept: of those, how many were graded by an earlier run. left_out: files that are no bundle.
     missing: who of the roster handed in nothing. changes: of a regrade, whose points changed, from
-    what, to what, and why.
+    what, to what, and why. notes: on the tables.
     """
 
     out: Path
@@ -118,6 +121,7 @@ class Summary:
     seconds: float
     missing: tuple[str, ...] = ()
     changes: tuple[tuple[str, ...], ...] = ()
+    notes: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         n = self.graded + self.refused + self.failed
@@ -127,7 +131,8 @@ class Summary:
             "flagged": self.flagged,
         }
         parts = [f"{self.graded} graded", *(f"{k} {what}" for what, k in others.items() if k)]
-        lines = [f"{counted(n, 'bundle')} in {self.seconds:.0f} s: {', '.join(parts)}."]
+        took = f" in {self.seconds:.0f} s" if self.kept < n else ""
+        lines = [f"{counted(n, 'bundle')}{took}: {', '.join(parts)}."]
         if self.kept:
             lines.append(f"{self.kept} of them had been graded before and have not changed.")
         if self.left_out:
@@ -138,13 +143,14 @@ class Summary:
         if self.changes:
             names = [f"{name} ({was} to {now})" for name, was, now, _ in self.changes]
             lines.append(f"Changed: {counted(len(names), 'student')}: {_some(names)}")
+        lines += self.notes
         lines.append(f"Open {self.out / PAGE}; {CSV} beside it goes into a spreadsheet.")
         return "\n".join(lines)
 
 
 def _some(names: Sequence[str]) -> str:
     """The first five of them."""
-    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+    return "; ".join(names[:5]) + ("; ..." if len(names) > 5 else "")
 
 
 # ---- a batch ------------------------------------------------------------------------------------
@@ -155,12 +161,13 @@ class Choices:
     """What an instructor chooses for a report.
 
     roster: a table of the class. late_after: the latest moment that is not late. separator: of the
-    cells of the tables.
+    cells of the tables. assignment: the column for the points in Canvas' gradebook.
     """
 
     roster: str | os.PathLike[str] | None = None
     late_after: datetime | None = None
     separator: Literal[",", ";"] = ","
+    assignment: str = ""
 
 
 def grade_folder(
@@ -236,7 +243,7 @@ def _grade(
             many = counted(len(bundles), "bundle")
             says = f"stopped after {finished} of {many}, which are kept. The same command goes on"
             raise Stopped(f"{says} from there.") from None
-        done, changes = _finish(out, bundles, others, roster, choices)
+        done, changes, notes = _finish(out, bundles, others, roster, choices)
     counts = Counter(_kind(line) for line in done)
     return Summary(
         out,
@@ -249,6 +256,7 @@ def _grade(
         time.monotonic() - started,
         tuple(line.name for line in done if line.reason == "missing"),
         tuple(changes),
+        notes,
     )
 
 
@@ -471,7 +479,7 @@ def work_through(
 def _scheduled(pool: ProcessPool, work: Work, bundle: Bundle, limits: Limits) -> Future[Graded]:
     """A bundle given to the pool; its future is broken where the pool is no more."""
     try:
-        arguments = (work, limits.timeout_s, str(bundle.path), bundle.name, bundle.page)
+        arguments = (work, limits.timeout_s, str(bundle.path), bundle.name)
         return pool.schedule(_in_time, arguments, timeout=SLOWER * limits.timeout_s)
     except RuntimeError as error:  # the pool is no more; the bundle is lost with it
         lost: Future[Graded] = Future()
@@ -651,29 +659,34 @@ def _load(out: Path, bundle: Bundle) -> report.ReportLine | None:
 def _is_done(out: Path, bundle: Bundle) -> bool:
     """Whether an earlier run has finished with a bundle, and its page is there."""
     line = _load(out, bundle)
-    if line is None or line.reason in FAILED:
+    if line is None or line.reason in report.FAILED:
         return False
-    return not line.page or (out / line.page).exists()
+    return line.points is None or bundle.body(out).exists()
 
 
 def _store(out: Path, bundle: Bundle, outcome: Graded, dated: bool = False) -> None:
-    """Keep a finished bundle: its page first, so that a line never lacks it."""
-    line, page = outcome
+    """Keep a finished bundle: that of its page first, so that a line never lacks it."""
+    line, body = outcome
     line = replace(line, handed_in=_dated(bundle.path) if dated else "")
-    if page:
-        results.write_bytes(out / bundle.page, page.encode())
+    if body:
+        results.write_bytes(bundle.body(out), body.encode())
     results.write_bytes(out / ROWS / f"{bundle.key}.json", as_json(line).encode())
 
 
 def _finish(
     out: Path, bundles: list[Bundle], others: Sequence[Graded], roster: Roster, how: Choices
-) -> tuple[list[report.ReportLine], list[tuple[str, ...]]]:
-    """Write what takes the whole class; returns the lines with what they share, and changes."""
+) -> tuple[list[report.ReportLine], list[tuple[str, ...]], tuple[str, ...]]:
+    """Write what takes the whole class; returns the lines with what they share, changes and notes
+    on the tables."""
     gone = "What was kept of it is gone. Run the same command again."
     each = [_load(out, b) or report.not_graded(b.name, "lost", gone) for b in bundles]
     each += [line for line, _ in others]
     own = _own_points(out / OWN_POINTS)
     lines = report.across(each, roster, how.late_after, own)
+    pages = [b.page(line) for b, line in zip(bundles, lines, strict=False)]  # they come first
+    for i, page in enumerate(pages):
+        if lines[i].points is not None:
+            lines[i] = replace(lines[i], page=page)
     state = {line.who: [line.name or line.student, *_state(line)] for line in lines if line.counts}
     changes = list(_changes(_json(out / ROWS / CLASS), state))
     table = report.grades_csv(lines, how.separator)
@@ -682,7 +695,7 @@ def _finish(
         SECOND: report.paragraphs_page(lines, named=False),
         PAGE: report.class_page(lines, changes),
         CSV: table,
-        **report.exports(lines, how.separator),
+        **(imports := report.exports(lines, how.separator, how.assignment)),
         f"{ROWS}/{CLASS}": json.dumps({"csv": _digest(table), "state": state}),
     }
     before = _json(out / ROWS / CLASS).get("csv")
@@ -695,26 +708,39 @@ def _finish(
     for name, text in texts.items():
         code = "utf-8-sig" if name.endswith(".csv") else "utf-8"  # so spreadsheets see ë
         results.write_bytes(out / name, text.encode(code))
-    _write_feedback(out, lines)
-    pages, keys = {bundle.page for bundle in bundles}, {bundle.key for bundle in bundles}
+    for name in {"moodle.csv", "canvas.csv"} - set(imports):
+        (out / name).unlink(missing_ok=True)  # of an earlier run
+    _write_pages(out, bundles, lines)
+    keys = {bundle.key for bundle in bundles}
     for path in (out / STUDENTS).glob("*.html"):
         if re.search(r"_[0-9a-f]{12}$", path.stem) and f"{STUDENTS}/{path.name}" not in pages:
             path.unlink()  # of a bundle that is no more, or an older grader
-    for path in (out / ROWS).glob("*.json"):
+    for path in (out / ROWS).iterdir():
         if re.fullmatch(r"[0-9a-f]{64}", path.stem) and path.stem not in keys:
             path.unlink()
-    return lines, changes
+    column, known = report.canvas_column(lines, how.assignment)
+    says = f"canvas.csv: the column of the points is “{column}”, which is in no roster"
+    return (
+        lines,
+        changes,
+        (f"{says}; --assignment names another.",) * ("canvas.csv" in imports and not known),
+    )
 
 
-def _write_feedback(out: Path, lines: Sequence[report.ReportLine]) -> None:
-    """The pages of those bundles that count in a zip that Moodle or Canvas gives back."""
+def _write_pages(out: Path, bundles: list[Bundle], lines: Sequence[report.ReportLine]) -> None:
+    """Each student's page; those of what counts also in a zip that Moodle or Canvas gives back, and
+    there for a bundle that could not be read, too."""
     buffer, seen = io.BytesIO(), set[str]()
+    bodies = {bundle.name: bundle.body(out) for bundle in bundles}
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as packed:
         for line in lines:
+            kept = line.page and bodies[line.file].read_text(encoding="utf-8")
+            page = report.student_page(line, kept).encode()
+            if line.page:
+                results.write_bytes(out / line.page, page)
             name = place_of(line.file).feedback
-            if line.counts and line.page and name not in seen:
+            if line.counts and line.file and name not in seen:
                 seen.add(name)
-                page = (out / line.page).read_bytes()
                 packed.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), page)
     results.write_bytes(out / FEEDBACK, buffer.getvalue())
 
@@ -782,4 +808,4 @@ def _kind(line: report.ReportLine) -> str:
     """What the summary counts a line as: graded, refused, failed or missing."""
     if line.points is not None or line.reason == "missing":
         return "graded" if line.reason != "missing" else "missing"
-    return "failed" if line.reason in FAILED else "refused"
+    return "failed" if line.reason in report.FAILED else "refused"

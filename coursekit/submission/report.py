@@ -45,6 +45,9 @@ from coursekit.submission.rubric import Grade, Item, grade
 from coursekit.words import counted
 
 HEADER = (*HEADINGS["first"], *LABELS, *HEADINGS["last"])  # of grades.csv
+FAILED = ("timeout", "died", "memory", "error", "lost")  # reasons; tried anew by the next run
+NOTHING = "Nothing was handed in."
+AGAIN = "Your file could not be read: hand it in again."
 MOODLE_COLUMNS, CANVAS_COLUMNS, OWN_COLUMNS = (HEADINGS[k] for k in ("moodle", "canvas", "own"))
 FORMULA = tuple("=+-@\t\r\n＝＋－＠")  # what makes a spreadsheet calculate a cell
 HERE = Path(__file__).parent
@@ -59,7 +62,12 @@ def _template() -> jinja2.Template:
     """The template of all pages, read once; everything that it shows is escaped."""
     loader = jinja2.FileSystemLoader(HERE)
     pages = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True)
-    pages.filters |= {"points": _points, "counted": counted, "px": "{:.1f}".format}
+    pages.filters |= {
+        "points": _points,
+        "result": _result,
+        "counted": counted,
+        "px": "{:.1f}".format,
+    }
     pages.globals |= PLOT | {"style": Markup((HERE / "report.css").read_text(encoding="utf-8"))}
     return pages.get_template("report.html.jinja")
 
@@ -75,7 +83,7 @@ class ReportLine:
 
     file: the bundle's name. student: the name in it. made, paragraph: as handed in. page: the link
     to its page. reason, says: of a bundle that was not graded. handed_in: when, as the LMS says.
-    Of `across`: counts, False where another one of the student does; late;
+    Of `across`: counts, False where another one of the student does; late: when and by how much;
     who, name, row: the person and what the roster says; own: the instructor's points and comment.
     `as_json` and `from_dict` take it through JSON.
     """
@@ -94,7 +102,7 @@ class ReportLine:
     counts: bool = True
     fingerprint: Fingerprint | None = None
     handed_in: str = ""
-    late: bool = False
+    late: str = ""
     who: str = ""
     name: str = ""
     row: Mapping[str, str] = field(default_factory=dict)
@@ -143,7 +151,7 @@ def number_of(text: str) -> float:
     return float(text.replace(",", ".").strip() or 0.0)
 
 
-def graded(file: str, grade: Grade, submission: Submission, page: str = "") -> ReportLine:
+def graded(file: str, grade: Grade, submission: Submission) -> ReportLine:
     """The line of a graded bundle; of its items what the class page and the table say."""
     return ReportLine(
         file=file,
@@ -154,7 +162,6 @@ def graded(file: str, grade: Grade, submission: Submission, page: str = "") -> R
         of=grade.of,
         items=tuple(replace(item, says="", tolerance=None) for item in grade.items),
         flags=grade.flags,
-        page=page,
         fingerprint=grade.fingerprint,
     )
 
@@ -164,17 +171,16 @@ def not_graded(file: str, reason: str, says: str) -> ReportLine:
     return ReportLine(file, reason=reason, says=says)
 
 
-def grade_file(path: str, name: str, page: str) -> tuple[ReportLine, str]:
-    """What a process of the grader does: the line of a bundle, and its student's page.
+def grade_file(path: str, name: str) -> tuple[ReportLine, str]:
+    """What a process of the grader does: the line of a bundle, and what `page_body` says of it.
 
-    name: what to call the file at `path`, page: the link to the page, which is empty if the bundle
-    is refused. Importing this module loads all that grading needs, so that nothing is loaded on
-    first use, when memory is limited.
+    name: what to call the file at `path`. Importing this module loads all that grading needs, so
+    that nothing is loaded on first use, when memory is limited.
     """
     try:
         submission = read_bundle(Path(path))
         found = grade(submission)
-        return graded(name, found, submission, page), student_page(found, submission)
+        return graded(name, found, submission), page_body(found, submission)
     except Refused as refused:
         return not_graded(name, refused.reason, str(refused)), ""
     except MemoryError:
@@ -215,17 +221,20 @@ def across(
         for key in copy.keys:
             about.setdefault(key, []).append(_copy_flag(copy))
     theirs: dict[str, list[ReportLine]] = {}
-    for line in done:
+    for line in lines:
         theirs.setdefault(who[line.file].key, []).append(line)
-    chosen = {key: _that_counts(some) for key, some in theirs.items()}
+    chosen = {
+        key: _that_counts([line for line in some if line.points is not None] or some)
+        for key, some in theirs.items()
+    }
     found = []
     for line in lines:
-        one, at = who[line.file], place_of(line.file)
-        last, more = chosen[one.key] if line.points is not None else (line, ())
-        late = at.late or (late_after is not None and _moment(line) > late_after.timestamp())
+        one = who[line.file]
+        last, more = chosen[one.key]
+        late = _late(line, late_after)
         flags = [*line.flags, *about.get(line.file, ()), *more, *_clock(line)]
         flags += roster.other_name(one, line.student)
-        if last is not line:
+        if last is not line and line.points is not None:
             says = (
                 f"An earlier bundle of {last.student}, {_points(line.points)} points; "
                 f"{last.file} counts, {_points(last.points)} points."
@@ -238,7 +247,7 @@ def across(
     there = {line.who for line in found}
     for one in roster.people.values():
         if one.key not in there:
-            nothing = not_graded("", "missing", "Nothing was handed in.")
+            nothing = not_graded("", "missing", NOTHING)
             found.append(_of(nothing, one, own))
     return found
 
@@ -290,6 +299,25 @@ def _moment(line: ReportLine) -> float:
     return _seconds(line.handed_in or line.made) if line.handed_in or line.made else 0.0
 
 
+def _late(line: ReportLine, late_after: datetime | None) -> str:
+    """When a bundle that is late was handed in, and how late that is; "" for one that is not."""
+    when = line.handed_in or line.made
+    over = _moment(line) - late_after.timestamp() if late_after is not None else 0.0
+    if over > 0:
+        hours = math.ceil(over / 3600)
+        much = counted(hours, "hour") if hours < 24 else counted(math.ceil(hours / 24), "day")
+        return f"{_date(when)}: {much} late"
+    return f"{_date(when)}: late, as Canvas says" if place_of(line.file).late else ""
+
+
+def _date(moment: str) -> str:
+    """ "2 March 2026, 10:00 UTC"; of here where no zone is said."""
+    if not moment:
+        return "at an unknown time"
+    then = datetime.fromisoformat(moment)
+    return f"{then.day} {then:%B %Y, %H:%M} {then.tzname() or ''}".strip()
+
+
 def _copy_flag(copy: Copy) -> Flag:
     """The flag of bundles that share something, with the names of some of them."""
     names = ", ".join(copy.keys[:6]) + (f", {len(copy.keys) - 6} more" * (len(copy.keys) > 6))
@@ -299,13 +327,44 @@ def _copy_flag(copy: Copy) -> Flag:
 # --- the student's page ---------------------------------------------------------------------------
 
 
-def student_page(grade: Grade, submission: Submission) -> str:
-    """A student's page: points, plot, table and a sentence on everything; no flags."""
+def student_page(line: ReportLine, body: str) -> str:
+    """A student's page: whose it is, the points with the instructor's own, and what was measured.
+
+    line: after `across`. body: of `page_body`, or "" where the bundle was not graded.
+    """
+    lost = [item for item in line.items if item.points < item.of]
+    facts = {"told": _told(line), "decided": _decided(line), "body": Markup(body)}
+    return _page(what="student", bundle=line, lost=len(lost), **facts)
+
+
+def _decided(line: ReportLine) -> str:
+    """Which points the instructor gave, for the student; "" for none."""
+    words = {"paragraph": "for the paragraph", "late": "for late days", "overrule": "in all"}
+    given = [key for key in words if line.own.get(key)]
+    given = ["overrule"] if "overrule" in given else given
+    said = [f"{_points(number_of(line.own[key]))} {words[key]}" for key in given]
+    computed = "" if line.points is None else f" ({_points(line.points)} were computed)"
+    return f"Points that your instructor set: {', '.join(said)}{computed}." if said else ""
+
+
+def _told(line: ReportLine) -> str:
+    """What somebody without points is told; nothing where it is the grader that failed."""
+    if line.total is not None or line.reason in FAILED:
+        return ""
+    return line.says if line.reason == "missing" else AGAIN
+
+
+def page_body(grade: Grade, submission: Submission) -> str:
+    """The part of a student's page that the bundle decides: plot, table, a sentence on everything.
+
+    No flags, which are the instructor's.
+    """
     camera = submission.camera
     baseline = "unknown" if camera.baseline_m is None else f"{1e3 * camera.baseline_m:.2f} mm"
     return _page(
-        what="student",
+        what="body",
         submission=submission,
+        made=_date(submission.made),
         grade=grade,
         facts=f"{camera.name} ({camera.source}), {camera.width}x{camera.height} px, "
         f"fx = {camera.fx:.1f} px, baseline {baseline}, "
@@ -463,7 +522,7 @@ def _law_curves(
     z = np.linspace(axes.low, axes.high, 40)
     middle, low, high = ((1e3 * curve).tolist() for curve in found.law.std_m(z))
     band = np.minimum(low + high[::-1], axes.top)
-    key.append(("law", f"law with their σ_d of {found.law.sigma_d_px:.3f} px, and its 95 % band"))
+    key.append(("law", f"law with your σ_d of {found.law.sigma_d_px:.3f} px, and its 95 % band"))
     if rounding_shows(min(ends)):
         key.append(("rounded", f"the same in depth counts of {step_mm:g} mm"))
     shows = rounding_shows(axes.low)
@@ -506,7 +565,8 @@ def class_page(lines: Sequence[ReportLine], changes: Sequence[tuple[str, ...]] =
     done = [line for line in lines if line.points is not None]
     counts = [line for line in done if line.counts]
     percents = [line.percent or 0.0 for line in counts]
-    named = sorted(counts, key=lambda line: (words_of(line.name or line.student), line.file))
+    everybody = [line for line in lines if line.counts]
+    named = sorted(everybody, key=lambda line: (words_of(line.name or line.student), line.file))
     ask_first = "No points were taken for these. Ask first: there may be an innocent reason."
     return _page(
         what="class",
@@ -516,37 +576,64 @@ def class_page(lines: Sequence[ReportLine], changes: Sequence[tuple[str, ...]] =
         median=statistics.median(percents) if percents else 0.0,
         flagged=sum(line.flagged for line in done),
         figure=_histogram(percents),
-        topics=list(_topics(counts)),
+        topics=_topics(counts),
+        left_out=_left_out(counts),
         flags=[
             ("To look at", ask_first, _by_flag(done, False)),
             ("Notes", "Expected, and no reason to ask.", _by_flag(done, True)),
         ],
         refused=[
-            (line.file or line.name, line.reason, line.says)
+            (
+                line,
+                f"{line.name} is asked to hand it in again." if _told(line) and line.name else "",
+            )
             for line in lines
             if line.points is None and line.reason != "missing"
         ],
         missing=[line.name for line in lines if line.reason == "missing"],
-        late=[line for line in counts if line.late],
+        late=[line for line in everybody if line.late],
         changes=changes,
         named=named,
-        ranked=sorted(named, key=lambda line: line.percent or 0.0),
+        ranked=sorted(named, key=lambda line: (line.total is not None, line.total or 0.0)),
     )
 
 
-def _topics(lines: Sequence[ReportLine]) -> Iterator[tuple[str, str, str, Any]]:
-    """Label, where the lesson says it, per cent right and (mistake, students) of what was asked."""
+def _result(line: ReportLine) -> str:
+    """The points of somebody, and whose they are; or why there are none."""
+    if line.total is None:
+        return "missing" if line.reason == "missing" else "not graded"
+    text = f"{_points(line.total)} of {_points(line.of or 100)}"
+    computed = "none" if line.points is None else _points(line.points)
+    return text if line.total == line.points else f"{text} (yours; {computed} computed)"
+
+
+def _topics(lines: Sequence[ReportLine]) -> list[tuple[str, str, int, Any]]:
+    """Label, where the lesson says it, how many students got it wrong and (mistake, students) of
+    each topic, the worst first. What somebody left out is no mistake.
+    """
+    found = []
     for topic, label in LABELS.items():
-        items = [item for line in lines for item in line.items if item.topic == topic]
         who: dict[str, list[ReportLine]] = {}
+        wrong = 0
         for line in lines:  # a mistake made at three distances is made by one student
-            for said in dict.fromkeys(_said(i) for i in line.items if i.topic == topic):
-                if said:
-                    who.setdefault(said, []).append(line)
-        if items:
-            right = sum(item.verdict == "right" for item in items) / len(items)
-            groups = sorted(who.items(), key=lambda pair: -len(pair[1]))
-            yield label, REPEAT.get(topic, ""), f"{right:.0%}", groups
+            items = [i for i in line.items if i.topic == topic and i.verdict != "missing"]
+            mistakes = dict.fromkeys(filter(None, map(_said, items)))
+            wrong += bool(mistakes)
+            for said in mistakes:
+                who.setdefault(said, []).append(line)
+        groups = sorted(who.items(), key=lambda pair: -len(pair[1]))
+        found.append((label, REPEAT.get(topic, ""), wrong, groups))
+    return sorted(found, key=lambda row: -row[2])
+
+
+def _left_out(lines: Sequence[ReportLine]) -> list[tuple[str, list[ReportLine]]]:
+    """What students left out, with those who left out the same."""
+    who: dict[str, list[ReportLine]] = {}
+    for line in lines:
+        topics = dict.fromkeys(item.topic for item in line.items if item.verdict == "missing")
+        if topics:
+            who.setdefault(", ".join(LABELS[topic] for topic in topics), []).append(line)
+    return sorted(who.items(), key=lambda pair: -len(pair[1]))
 
 
 def _by_flag(lines: Sequence[ReportLine], note: bool) -> list[Any]:
@@ -623,32 +710,47 @@ def grades_csv(lines: Sequence[ReportLine], separator: str = ",") -> str:
     return _csv([(*HEADER, *more), *rows], separator)
 
 
-def exports(lines: Sequence[ReportLine], separator: str = ",") -> dict[str, str]:
+def canvas_column(lines: Sequence[ReportLine], assignment: str = "") -> tuple[str, bool]:
+    """The gradebook's column for the points, and whether the roster has it: the one that is named,
+    or the only one whose name holds `assignment`."""
+    name = assignment or CANVAS_COLUMNS[-1]
+    columns = dict.fromkeys(column.strip() for line in lines for column in line.row)
+    found = [c for c in columns if c == name]
+    found = found or [c for c in columns if name.casefold() in c.casefold()]
+    return (found[0], True) if len(found) == 1 else (name, False)
+
+
+def exports(
+    lines: Sequence[ReportLine], separator: str = ",", assignment: str = ""
+) -> dict[str, str]:
     """Tables that Moodle and Canvas import, by the file's name; lines: after `across`.
 
     Moodle's is its offline grading worksheet, found by `Identifier`; Canvas' its gradebook, found
-    by `ID`, with the row of the points possible.
+    by `ID`, with the row of the points possible. Both have whoever has points or a word for them;
+    a table without either is not made. assignment: see `canvas_column`.
     """
     tables: dict[str, str] = {}
     moodle, canvas = [], []
     for line in lines:
-        at, row = place_of(line.file), {k.casefold(): v for k, v in line.row.items()}
-        if not (line.counts and (line.points is not None or line.reason == "missing")):
+        at, row = place_of(line.file), {k.strip().casefold(): v for k, v in line.row.items()}
+        name, grade_of, feedback = line.name or line.student, _points(line.total), _feedback(line)
+        if not (line.counts and (grade_of or feedback)):
             continue
-        name, grade_of = line.name or line.student, _points(line.total)
         identifier = f"Participant {at.id}" if at.lms == "Moodle" else row.get("identifier", "")
         if identifier:
             email = row.get("email address", row.get("email", ""))
-            moodle.append((identifier, name, email, grade_of, "100", "", _feedback(line)))
-        number = at.id if at.lms == "Canvas" else row.get("id", "")
-        if number and not identifier:
-            sis = (row.get(column, "") for column in CANVAS_COLUMNS[2:5])
-            canvas.append((name, number, *sis, grade_of))
-    if moodle:
+            moodle.append((identifier, name, email, grade_of, "100", "", feedback))
+        gradebook = {"student", "id", "section"} <= set(row)
+        number = row["id"] if gradebook else at.id if at.lms == "Canvas" else ""
+        if number:
+            ids = (row.get(column.casefold(), "") for column in CANVAS_COLUMNS[2:5])
+            canvas.append((name, number, *ids, grade_of))
+    if any(row[3] or row[6] != NOTHING for row in moodle):
         tables["moodle.csv"] = _csv([MOODLE_COLUMNS, *moodle], separator)
-    if canvas:
+    if any(row[-1] for row in canvas):
+        columns = (*CANVAS_COLUMNS[:-1], canvas_column(lines, assignment)[0])
         possible = ("    Points Possible", "", "", "", "", "100")
-        tables["canvas.csv"] = _csv([CANVAS_COLUMNS, possible, *canvas], separator)
+        tables["canvas.csv"] = _csv([columns, possible, *canvas], separator)
     return tables
 
 
@@ -663,7 +765,7 @@ def own_table(lines: Sequence[ReportLine], separator: str = ",") -> str:
 def _feedback(line: ReportLine) -> str:
     """What a student reads beside the points: the instructor's words, and what cost some."""
     lost = [_lost(item) for item in line.items if item.points < item.of]
-    return " ".join(filter(None, (line.own.get("comment", ""), "; ".join(lost), line.says)))
+    return " ".join(filter(None, (line.own.get("comment", ""), "; ".join(lost), _told(line))))
 
 
 def _csv(rows: Iterable[Iterable[str]], separator: str) -> str:

@@ -581,7 +581,9 @@ def _exponent(asked: _Question, submission: Submission, found: Recomputed) -> It
     if found.law is None:
         return _no_law(asked, claim, found)
     if claim is None and interval is None:
-        says = "Exponent: none quoted, and three distances over a factor of two give none: right."
+        at, n = [m.distance_m for m in found.at], counted(len(found.at), "distance")
+        over = f"{n} over a factor of {max(at) / min(at):.2g}"
+        says = f"Exponent: none quoted, and {over} say too little of it: right."
         return asked.item("right", says)
     if free is None or free.exponent is None or free.exponent_interval is None:
         says = "Exponent: your raw depths give none to compare yours with."
