@@ -114,8 +114,7 @@ class Covariance:
     def __post_init__(self) -> None:
         names = tuple(checks.instance("names", name, str) for name in self.names)
         matrix = checks.covariance("matrix", self.matrix, len(names))
-        object.__setattr__(self, "names", names)
-        object.__setattr__(self, "matrix", tuple(map(tuple, matrix.tolist())))
+        checks.keep(self, names=names, matrix=tuple(map(tuple, matrix.tolist())))
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,10 +136,9 @@ class Placement:
     def __post_init__(self) -> None:
         checks.choice("mount", self.mount, PARENTS)
         checks.instance("verdict", self.verdict, str)
-        object.__setattr__(self, "T", checks.transform("T", self.T))
+        checks.keep(self, T=checks.transform("T", self.T))
         if self.covariance is not None:
-            known = checks.covariance("covariance", self.covariance, 6)
-            object.__setattr__(self, "covariance", known)
+            checks.keep(self, covariance=checks.covariance("covariance", self.covariance, 6))
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON has it, with the quaternion (x, y, z, w) beside the matrix."""

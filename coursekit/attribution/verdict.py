@@ -20,7 +20,7 @@ import numpy as np
 
 from coursekit import checks
 from coursekit.arm import widowx
-from coursekit.arrays import ArrayLike, Floats
+from coursekit.arrays import ArrayLike, Floats, frozen
 from coursekit.attribution import significance
 from coursekit.attribution.significance import MeanTest, PlaceTest, PoseTest
 from coursekit.budget.view import GRIPPER_DOWN
@@ -513,6 +513,4 @@ def _table_grasps() -> tuple[Floats, Floats]:
     turn = Rotation.from_euler("ZYX", np.column_stack([yaw, tilt])).as_matrix() @ GRIPPER_DOWN
     poses = np.stack([make_transform(R, t) for R, t in zip(turn, at, strict=True)])
     q, reached = widowx().inverse(poses)
-    q, poses = q[reached], poses[reached]
-    q.flags.writeable = poses.flags.writeable = False
-    return q, poses
+    return frozen(q[reached]), frozen(poses[reached])

@@ -20,8 +20,8 @@ import cv2
 import numpy as np
 
 from coursekit import geometry
-from coursekit.arrays import AnyArray, Bools, Floats, Grey, NDArray
-from coursekit.checks import array, choice, instance, number, want, whole
+from coursekit.arrays import Bools, Floats, Grey, NDArray, frozen
+from coursekit.checks import array, choice, instance, keep, number, want, whole
 from coursekit.geometry import Intrinsics
 from coursekit.words import Listed, counted, say
 
@@ -83,8 +83,7 @@ class Board:
         fits = fits and fewest <= squares.min() and squares.max() <= 1000
         wanted = f"(columns, rows) of squares, {fewest} to 1000 each (inner corners are one fewer)"
         want(fits, "squares", self.squares, wanted)
-        object.__setattr__(self, "squares", tuple(squares.tolist()))
-        object.__setattr__(self, "square_m", _side("square_m", self.square_m))
+        keep(self, squares=tuple(squares.tolist()), square_m=_side("square_m", self.square_m))
         if self.kind == "checkerboard":
             extras = (self.marker_m, self.old_origin)
             want(extras == (None, False), "marker_m, old_origin", extras, "none on a checkerboard")
@@ -92,7 +91,7 @@ class Board:
             return
         default = round(MARKER_SHARE * self.square_m, 9)  # 0.01875, not 0.018750000000000003
         marker_m = _side("marker_m", default if self.marker_m is None else self.marker_m)
-        object.__setattr__(self, "marker_m", marker_m)
+        keep(self, marker_m=marker_m)
         want(marker_m < self.square_m, "marker_m", marker_m, f"less than {self.square_m} m")
         first = whole("first_marker", self.first_marker, "a whole number from 0 on", least=0)
         held, needed = len(_dictionary(self.dictionary).bytesList), first + int(self.white.sum())
@@ -110,7 +109,7 @@ class Board:
         columns, rows = self.corners
         first = 0 if self.kind == "checkerboard" else 1
         y, x = np.mgrid[first : first + rows, first : first + columns]
-        return _frozen(self.square_m * np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3))
+        return frozen(self.square_m * np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3))
 
     @cached_property
     def falling(self) -> Bools:
@@ -290,11 +289,10 @@ class Detection:
         want(counts, "ids", self.ids, "(N,) whole numbers")
         pixels = array("pixels", self.pixels, (len(ids), 2)).copy()
         width, height = self.size
-        object.__setattr__(self, "ids", _frozen(ids.astype(np.intp)))
-        object.__setattr__(self, "pixels", _frozen(pixels))
-        object.__setattr__(self, "size", (int(width), int(height)))
+        size = int(width), int(height)
+        keep(self, ids=frozen(ids.astype(np.intp)), pixels=frozen(pixels), size=size)
         if self.blur is not None:
-            object.__setattr__(self, "blur", _frozen(array("blur", self.blur, (2, 2)).copy()))
+            keep(self, blur=frozen(array("blur", self.blur, (2, 2)).copy()))
 
     def __len__(self) -> int:
         """How many corners."""
@@ -457,12 +455,6 @@ def _faults(
 
 def _times(size: tuple[int, int]) -> str:
     return f"{size[0]}x{size[1]}"
-
-
-def _frozen(values: AnyArray) -> AnyArray:
-    """The same array, read-only from now on."""
-    values.flags.writeable = False
-    return values
 
 
 # --- what a camera sees of a board ---
