@@ -40,7 +40,7 @@ def want(holds: object, name: str, got: object, wanted: str) -> None:
         raise ValueError(f"{name}: got {shown(got)}, want {wanted}")
 
 
-def keep(thing: object, **fields: object) -> None:
+def settle(thing: object, **fields: object) -> None:
     """Set fields of a frozen dataclass as they were checked, in its `__post_init__`."""
     for name, value in fields.items():
         object.__setattr__(thing, name, value)

@@ -114,7 +114,7 @@ class Covariance:
     def __post_init__(self) -> None:
         names = tuple(checks.instance("names", name, str) for name in self.names)
         matrix = checks.covariance("matrix", self.matrix, len(names))
-        checks.keep(self, names=names, matrix=tuple(map(tuple, matrix.tolist())))
+        checks.settle(self, names=names, matrix=tuple(map(tuple, matrix.tolist())))
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,9 +136,9 @@ class Placement:
     def __post_init__(self) -> None:
         checks.choice("mount", self.mount, PARENTS)
         checks.instance("verdict", self.verdict, str)
-        checks.keep(self, T=checks.transform("T", self.T))
+        checks.settle(self, T=checks.transform("T", self.T))
         if self.covariance is not None:
-            checks.keep(self, covariance=checks.covariance("covariance", self.covariance, 6))
+            checks.settle(self, covariance=checks.covariance("covariance", self.covariance, 6))
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON has it, with the quaternion (x, y, z, w) beside the matrix."""

@@ -21,7 +21,7 @@ import numpy as np
 
 from coursekit import geometry
 from coursekit.arrays import Bools, Floats, Grey, NDArray, frozen
-from coursekit.checks import array, choice, instance, keep, number, want, whole
+from coursekit.checks import array, choice, instance, number, settle, want, whole
 from coursekit.geometry import Intrinsics
 from coursekit.words import Listed, counted, say
 
@@ -83,7 +83,7 @@ class Board:
         fits = fits and fewest <= squares.min() and squares.max() <= 1000
         wanted = f"(columns, rows) of squares, {fewest} to 1000 each (inner corners are one fewer)"
         want(fits, "squares", self.squares, wanted)
-        keep(self, squares=tuple(squares.tolist()), square_m=_side("square_m", self.square_m))
+        settle(self, squares=tuple(squares.tolist()), square_m=_side("square_m", self.square_m))
         if self.kind == "checkerboard":
             extras = (self.marker_m, self.old_origin)
             want(extras == (None, False), "marker_m, old_origin", extras, "none on a checkerboard")
@@ -91,7 +91,7 @@ class Board:
             return
         default = round(MARKER_SHARE * self.square_m, 9)  # 0.01875, not 0.018750000000000003
         marker_m = _side("marker_m", default if self.marker_m is None else self.marker_m)
-        keep(self, marker_m=marker_m)
+        settle(self, marker_m=marker_m)
         want(marker_m < self.square_m, "marker_m", marker_m, f"less than {self.square_m} m")
         first = whole("first_marker", self.first_marker, "a whole number from 0 on", least=0)
         held, needed = len(_dictionary(self.dictionary).bytesList), first + int(self.white.sum())
@@ -290,9 +290,9 @@ class Detection:
         pixels = array("pixels", self.pixels, (len(ids), 2)).copy()
         width, height = self.size
         size = int(width), int(height)
-        keep(self, ids=frozen(ids.astype(np.intp)), pixels=frozen(pixels), size=size)
+        settle(self, ids=frozen(ids.astype(np.intp)), pixels=frozen(pixels), size=size)
         if self.blur is not None:
-            keep(self, blur=frozen(array("blur", self.blur, (2, 2)).copy()))
+            settle(self, blur=frozen(array("blur", self.blur, (2, 2)).copy()))
 
     def __len__(self) -> int:
         """How many corners."""

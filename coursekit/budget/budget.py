@@ -336,7 +336,7 @@ class ErrorBudget:
     title: str = "Error budget"
 
     def __post_init__(self) -> None:
-        checks.keep(self, terms=tuple(self.terms))
+        checks.settle(self, terms=tuple(self.terms))
         want(self.terms, "terms", self.terms, "at least one")
         different = len(set(self.names)) == len(self.names)
         want(different, "terms", self.names, "different names")

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coursekit.arrays import ArrayLike, Bools, Floats, NDArray, frozen
-from coursekit.checks import array, choice, instance, keep, number, positive, transform, want
+from coursekit.checks import array, choice, instance, number, positive, settle, transform, want
 from coursekit.geometry import Intrinsics, deproject, invert_transform, make_transform, pixel_grid
 from coursekit.simulation import raycast
 
@@ -58,8 +58,8 @@ class Box:
         choice("texture", self.texture, TEXTURES)
         number("specular", self.specular, "a share from 0 to 1", least=0.0, most=1.0)
         T = transform("T_scene_box", self.T_scene_box)
-        keep(self, size_m=frozen(size.copy()), T_scene_box=frozen(T.copy()))
-        keep(self, color=tuple(color.tolist()))
+        settle(self, size_m=frozen(size.copy()), T_scene_box=frozen(T.copy()))
+        settle(self, color=tuple(color.tolist()))
 
 
 Scene = tuple[Box, ...]
