@@ -446,6 +446,7 @@ def test_everybody_of_a_class_has_a_row_and_nobodys_grade_is_anothers(
     choices = batch.Choices("class.csv", datetime(2026, 3, 4))
     summary = batch.grade_folder("all.zip", progress=False, choices=choices)
     assert summary.missing == tuple(names[:2])
+    assert ["“Studio exercise 1”" in note for note in summary.notes] == [True] * (lms == "Canvas")
     out = Path("all_report")
     rows = table(out)
     status: dict[str, list[str]] = {}
