@@ -37,7 +37,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coursekit.arrays import ArrayLike, Floats, Mask
+from coursekit.arrays import ArrayLike, Floats, Mask, frozen
 from coursekit.checks import array, choice, number, transforms, want, whole
 from coursekit.geometry import cross_matrix, invert_transform, make_transform, pose_difference
 from coursekit.specifications import DATA
@@ -267,7 +267,7 @@ def widowx() -> Arm:
     )
     for value in vars(arm).values():
         if isinstance(value, np.ndarray):
-            value.flags.writeable = False
+            frozen(value)
     return arm
 
 

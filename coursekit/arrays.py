@@ -1,4 +1,4 @@
-"""The types of arrays, once for all rooms."""
+"""The types of arrays, once for all rooms, and an array that stays as it is."""
 
 from typing import Any
 
@@ -14,3 +14,9 @@ Image = NDArray[np.uint8]  # grey (H, W) or BGR (H, W, 3)
 AnyArray = NDArray[Any]
 Interval = tuple[float, float]  # low and high end, mostly of 95 %
 Window = tuple[int, int, int, int]  # left, top, width, height, px
+
+
+def frozen(values: AnyArray) -> AnyArray:
+    """The same array, read-only from now on."""
+    values.flags.writeable = False
+    return values

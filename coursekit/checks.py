@@ -40,6 +40,12 @@ def want(holds: object, name: str, got: object, wanted: str) -> None:
         raise ValueError(f"{name}: got {shown(got)}, want {wanted}")
 
 
+def settle(thing: object, **fields: object) -> None:
+    """Set fields of a frozen dataclass as they were checked, in its `__post_init__`."""
+    for name, value in fields.items():
+        object.__setattr__(thing, name, value)
+
+
 def is_number(value: object) -> bool:
     """Whether `value` is one finite real number; True and False are none."""
     plain = isinstance(value, (int, float, np.integer, np.floating))

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coursekit import kernels
+from coursekit import checks, kernels
 from coursekit.arrays import ArrayLike, Floats, NDArray
 from coursekit.checks import array, instance, number, positive, transform, transforms, want, whole
 from coursekit.formats.lens import read_lens
@@ -51,13 +51,13 @@ class Intrinsics:
     def __post_init__(self) -> None:
         lengths = {"width": whole, "height": whole, "fx": positive, "fy": positive}
         for name, check in (lengths | {"cx": number, "cy": number}).items():
-            object.__setattr__(self, name, check(name, getattr(self, name)))
+            checks.settle(self, **{name: check(name, getattr(self, name))})
         model = SAME_MODEL.get(self.model, self.model)
         known = ", ".join(DISTORTION_MODELS)
         want(model in DISTORTION_MODELS, "model", model, f"one of {known}; {NO_OTHER}")
-        object.__setattr__(self, "model", model)
-        coeffs = _coefficients("coeffs", self.coeffs)
-        object.__setattr__(self, "coeffs", tuple(coeffs.tolist()))
+        checks.settle(
+            self, model=model, coeffs=tuple(_coefficients("coeffs", self.coeffs).tolist())
+        )
 
     @property
     def K(self) -> Floats:

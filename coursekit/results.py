@@ -114,8 +114,7 @@ class Covariance:
     def __post_init__(self) -> None:
         names = tuple(checks.instance("names", name, str) for name in self.names)
         matrix = checks.covariance("matrix", self.matrix, len(names))
-        object.__setattr__(self, "names", names)
-        object.__setattr__(self, "matrix", tuple(map(tuple, matrix.tolist())))
+        checks.settle(self, names=names, matrix=tuple(map(tuple, matrix.tolist())))
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,10 +136,9 @@ class Placement:
     def __post_init__(self) -> None:
         checks.choice("mount", self.mount, PARENTS)
         checks.instance("verdict", self.verdict, str)
-        object.__setattr__(self, "T", checks.transform("T", self.T))
+        checks.settle(self, T=checks.transform("T", self.T))
         if self.covariance is not None:
-            known = checks.covariance("covariance", self.covariance, 6)
-            object.__setattr__(self, "covariance", known)
+            checks.settle(self, covariance=checks.covariance("covariance", self.covariance, 6))
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON has it, with the quaternion (x, y, z, w) beside the matrix."""
@@ -321,14 +319,10 @@ def export(
         checks.choice("to (of a camera's place)", to, (*pose_files.PLACE_FORMATS, "json"))
         placed = replace(found, parent=parent or found.parent, child=optical)
         text, notes = _place_text(placed, to, link, T_link_optical)
-        verdict, unsaid = (
-            found.verdict,
-            "" if parent else say("others.unsaid_parent", parent=found.parent),
-        )
-    comment = COMMENTS.get(to, "")
-    text = (
-        "".join(comment.format(one.replace("--", "-")) for one in (verdict, unsaid) if one) + text
-    )
+        verdict = found.verdict
+        unsaid = "" if parent else say("others.unsaid_parent", parent=found.parent)
+    comment, said = COMMENTS.get(to, ""), filter(None, (verdict, unsaid))
+    text = "".join(comment.format(one.replace("--", "-")) for one in said) + text
     notes = tuple(note for note in (verdict, *notes, unsaid) if note)
     path = None if out is None else Path(out)
     if path is not None:
@@ -341,9 +335,8 @@ def export(
 def placement(result: Any) -> Placement:
     """The camera's place as `hand_eye.solve` found it, with the usual names of the two frames."""
     known = None if result.refined is None else result.covariance[:6, :6]
-    return Placement(
-        PARENTS[result.mount], OPTICAL, result.mount, result.X, known, _verdict(result)
-    )
+    parent, verdict = PARENTS[result.mount], _verdict(result)
+    return Placement(parent, OPTICAL, result.mount, result.X, known, verdict)
 
 
 def _verdict(result: Any) -> str:

@@ -187,16 +187,12 @@ class Findings(Listed[Finding]):
         return f"{counted(len(self), 'finding')}." if self else "Nothing found."
 
     def _looked_for(self) -> list[str]:
-        lines = []
-        if self.looked_for:
-            lines.append(f"Looked for: {'; '.join(self.looked_for)}.")
-        return [*lines, *(f"Not tested: {reason}" for reason in self.not_tested)]
+        looked = [f"Looked for: {'; '.join(self.looked_for)}."] * bool(self.looked_for)
+        return [*looked, *(f"Not tested: {reason}" for reason in self.not_tested)]
 
     def __repr__(self) -> str:
-        found = [
-            f"{number}. {str(finding).replace(chr(10), chr(10) + '   ')}"
-            for number, finding in enumerate(self, 1)
-        ]
+        indented = (str(finding).replace("\n", "\n   ") for finding in self)
+        found = [f"{number}. {text}" for number, text in enumerate(indented, 1)]
         return "\n".join([self._headline(), *found, *map(wrapped, self._looked_for())])
 
     def _repr_html_(self) -> str:

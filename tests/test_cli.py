@@ -129,7 +129,7 @@ def test_photographs_become_a_lens_and_a_place(tmp_path, capsys):
     "command", ["calibrate", "hand-eye --lens a --mount eye_in_hand --parent b"]
 )
 def test_a_file_that_is_there_is_refused_before_the_work(command, tmp_path, capsys):
-    (tmp_path / "a.yaml").write_text("mine")
+    (tmp_path / "a.yaml").write_text("mine", encoding="utf-8")
     options = f"no_folder --squares 9x6 --square-mm 25 --out {tmp_path / 'a.yaml'}"
     assert cli.main(f"{command} {options}".split()) == 1
     assert capsys.readouterr().err.endswith("choose another name or --overwrite\n")

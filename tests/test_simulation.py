@@ -218,7 +218,7 @@ STACKED, IN_THE_BLOCK = np.stack([np.eye(4)] * 2), pose((0, 0, 0), (0, 0, 0.48))
 NO_POSES = (np.eye(3), 2 * np.eye(4), STACKED, IN_THE_BLOCK)
 
 test_bad_input_is_named = refusals(
-    *named(tabletop, distance_m=[0, -1, float("nan"), "0.45", True], wall_behind_m=[0.05]),
+    *named(tabletop, distance_m=[0, -1, float("nan"), "0.45", True]),
     *named(
         picture,
         scene=[tabletop()[0], ("wall",)],

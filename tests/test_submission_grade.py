@@ -149,6 +149,9 @@ def test_the_exponents_interval_is_compared_too():
     assert wide.verdict == "partial"
     assert "too wide" in wide.says
     assert item(with_part(EXACT, "claims", exponent=None), "exponent").verdict == "partial"
+    two = with_part(replace(EXACT, stacks=EXACT.stacks[:2]), "claims", exponent=None)
+    says = item(with_part(two, "claims", exponent_interval=None), "exponent").says
+    assert "2 distances over a factor of 1.5" in says
 
 
 @pytest.mark.parametrize("field", ["distances_m", "measured_mm", "predicted_mm"])

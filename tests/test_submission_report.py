@@ -247,6 +247,17 @@ def test_every_mistake_is_on_the_page_not_the_most_frequent_alone():
     assert all(MISTAKES[mistake] in text for mistake in mistakes)
 
 
+def test_what_most_got_wrong_comes_first_and_what_is_left_out_is_no_mistake():
+    wrong = {topic: line_of(one) for topic, one in WRONG.values() if topic in ("bias", "std")}
+    left_out = line_of(replace(GOOD, student="Silent", stacks=(), plot=None), "silent.zip")
+    text = check_page(report.class_page([wrong["std"], *[wrong["bias"]] * 2, left_out])).text
+    assert "What went wrong, and with how many of 4 students" in text
+    assert re.findall(r"[1-9] \(\d+ %\)", text) == ["2 (50 %)", "1 (25 %)"]  # bias, then std
+    table, _, rest = text.partition("Left out, and in no row above:")
+    assert "Silent" not in table.partition("What went wrong")[2]
+    assert "Silent" in rest.partition("Everybody")[0]
+
+
 def test_everybody_is_by_points_and_by_name(lines):
     text = report.class_page(lines)
     ranked, named = text.partition("Everybody, lowest points first")[2].split("Everybody by name")

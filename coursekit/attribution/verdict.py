@@ -20,7 +20,7 @@ import numpy as np
 
 from coursekit import checks
 from coursekit.arm import widowx
-from coursekit.arrays import ArrayLike, Floats
+from coursekit.arrays import ArrayLike, Floats, frozen
 from coursekit.attribution import significance
 from coursekit.attribution.significance import MeanTest, PlaceTest, PoseTest
 from coursekit.budget.view import GRIPPER_DOWN
@@ -256,12 +256,8 @@ def _undecided(
 
     needed: for each cause that has to show, whether it does in n trials. least: trials in any case.
     """
-    total = bisect_left(
-        range(MOST_TRIALS + 1),
-        True,
-        lo=n + 1,
-        key=lambda n: n >= least and all(shows(n) for shows in needed),
-    )
+    totals, first = range(MOST_TRIALS + 1), max(n + 1, least)
+    total = bisect_left(totals, True, first, key=lambda n: all(shows(n) for shows in needed))
     more = total - n if total <= MOST_TRIALS else None
     return Decision("cannot_tell_yet", says, more, remedy)
 
@@ -517,6 +513,4 @@ def _table_grasps() -> tuple[Floats, Floats]:
     turn = Rotation.from_euler("ZYX", np.column_stack([yaw, tilt])).as_matrix() @ GRIPPER_DOWN
     poses = np.stack([make_transform(R, t) for R, t in zip(turn, at, strict=True)])
     q, reached = widowx().inverse(poses)
-    q, poses = q[reached], poses[reached]
-    q.flags.writeable = poses.flags.writeable = False
-    return q, poses
+    return frozen(q[reached]), frozen(poses[reached])

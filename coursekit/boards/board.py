@@ -20,8 +20,8 @@ import cv2
 import numpy as np
 
 from coursekit import geometry
-from coursekit.arrays import AnyArray, Bools, Floats, Grey, NDArray
-from coursekit.checks import array, choice, instance, number, want, whole
+from coursekit.arrays import Bools, Floats, Grey, NDArray, frozen
+from coursekit.checks import array, choice, instance, number, settle, want, whole
 from coursekit.geometry import Intrinsics
 from coursekit.words import Listed, counted, say
 
@@ -83,8 +83,7 @@ class Board:
         fits = fits and fewest <= squares.min() and squares.max() <= 1000
         wanted = f"(columns, rows) of squares, {fewest} to 1000 each (inner corners are one fewer)"
         want(fits, "squares", self.squares, wanted)
-        object.__setattr__(self, "squares", tuple(squares.tolist()))
-        object.__setattr__(self, "square_m", _side("square_m", self.square_m))
+        settle(self, squares=tuple(squares.tolist()), square_m=_side("square_m", self.square_m))
         if self.kind == "checkerboard":
             extras = (self.marker_m, self.old_origin)
             want(extras == (None, False), "marker_m, old_origin", extras, "none on a checkerboard")
@@ -92,7 +91,7 @@ class Board:
             return
         default = round(MARKER_SHARE * self.square_m, 9)  # 0.01875, not 0.018750000000000003
         marker_m = _side("marker_m", default if self.marker_m is None else self.marker_m)
-        object.__setattr__(self, "marker_m", marker_m)
+        settle(self, marker_m=marker_m)
         want(marker_m < self.square_m, "marker_m", marker_m, f"less than {self.square_m} m")
         first = whole("first_marker", self.first_marker, "a whole number from 0 on", least=0)
         held, needed = len(_dictionary(self.dictionary).bytesList), first + int(self.white.sum())
@@ -110,7 +109,7 @@ class Board:
         columns, rows = self.corners
         first = 0 if self.kind == "checkerboard" else 1
         y, x = np.mgrid[first : first + rows, first : first + columns]
-        return _frozen(self.square_m * np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3))
+        return frozen(self.square_m * np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3))
 
     @cached_property
     def falling(self) -> Bools:
@@ -205,9 +204,8 @@ class Board:
         if self.marker_m is None:
             raise ValueError("kind: a checkerboard has no cv2.aruco.CharucoBoard")
         numbers = self.first_marker + np.arange(self.white.sum())
-        board = cv2.aruco.CharucoBoard(
-            self.squares, self.square_m, self.marker_m, _dictionary(self.dictionary), numbers
-        )
+        known = _dictionary(self.dictionary)
+        board = cv2.aruco.CharucoBoard(self.squares, self.square_m, self.marker_m, known, numbers)
         board.setLegacyPattern(self.old_origin)
         return board
 
@@ -237,9 +235,8 @@ def _cover(first: float, share: float, cells: int, pixels: int) -> Floats:
 @cache
 def _dictionary(name: str) -> Any:
     """OpenCV's dictionary of a name; ValueError for an unknown one."""
-    return cv2.aruco.getPredefinedDictionary(
-        getattr(cv2.aruco, choice("dictionary", name, DICTIONARIES))
-    )
+    number = getattr(cv2.aruco, choice("dictionary", name, DICTIONARIES))
+    return cv2.aruco.getPredefinedDictionary(number)
 
 
 def _side(name: str, value: object) -> float:
@@ -292,11 +289,10 @@ class Detection:
         want(counts, "ids", self.ids, "(N,) whole numbers")
         pixels = array("pixels", self.pixels, (len(ids), 2)).copy()
         width, height = self.size
-        object.__setattr__(self, "ids", _frozen(ids.astype(np.intp)))
-        object.__setattr__(self, "pixels", _frozen(pixels))
-        object.__setattr__(self, "size", (int(width), int(height)))
+        size = int(width), int(height)
+        settle(self, ids=frozen(ids.astype(np.intp)), pixels=frozen(pixels), size=size)
         if self.blur is not None:
-            object.__setattr__(self, "blur", _frozen(array("blur", self.blur, (2, 2)).copy()))
+            settle(self, blur=frozen(array("blur", self.blur, (2, 2)).copy()))
 
     def __len__(self) -> int:
         """How many corners."""
@@ -426,10 +422,8 @@ def check_detections(
     ValueError: detections[0] (a.png): has 3 corners, want at least 4
     """
     if len(detections) < least_views:
-        seen, others = (
-            counted(len(detections), "view"),
-            why_unused(getattr(detections, "skipped", ())),
-        )
+        seen = counted(len(detections), "view")
+        others = why_unused(getattr(detections, "skipped", ()))
         raise ValueError(f"detections: got {seen}, want at least {least_views}{others}")
     for index, view in enumerate(detections):
         fault = next(_faults(view, board, least_corners, size or detections[0].size), "")
@@ -461,12 +455,6 @@ def _faults(
 
 def _times(size: tuple[int, int]) -> str:
     return f"{size[0]}x{size[1]}"
-
-
-def _frozen(values: AnyArray) -> AnyArray:
-    """The same array, read-only from now on."""
-    values.flags.writeable = False
-    return values
 
 
 # --- what a camera sees of a board ---

@@ -280,12 +280,9 @@ def _covariance(
     gx, gy, weight = _gradients(image, q, window)
     dx, dy = window.dx, window.dy[:, None]
     r = gx * dx + gy * dy
-    C = np.stack(
-        [
-            _transposed(weight * (r + gx * dx), weight * gx * dy, q),
-            _transposed(weight * gy * dx, weight * (r + gy * dy), q),
-        ]
-    )
+    to_x = _transposed(weight * (r + gx * dx), weight * gx * dy, q)
+    to_y = _transposed(weight * gy * dx, weight * (r + gy * dy), q)
+    C = np.stack([to_x, to_y])
     sigma2 = np.interp(_patch(image, q, window), levels, variances)
     margin = KERNEL[0] // 2
     sigma2 = np.pad(sigma2, (margin, margin + 1), mode="edge")

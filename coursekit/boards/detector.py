@@ -207,9 +207,8 @@ def _named(number: int, item: Any) -> tuple[str, Any]:
         if item.color is None:
             raise ValueError(f"images: frame {number} has no colour image")
         return f"frame {item.number}", item.color
-    raise ValueError(
-        f"images: number {number} is a {type(item).__name__}, want a path, an array or a frame"
-    )
+    kind = type(item).__name__
+    raise ValueError(f"images: number {number} is a {kind}, want a path, an array or a frame")
 
 
 def natural(path: Path) -> list[Any]:
@@ -231,10 +230,9 @@ def _read(source: Any) -> AnyArray:
         raise BoardNotFound(say("boards.not_read", error=why)) from error
     if not data:
         raise BoardNotFound(say("boards.empty"))
-    for pattern, what in (
-        ROOM_TEXTS["boards"]["other_files"].items() if not data.startswith((JPEG, PNG)) else ()
-    ):
-        texts = (source.suffix.lower(), data[:16].decode("latin1"))
+    others = {} if data.startswith((JPEG, PNG)) else ROOM_TEXTS["boards"]["other_files"]
+    texts = (source.suffix.lower(), data[:16].decode("latin1"))
+    for pattern, what in others.items():
         if any(re.match(pattern, text, re.DOTALL) for text in texts):
             raise BoardNotFound(what)
     (width, height), cut_off = _header(data)
@@ -257,9 +255,8 @@ def _decoded(data: bytes) -> AnyArray:
     if image is None:
         raise BoardNotFound(say("boards.no_image"))
     if data.startswith(PNG) and (data[25:26] in ALPHA or b"tRNS" in data[:4096]):
-        layers: AnyArray = np.asarray(
-            cv2.imdecode(coded, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
-        )
+        with_alpha = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
+        layers: AnyArray = np.asarray(cv2.imdecode(coded, with_alpha))
         white = 255 if image.dtype == np.uint8 else 65535
         alpha = layers[..., -1] / white
         if layers.shape[2:] == (4,) and alpha.any() and alpha.min() < 1:

@@ -55,16 +55,8 @@ def _ray(view: View) -> Floats:
     return (view.R_base_camera @ view.ray)[:, None]
 
 
-def _across(view: View) -> Floats:
-    return view.R_base_camera @ view.by_pixel
-
-
 def _turn(view: View) -> Floats:
     return -cross_matrix(view.lever_base)
-
-
-def _by_K(view: View) -> Floats:
-    return view.R_base_camera @ view.by_parameter
 
 
 def _disparity(view: View) -> Floats:
@@ -85,16 +77,17 @@ class _Conversion:
     matrix: Callable[[View], Floats]
 
 
+PX, MM, DEG = (("px", 1.0),), (("mm", 1e3),), (("deg", math.degrees(1.0)),)
 _CONVERSIONS: dict[str, _Conversion] = {
-    "image": _Conversion((("px", 1.0),), "Z/f: {per:.2f} mm/px", _across),
-    "ray": _Conversion((("mm", 1e3),), "along the ray", _ray),
-    "disparity": _Conversion((("px", 1.0),), "Z²/(fB): {per:.1f} mm/px", _disparity),
+    "image": _Conversion(PX, "Z/f: {per:.2f} mm/px", lambda v: v.R_base_camera @ v.by_pixel),
+    "ray": _Conversion(MM, "along the ray", _ray),
+    "disparity": _Conversion(PX, "Z²/(fB): {per:.1f} mm/px", _disparity),
     "depth": _Conversion((("%", 1e2), ("px", 1.0)), "sZ - oZ²/(fB)", _depth),
-    "turn": _Conversion(
-        (("deg", math.degrees(1.0)),), "lever {lever:.2f} m: {per:.1f} mm/deg", _turn
+    "turn": _Conversion(DEG, "lever {lever:.2f} m: {per:.1f} mm/deg", _turn),
+    "shift": _Conversion(MM, "direct", lambda _: np.eye(3)),
+    "intrinsics": _Conversion(
+        (("σ", 1.0),), "by K and lens", lambda v: v.R_base_camera @ v.by_parameter
     ),
-    "shift": _Conversion((("mm", 1e3),), "direct", lambda _: np.eye(3)),
-    "intrinsics": _Conversion((("σ", 1.0),), "by K and lens", _by_K),
 }
 FACTORED = ("depth", "intrinsics")  # their components have different units
 
@@ -343,7 +336,7 @@ class ErrorBudget:
     title: str = "Error budget"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "terms", tuple(self.terms))
+        checks.settle(self, terms=tuple(self.terms))
         want(self.terms, "terms", self.terms, "at least one")
         different = len(set(self.names)) == len(self.names)
         want(different, "terms", self.names, "different names")
@@ -512,9 +505,8 @@ class ErrorBudget:
         for row in self.rows:
             term, at = row.term, span(row.low_m, row.high_m)
             closing = "" if self._stated else f"{1e3 * row.along_m[0]:.1f} mm"
-            lines.append(
-                (term.name, term.kind, term.magnitude, term.conversion(self.view), at, closing)
-            )
+            what = term.name, term.kind, term.magnitude, term.conversion(self.view)
+            lines.append((*what, at, closing))
         return (head[:-1], [line[:-1] for line in lines]) if self._stated else (head, lines)
 
     def sources(self) -> list[str]:

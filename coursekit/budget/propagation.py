@@ -93,7 +93,7 @@ class Covariances:
         for name, size in sizes.items():
             given = getattr(self, name)
             known = np.zeros((size, size)) if given is None else given
-            object.__setattr__(self, name, checks.covariance(name, known, size))
+            checks.settle(self, **{name: checks.covariance(name, known, size)})
 
     @cached_property
     def joint(self) -> Floats:

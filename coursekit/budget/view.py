@@ -61,9 +61,8 @@ class View:
         checks.positive("baseline_m", self.baseline_m, "a positive length, m")
         for name, value in zip("uv", self.pixel, strict=True):
             checks.number(name, value, "a pixel coordinate")
-            object.__setattr__(self, name, float(value))
-        T_base_camera = checks.transform("T_base_camera", self.T_base_camera)
-        object.__setattr__(self, "T_base_camera", T_base_camera)
+            checks.settle(self, **{name: float(value)})
+        checks.settle(self, T_base_camera=checks.transform("T_base_camera", self.T_base_camera))
         _ = self.ray  # says so now if there is none
 
     @property
@@ -157,7 +156,7 @@ class GraspAxes:
         for name in ("closing", "approach"):
             given = checks.array(name, getattr(self, name), (3,), finite=True)
             want(given.any(), name, given, "a direction, not zero")
-            object.__setattr__(self, name, tuple((given / np.linalg.norm(given)).tolist()))
+            checks.settle(self, **{name: tuple((given / np.linalg.norm(given)).tolist())})
         right_angle = abs(np.dot(self.closing, self.approach)) <= 1e-6
         want(right_angle, "approach", self.approach, "a direction at right angles to closing")
         tolerance = checks.array("tolerance_m", self.tolerance_m, (3,), finite=True)

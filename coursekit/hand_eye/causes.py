@@ -28,7 +28,7 @@ from scipy.linalg import block_diag
 from coursekit.arm import Arm, ArmErrors, fk_covariance, pose_difference
 from coursekit.arrays import Floats, NDArray
 from coursekit.causes import CauseSearch, Hypothesis, Tested, likelihood_ratios, search
-from coursekit.geometry import turned
+from coursekit.geometry import make_transform, turned
 from coursekit.hand_eye import poses
 from coursekit.hand_eye.closed_form import motions, rotation_by_axes, translation_half
 from coursekit.hand_eye.session import HandEyeSession
@@ -225,9 +225,8 @@ def _closed_form(pairs: PosePairs) -> tuple[Floats, Floats]:
     largest = np.bincount(pairs.segment).argmax()
     main = pairs.keep(pairs.segment == largest)
     A, B = motions(main.T_base_gripper, main.T_camera_board, pairs.mount)
-    X = np.eye(4)
-    X[:3, :3] = rotation_by_axes(A, B)
-    X[:3, 3] = translation_half(A, B, X[:3, :3])
+    R = rotation_by_axes(A, B)
+    X = make_transform(R, translation_half(A, B, R))
     places = poses.stand_board(pairs.T_base_gripper, pairs.T_camera_board, X, pairs.mount)
     Y = [poses.mean_pose(places[pairs.segment == k]) for k in range(pairs.segment.max() + 1)]
     return X, np.stack(Y)

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from coursekit.arrays import ArrayLike, Floats, Integers
 from coursekit.checks import choice, positive, want, whole
-from coursekit.geometry import invert_transform, pose_difference, turned
+from coursekit.geometry import invert_transform, make_transform, pose_difference, turned
 from coursekit.hand_eye.poses import (
     MOUNTS,
     SCATTER,
@@ -86,7 +86,9 @@ def rotation_half(A: Floats, B: Floats) -> Floats:
     a = half_angle_vectors(A[:, :3, :3])
     spread = np.asarray(np.linalg.svd(a, compute_uv=False)) / math.sqrt(max(1, len(a)))  # rad
     if spread[1] < LEAST_TURN_RAD:
-        raise NotDetermined(_too_few_axes(a, spread))
+        if spread[0] < LEAST_TURN_RAD:
+            raise NotDetermined(say("hand_eye.no_turns"))
+        raise NotDetermined(say("hand_eye.one_axis", axis=axis_text(np.linalg.svd(a)[2][0])))
     return rotation_by_axes(A, B)
 
 
@@ -135,12 +137,6 @@ def rotation_from_shifts(
     return nearest_rotation(a.T @ b)
 
 
-def _too_few_axes(a: Floats, spread: Floats) -> str:
-    if spread[0] < LEAST_TURN_RAD:
-        return say("hand_eye.no_turns")
-    return say("hand_eye.one_axis", axis=axis_text(np.linalg.svd(a)[2][0]))
-
-
 # --- the solvers ---
 
 
@@ -152,29 +148,22 @@ def closed_form(
     Raises NotDetermined where the arm did not turn about two axes, SolverFailed where what OpenCV
     returns is no pose.
     """
-    M = carrier_stand(T_base_gripper, mount)
+    M, seen = carrier_stand(T_base_gripper, mount), _parts(T_camera_board)
     if method == "closed_form":
         A, B = motions(T_base_gripper, T_camera_board, mount)
-        X = np.eye(4)
-        X[:3, :3] = rotation_half(A, B)
-        X[:3, 3] = translation_half(A, B, X[:3, :3])
+        turn = rotation_half(A, B)
+        X = make_transform(turn, translation_half(A, B, turn))
     elif method in HAND_EYE:
+        solver = getattr(cv2, f"CALIB_HAND_EYE_{method.upper()}")
         with _opencv(method):
-            R, t = cv2.calibrateHandEye(
-                *_parts(invert_transform(M)),
-                *_parts(T_camera_board),
-                method=getattr(cv2, f"CALIB_HAND_EYE_{method.upper()}"),
-            )
+            R, t = cv2.calibrateHandEye(*_parts(invert_transform(M)), *seen, method=solver)
         if np.array_equal(R, np.eye(3)):
             raise SolverFailed(say("hand_eye.identity", method=method))
         X = _rigid(method, R, t)
     else:  # OpenCV's world is the board, its base the stand and its gripper the carrier
+        solver = getattr(cv2, f"CALIB_ROBOT_WORLD_HAND_EYE_{method.upper()}")
         with _opencv(method):
-            R_Y, t_Y, R_X, t_X = cv2.calibrateRobotWorldHandEye(
-                *_parts(T_camera_board),
-                *_parts(M),
-                method=getattr(cv2, f"CALIB_ROBOT_WORLD_HAND_EYE_{method.upper()}"),
-            )
+            R_Y, t_Y, R_X, t_X = cv2.calibrateRobotWorldHandEye(*seen, *_parts(M), method=solver)
         X = invert_transform(_rigid(method, R_X, t_X))
         return X, invert_transform(_rigid(method, R_Y, t_Y))
     return X, mean_pose(stand_board(T_base_gripper, T_camera_board, X, mount))
@@ -213,9 +202,7 @@ def _rigid(method: str, R: ArrayLike, t: ArrayLike) -> Floats:
         fault = f"a matrix that is no rotation (off by {off:.1g})"
     if fault:
         raise SolverFailed(f"{method}: returned {fault}")
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = nearest_rotation(R), t
-    return T
+    return make_transform(nearest_rotation(R), t)
 
 
 # --- an experiment ---

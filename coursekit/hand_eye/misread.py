@@ -146,7 +146,7 @@ def other_pairing(pairs: PosePairs, names: Sequence[str]) -> Pairing | None:
     tried += [replace(pairs, T_base_gripper=pairs.T_base_gripper[order]) for order in orders]
     names, own = [names[view] for view in pairs.view], np.arange(n)
     found = [_fitting_rows(part.fit, pairs) for part in tried]
-    rows, off = min(found, key=_left_over)
+    rows, off = min(found, key=lambda fitting: float(fitting[1][own, fitting[0]].mean()))
     if (rows != own).sum() < 2:
         return None
     # X and Y of a few pairs may fit those by chance: all of them must say the same
@@ -156,11 +156,6 @@ def other_pairing(pairs: PosePairs, names: Sequence[str]) -> Pairing | None:
     if len(moved) < 2 or better.mean() < 2 * np.log(CLEARLY_BETTER):
         return None
     return _in_order(pairs, rows, off, names)
-
-
-def _left_over(fitting: tuple[NDArray[np.intp], Floats]) -> float:
-    rows, off = fitting
-    return float(off[np.arange(len(rows)), rows].mean())
 
 
 def _fitting_rows(fit: Fit, pairs: PosePairs) -> tuple[NDArray[np.intp], Floats]:
@@ -356,12 +351,10 @@ class Misreading:
             what += f" {self.written.order!r}"
         what += " in degrees" * (self.factor > 1) + " in radians" * (self.factor < 1)
         line = f"{what} read by {read}; the data fit {written}"
-        twins = {Notation(n.order[::-1].swapcase()) for n in (self.written, self.read)}
-        if Notation(ROTATION_VECTOR) not in (self.written, self.read) and len(twins) == 2:
-            line += (
-                f" (or, with the three numbers in reverse, {self.written.order[::-1].swapcase()!r} "
-                f"in place of {self.read.order[::-1].swapcase()!r})"
-            )
+        orders = self.written.order, self.read.order
+        if ROTATION_VECTOR not in orders and len(set(orders)) == 2:
+            twins = "{!r} in place of {!r}".format(*(order[::-1].swapcase() for order in orders))
+            line += f" (or, with the three numbers in reverse, {twins})"
         return line
 
     def nearest(self, given: Floats, R: Floats) -> tuple[Floats, Floats]:

@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 
 from coursekit.arrays import ArrayLike, Floats
 from coursekit.checks import array, choice, transform, transforms, want
-from coursekit.geometry import cross_matrix, invert_transform
+from coursekit.geometry import cross_matrix, invert_transform, make_transform
 from coursekit.words import wrapped
 
 Mount = Literal["eye_in_hand", "eye_to_hand"]
@@ -105,26 +105,18 @@ def by_arm_twist(T_base_gripper: Floats, X: Floats, Y: Floats, mount: Mount) -> 
 
     Y as in `by_X_and_Y`.
     """
-    M = carrier_stand(T_base_gripper, mount)
-    arm = (M @ Y)[:, :3, 3] - M[:, :3, 3]
-    by_carrier = np.zeros((len(M), 6, 6))
-    by_carrier[:, :3, :3] = by_carrier[:, 3:, 3:] = X[:3, :3].T
-    by_carrier[:, 3:, :3] = -X[:3, :3].T @ cross_matrix(arm)
-    if mount == "eye_to_hand":
-        return by_carrier
-    # M = T^-1: R' exp(-w), and -R' exp(-w) (t + v) = -R' t - R' v + R' (w x t)
-    inverse = np.zeros_like(by_carrier)
-    inverse[:, :3, :3] = inverse[:, 3:, 3:] = -M[:, :3, :3]
-    inverse[:, 3:, :3] = -M[:, :3, :3] @ cross_matrix(T_base_gripper[:, :3, 3])
-    return by_carrier @ inverse
+    in_hand = mount == "eye_in_hand"  # the gripper then moves the camera, and not the board
+    board = Y if in_hand else T_base_gripper @ Y
+    back = -np.swapaxes(T_base_gripper[:, :3, :3], 1, 2) if in_hand else np.eye(3)
+    columns = np.zeros((len(T_base_gripper), 6, 6))
+    columns[:, :3, :3] = columns[:, 3:, 3:] = turn = X[:3, :3].T @ back
+    columns[:, 3:, :3] = -turn @ cross_matrix(board[..., :3, 3] - T_base_gripper[:, :3, 3])
+    return columns
 
 
 def mean_pose(T: Floats) -> Floats:
     """The mean (4, 4) of poses (n, 4, 4): the chordal mean of the rotations, the mean position."""
-    mean = np.eye(4)
-    mean[:3, :3] = nearest_rotation(T[:, :3, :3].sum(axis=0))
-    mean[:3, 3] = T[:, :3, 3].mean(axis=0)
-    return mean
+    return make_transform(nearest_rotation(T[:, :3, :3].sum(axis=0)), T[:, :3, 3].mean(axis=0))
 
 
 def nearest_rotation(matrix: Floats) -> Floats:
@@ -223,10 +215,8 @@ def observability(
 
 def _nearest_stand(M: Floats, X: Floats) -> Floats:
     """Y with the board where, over all T_carrier_stand (n, 4, 4), it is nearest to the camera."""
-    Y = np.eye(4)
     rows, right = M[:, :3, :3].reshape(-1, 3), (X[:3, 3] - M[:, :3, 3]).ravel()
-    Y[:3, 3] = np.linalg.lstsq(rows, right, rcond=None)[0]
-    return Y
+    return make_transform(np.eye(3), np.linalg.lstsq(rows, right, rcond=None)[0])
 
 
 def _in_words(weak: Floats) -> list[str]:

@@ -105,11 +105,8 @@ class Problem:
     def _columns(self) -> list[int]:
         """The shared errors of the arm that are unknowns; joint offsets are not counted twice."""
         assert self.fk is not None
-        return [
-            column
-            for column, name in enumerate(self.fk.names)
-            if self.arm is None or not name.startswith(JOINT_OFFSET)
-        ]
+        names = enumerate(self.fk.names)
+        return [k for k, name in names if self.arm is None or not name.startswith(JOINT_OFFSET)]
 
     @cached_property
     def _offset_sigma(self) -> Floats:
@@ -119,9 +116,8 @@ class Problem:
         if self.fk is None:
             return np.full(6, OFFSET_SIGMA_RAD)
         known = dict(zip(self.fk.names, self.fk.sigma, strict=True))
-        return np.array(
-            [known.get(JOINT_OFFSET + joint, OFFSET_SIGMA_RAD) for joint in self.arm.joints]
-        )
+        names = (JOINT_OFFSET + joint for joint in self.arm.joints)
+        return np.array([known.get(name, OFFSET_SIGMA_RAD) for name in names])
 
     @cached_property
     def shared(self) -> Floats:
@@ -154,9 +150,8 @@ class Problem:
         """With each pose's own error of this covariance (n, 6, 6): beside pixels six unknowns more,
         and where only poses are known what they are weighed with."""
         if isinstance(self.views, PoseViews):
-            return replace(
-                self, views=replace(self.views, information=np.asarray(np.linalg.inv(own)))
-            )
+            views = replace(self.views, information=np.asarray(np.linalg.inv(own)))
+            return replace(self, views=views)
         return replace(self, own_root=np.asarray(np.linalg.cholesky(own)))
 
     def with_own(self, state: State, twists: Floats) -> State:

@@ -39,7 +39,7 @@ from coursekit.boards import Board, Detection, Detections, detect_all
 from coursekit.boards.board import Skipped, why_unused
 from coursekit.boards.detector import SESSION, natural
 from coursekit.causes import DiagnosisTexts
-from coursekit.checks import array, choice, instance, transform, want
+from coursekit.checks import array, choice, instance, settle, transform, want
 from coursekit.formats import poses as pose_files
 from coursekit.formats.poses import JOINTS, PLACE, THREE, TURN, VELOCITIES, PoseRow
 from coursekit.geometry import Intrinsics, cross_matrix, pose_difference
@@ -120,8 +120,7 @@ class HandEyeSession:
         want(self.dq is None or self.q is not None, "q", None, "the joint angles of these dq")
         checked["names"] = self.names or tuple(f"view {i:02d}" for i in range(n))
         want(len(checked["names"]) == n, "names", len(checked["names"]), f"{n}, one a view")
-        for name, value in checked.items():
-            object.__setattr__(self, name, value)
+        settle(self, **checked)
 
     @property
     def detections(self) -> Detections | None:
@@ -316,7 +315,6 @@ class HandEyeSession:
         if self.board is None or self.intrinsics is None:
             raise ValueError("board, intrinsics: a folder of images needs both")
         place = Path(folder)
-        place.mkdir(parents=True, exist_ok=True)
         for name in self.names:
             write_bytes(place / name, images[name])
         write_bytes(place / POSES, self._csv().encode())

@@ -19,7 +19,7 @@ from coursekit.arm import Arm
 from coursekit.arrays import ArrayLike, Bools, Floats, Integers
 from coursekit.boards import Board
 from coursekit.boards.board import seen
-from coursekit.checks import choice, number, transform, transforms, whole
+from coursekit.checks import choice, number, settle, transform, transforms, whole
 from coursekit.geometry import Intrinsics, inverse_of, invert_transform, make_transform
 from coursekit.hand_eye.poses import MOUNTS, Mount
 from coursekit.specifications import DATA
@@ -100,8 +100,7 @@ class Setup:
 
     def __post_init__(self) -> None:
         choice("mount", self.mount, MOUNTS)
-        object.__setattr__(self, "X", transform("X", self.X))
-        object.__setattr__(self, "Y", transform("Y", self.Y))
+        settle(self, X=transform("X", self.X), Y=transform("Y", self.Y))
         number("share", self.share, "more than 0 and at most 1", above=0.0, most=1.0)
 
     def T_camera_board(self, T_base_gripper: ArrayLike) -> Floats:

@@ -13,8 +13,8 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coursekit.arrays import ArrayLike, Bools, Floats, NDArray
-from coursekit.checks import array, choice, instance, number, positive, transform, want
+from coursekit.arrays import ArrayLike, Bools, Floats, NDArray, frozen
+from coursekit.checks import array, choice, instance, number, positive, settle, transform, want
 from coursekit.geometry import Intrinsics, deproject, invert_transform, make_transform, pixel_grid
 from coursekit.simulation import raycast
 
@@ -27,9 +27,8 @@ DARK = (0.05, 0.05, 0.05)
 SKIN = (0.80, 0.60, 0.50)
 ORANGE = (230 / 255, 159 / 255, 0.0)  # of the Okabe-Ito palette, safe for the colour-blind
 
-BLOCK_M = 0.060
-CUBE_M = 0.025
-TABLE_THICK_M = 0.025
+BLOCK_M, CUBE_M = 0.060, 0.025
+TABLE_THICK_M, WALL_BEHIND_M = 0.025, 0.50  # the latter: from the block's face
 METRES = "a positive number of metres"
 
 
@@ -58,43 +57,35 @@ class Box:
         want(((color >= 0) & (color <= 1)).all(), "color", color, "red, green, blue from 0 to 1")
         choice("texture", self.texture, TEXTURES)
         number("specular", self.specular, "a share from 0 to 1", least=0.0, most=1.0)
-        object.__setattr__(self, "size_m", _kept(size))
-        object.__setattr__(self, "T_scene_box", _kept(transform("T_scene_box", self.T_scene_box)))
-        object.__setattr__(self, "color", tuple(color.tolist()))
-
-
-def _kept(values: Floats) -> Floats:
-    """A copy that nobody can write to."""
-    values = values.copy()
-    values.flags.writeable = False
-    return values
+        T = transform("T_scene_box", self.T_scene_box)
+        settle(self, size_m=frozen(size.copy()), T_scene_box=frozen(T.copy()))
+        settle(self, color=tuple(color.tolist()))
 
 
 Scene = tuple[Box, ...]
 
 
-def tabletop(distance_m: float = 0.45, wall_behind_m: float = 0.50) -> Scene:
+def tabletop(distance_m: float = 0.45) -> Scene:
     """A wall, a table, a 60 mm block standing on it and a 25 mm cube beside the block.
 
     distance_m: Z of the block's front face, m; the face is parallel to the image plane of a camera
-    at the scene's origin, its centre on the optical axis. wall_behind_m: from that face to the
-    wall, m, at least 0.10. Returns the four boxes, in this order: "wall", "table", "60 mm block",
-    "25 mm cube". Raises ValueError for a distance that is not positive.
+    at the scene's origin, its centre on the optical axis; the wall is 0.5 m behind it. Returns the
+    four boxes, in this order: "wall", "table", "60 mm block", "25 mm cube". Raises ValueError for a
+    distance that is not positive.
 
     >>> [box.name for box in tabletop(0.45)]
     ['wall', 'table', '60 mm block', '25 mm cube']
     """
     distance = positive("distance_m", distance_m, METRES)
-    behind = number("wall_behind_m", wall_behind_m, "at least 0.10 m, behind the cube", least=0.10)
     top, turned = BLOCK_M / 2, Rotation.from_euler("y", 28, degrees=True)
-    front, back = min(0.20, 0.6 * distance), distance + behind - 0.02
+    front, back = min(0.20, 0.6 * distance), distance + WALL_BEHIND_M - 0.02
     table_size, table_middle = (2.00, TABLE_THICK_M, back - front), (back + front) / 2
     table = _box("table", table_size, (0.0, top + TABLE_THICK_M / 2, table_middle), MAPLE, "wood")
     block_at = (0.0, top - BLOCK_M / 2, distance + BLOCK_M / 2)
     block = _box("60 mm block", 3 * (BLOCK_M,), block_at, ALUMINIUM)
     cube_at = (0.075, top - CUBE_M / 2, distance + 0.015)
     cube = _box("25 mm cube", 3 * (CUBE_M,), cube_at, ORANGE, rotation=turned)
-    return _wall(distance + behind, 0.0), table, block, cube
+    return _wall(distance + WALL_BEHIND_M, 0.0), table, block, cube
 
 
 def wall_scene(distance_m: float = 1.0, tilt_deg: float = 7.0) -> Scene:

@@ -719,7 +719,7 @@ def _finish(
         if re.fullmatch(r"[0-9a-f]{64}", path.stem) and path.stem not in keys:
             path.unlink()
     column, known = report.canvas_column(lines, how.assignment)
-    says = f"canvas.csv: the column of the points is “{column}”, which is in no roster"
+    says = f"canvas.csv: the points are in a column “{column}”, which the roster does not have once"
     return (
         lines,
         changes,
@@ -738,7 +738,8 @@ def _write_pages(out: Path, bundles: list[Bundle], lines: Sequence[report.Report
             page = report.student_page(line, kept).encode()
             if line.page:
                 results.write_bytes(out / line.page, page)
-            name = place_of(line.file).feedback
+            at = place_of(line.file)
+            name = at.feedback if at.lms or not line.page else Path(line.page).name
             if line.counts and line.file and name not in seen:
                 seen.add(name)
                 packed.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), page)

@@ -273,7 +273,8 @@ def _that_counts(some: Sequence[ReportLine]) -> tuple[ReportLine, tuple[Flag, ..
     if best is newest and len(folders) == 1:
         return best, ()
     each = ", ".join(
-        f"{line.file} ({_points(line.points)} points, packed {line.made})" for line in some[:6]
+        f"{line.file} ({_points(line.points)} points, packed {_date(line.made)})"
+        for line in some[:6]
     )
     says = SEEN["same_name"].format(typed=best.student, bundles=each)
     return best, (Flag("same_name", says),)
@@ -284,7 +285,9 @@ def _clock(line: ReportLine) -> Iterator[Flag]:
     now = datetime.now(UTC).isoformat(timespec="seconds")
     for what, moment in (("was handed in", line.handed_in), ("was graded", now)):
         if line.made and moment and _seconds(line.made) > _seconds(moment) + 86_400:
-            says = SEEN["wrong_clock"].format(made=line.made, after=f"it {what} ({moment})")
+            says = SEEN["wrong_clock"].format(
+                made=_date(line.made), after=f"it {what} ({_date(moment)})"
+            )
             yield Flag("wrong_clock", says)
             return
 
