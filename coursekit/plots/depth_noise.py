@@ -220,15 +220,16 @@ def noise_law(
     error_mm: ArrayLike,
     curve: tuple[Floats, Floats, Floats, Floats],
     extra: Mapping[str, tuple[ArrayLike, ArrayLike]] | None = None,
+    law: str = "fitted law",
 ) -> LessonFigure:
-    """Measured std of depth with its standard error over the fitted law (Z, mid, low, high).
+    """Measured std of depth with its standard error over a curve (Z, mid, low, high), the `law`.
 
     All standard deviations are in mm, all distances in m. extra: other series (Z, std), by name.
     The legend stands beside the axes, clear of all points.
     """
     z, mid, low, high = curve
     fig, ax = single(9.5, 4.6)
-    ax.plot(z, mid, color=COLORS["model"], label="fitted law")
+    ax.plot(z, mid, color=COLORS["model"], label=law)
     ax.fill_between(z, low, high, color=COLORS["model"], alpha=0.25, label="its 95 % band")
     ax.errorbar(distances_m, std_mm, 1.96 * np.asarray(error_mm), fmt="o", ms=4, capsize=4,
                 color=COLORS["measured"], label="measured, with 95 % interval")  # fmt: skip
@@ -239,9 +240,10 @@ def noise_law(
     plain_ticks(ax.xaxis, (0.3, 0.45, 0.6, 1, 1.5, 2, 3))
     plain_ticks(ax.yaxis, (0.01, 0.03, 0.1, 0.3, 1, 3, 10, 30))
     ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0))
+    plain = law.translate({36: None, 92: None})  # without the signs of mathematics
     others = "".join(f"; {name}: {_listed(x, y)}" for name, (x, y) in (extra or {}).items())
     return fig.saying(
-        f"Standard deviation of depth against distance over the fitted law: "
+        f"Standard deviation of depth against distance over the {plain}: "
         f"{_listed(distances_m, std_mm)}{others}."
     )
 
