@@ -31,6 +31,7 @@ NOT_TRUSTED = 3  # the exit code; what was found is written nevertheless
 
 OPTIONS = {"path": "--out", "n": "--frames", "which": "--camera", "distance_m": "--distance"}
 OPTIONS |= {f"{name}_m": f"--{name}-mm (here in m)" for name in ("square", "marker")}
+OPTIONS |= {"detections": "photographs", "images": "photographs", "intrinsics": "--lens"}
 OPTIONS |= {name: f"--{name}" for name in ("squares", "paper", "dictionary", "workers", "timeout")}
 COMMANDS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
 INSTEAD = COMMANDS.pop("instead")
@@ -148,25 +149,35 @@ def _hand_eye(options: argparse.Namespace) -> int:
     session = ck.hand_eye.HandEyeSession.from_folder(*what, **said)
     place = session.solve()
     findings = ck.hand_eye.diagnose(session)
-    code = _say_how_good(place, session.skipped, findings, options.details)
+    weak = place.judgement.weak
+    code = _say_how_good(place, session.skipped, findings, options.details, weak)
     done = _exported_place(place, options)
     print(replace(done, notes=done.notes[1:]))
     return code
 
 
 def _say_how_good(
-    result: Estimate, skipped: Sequence[Skipped], findings: Findings, details: bool
+    result: Estimate,
+    skipped: Sequence[Skipped],
+    findings: Findings,
+    details: bool,
+    weak: Sequence[str] = (),
 ) -> int:
-    """How far to trust the result, what to do first, what was not used; returns the exit code."""
+    """How far to trust the result, what to do first, what was not used; returns the exit code.
+
+    weak: what could be better and is no finding.
+    """
     first, *more = (" ".join(part.split()) for part in re.split(r"\n(?=\S)", result.verdict()))
     code = NOT_TRUSTED if first.startswith("Not to be trusted") else 0
     if details:
         print(_typed(f"{result.verdict()}\n{result}\n{findings!r}"))
     else:
         titles = "; ".join(finding.title for finding in findings)
-        told = [f"Do first: {findings[0].remedy}", f"Found: {titles}."] if findings else []
-        weak = [reason for reason in more if reason.startswith("- ") and not (findings and code)]
-        print("\n".join(wrapped(_typed(line)) for line in [first, *told, *weak]))
+        told = [reason for reason in more if reason.startswith("- ")]
+        if findings:
+            told = [f"Do first: {findings[0].remedy}", f"Found: {titles}."]
+            told += [f"- {reason}" for reason in weak]
+        print("\n".join(wrapped(_typed(line)) for line in [first, *told]))
     reasons = by_reason(skipped)
     shown = len(reasons) if details else SHOWN
     for group in reasons[:shown]:

@@ -19,7 +19,7 @@ from coursekit.cameras import CameraError, open_camera
 from coursekit.cameras.simulated import SimulatedCamera
 from coursekit.results import ROOT
 from coursekit.simulation.arm_sessions import truth_of
-from coursekit.words import Estimate, Findings
+from coursekit.words import Estimate, Finding, Findings
 
 FINDINGS = Path(cli.__file__).with_name("findings.toml")
 CHARUCO = Board("charuco", (9, 6), 0.025)
@@ -192,3 +192,12 @@ def test_the_verdict_comes_first_and_decides_the_exit_code(grade, code, capsys):
     said = capsys.readouterr().out.splitlines()
     assert said[:2] == [f"{grade}: the intervals hold.", "- turn the wrist."]
     assert said[2:4] == ["not used: 1.png, 2.png: blank", "not used, either: 0.png"]
+
+
+def test_a_finding_leaves_room_for_what_is_weak_besides(capsys):
+    found = Findings(
+        [Finding("bowed_board", "S", "E", "Take glass. "), Finding("blur", "S", "E", "")]
+    )
+    cli._say_how_good(Judged("Not good enough"), [], found, False, ["30 deg or more."])
+    said = capsys.readouterr().out.splitlines()[1:4]
+    assert said == ["Do first: Take glass.", "Found: Bowed board; Blur.", "- 30 deg or more."]

@@ -33,6 +33,11 @@ def _describe_depth_noise(args: tuple[Any, ...]) -> str:
     return f"{camera}, Z = {', '.join(f'{z:g}' for z in np.ravel(Z))} m"
 
 
+def _noise_by_disparity(Z: Any, fx: float, baseline: float, sigma_d: float) -> Any:
+    d = fx * baseline / Z
+    return fx * baseline / d**2 * sigma_d
+
+
 DEPTH_NOISE = Exercise(
     name="depth_noise.depth_noise",
     build=_build_depth_noise,
@@ -54,6 +59,7 @@ DEPTH_NOISE = Exercise(
     unit="m",
     tolerance=1e-8,
     describe=_describe_depth_noise,
+    styles=[_noise_by_disparity],
     show=lambda row: ", ".join(f"{v:.7g}" for v in np.ravel(row)),
 )
 
@@ -68,6 +74,7 @@ def _difference(divisor: Step) -> Step:
 DEPTH_NOISE.add_mistakes(
     ("power", "linear_in_Z", lambda Z: Z),
     ("power", "linear_in_Z", lambda Z: 2 * Z),
+    ("", "depth_for_slope", lambda _: lambda Z, fx, baseline, sigma_d: Z * sigma_d),
     ("power", "cubed", lambda Z: Z**3),
     ("constant", "baseline_forgotten", lambda fx, baseline: fx),
     ("constant", "fx_forgotten", lambda fx, baseline: baseline),
@@ -220,6 +227,11 @@ def _centre_clamped(start: int, stop: int, size: int) -> Any:
     return slice(max(centre - half, 0), centre + half + 1)
 
 
+def _repeated_if_inside(start: int, stop: int, size: int) -> Any:
+    """As of an image padded with its edge: nothing where the centre lies outside."""
+    return np.clip(range(start, stop), 0, size - 1)[: size * (0 <= (start + stop) // 2 < size)]
+
+
 def _height_width_swapped(image: Floats, top: int, bottom: int, left: int, right: int) -> Any:
     width, height = image.shape
     return _cut(_inside)(image, top, min(bottom, height), left, min(right, width))
@@ -244,6 +256,7 @@ ROBUST_DEPTH.add_mistakes(
     ("cut", "moved_inside", _cut(_moved_inside)),
     ("cut", "centre_clamped", _cut(_centre_clamped)),
     ("cut", "border_repeated", _cut(lambda a, b, size: np.clip(range(a, b), 0, size - 1))),
+    ("cut", "border_repeated", _cut(_repeated_if_inside)),
     ("cut", "border_lost", _cut(lambda a, b, size: _inside(a, min(b, size - 1), size))),
     ("cut", "border_lost", _cut(lambda a, b, size: slice(max(a, 0), min(b, size - 1)))),
     ("cut", "modulo", _cut(lambda a, b, size: np.arange(a, b) % size)),
@@ -432,6 +445,7 @@ TABLE_ROW.add_mistakes(
     ("std", "over_space", lambda z: np.nanstd(np.nanmean(z, axis=0), ddof=1)),
     ("std", "over_everything", np.nanstd),
     ("std", "over_everything", lambda z: np.nanstd(z, ddof=1)),
+    ("bias", "distance_in_metres", lambda level, distance: level - distance / 1e3),
     ("", "about_the_distance", _about_the_distance),
     ("keep", "mixed_treatment", lambda z: (_left_out(z), z)),
     ("keep", "mixed_treatment", lambda z: (z, _left_out(z))),
@@ -465,8 +479,10 @@ def _build_standard_errors(steps: Mapping[str, Step]) -> Model:
     def standard_errors(z: Floats) -> Any:
         spread, root, sides = steps["spread"], steps["root"], steps["sides"]()
         areas = [steps["area"](*z[0].shape, side) for side in sides]
-        stays = spread(np.nanmean(z, axis=0)) / root(steps["patches"](areas[0], sides[0]))
-        moves = spread(steps["levels"](z)) / root(steps["frames"](len(z)))
+        patches, frames = steps["patches"](areas[0], sides[0]), steps["frames"](len(z))
+        for_stays, for_moves = steps["numbers"](patches, frames)
+        stays = spread(np.nanmean(z, axis=0)) / root(for_stays)
+        moves = spread(steps["levels"](z)) / root(for_moves)
         nu = steps["squares"](steps["count"](z), areas[1], sides[1])
         return np.array([steps["sum"](stays, moves), steps["pooled"](z) / math.sqrt(nu)])
 
@@ -523,6 +539,7 @@ STANDARD_ERRORS = Exercise(
         "area": lambda height, width, side: height * width,
         "patches": lambda area, side: area / side**2,
         "frames": lambda n: n,
+        "numbers": lambda patches, frames: (patches, frames),
         "count": lambda z: len(z) - 1,
         "pooled": _pooled,
         "squares": lambda dof, area, side: 2 * dof * area / side**2,
@@ -553,13 +570,17 @@ def _samples_independent(z: Floats) -> Floats:
     return np.array([np.nanstd(z, ddof=1) / math.sqrt(n), _pooled(z) / math.sqrt(2 * (n - 1))])
 
 
-def _patches_of_every_frame(errors: Model) -> Model:
-    return lambda z: np.array([12 * np.nanstd(z, ddof=1) / math.sqrt(z.size), errors(z)[1]])
+def _of_every_frame(spread: Step) -> Step:
+    """The bias's ± as if each frame had patches of its own, which scatter by so much."""
+    return lambda errors: lambda z: np.array([12 * spread(z) / math.sqrt(z.size), errors(z)[1]])
 
 
 STANDARD_ERRORS.add_mistakes(
     ("", "pixels_independent", lambda _: _samples_independent),
-    ("", "patches_of_every_frame", _patches_of_every_frame),
+    ("", "patches_of_every_frame", _of_every_frame(lambda z: np.nanstd(z, ddof=1))),
+    ("", "noise_over_time_only", _of_every_frame(_pooled)),
+    ("numbers", "pattern_over_frames", lambda patches, frames: (patches * frames, frames)),
+    ("numbers", "numbers_exchanged", lambda patches, frames: (frames, patches)),
     ("patches", "pattern_forgotten", lambda area, side: math.inf),
     ("patches", "pixels_independent", lambda area, side: area),
     ("squares", "pixels_independent", lambda dof, area, side: 2 * dof * area),
@@ -578,6 +599,7 @@ STANDARD_ERRORS.add_mistakes(
     ("count", "frames_not_counted", lambda z: 1),
     ("squares", "root_forgotten", lambda dof, area, side: (2 * dof * area / side**2) ** 2),
     ("patches", "root_before_the_patch", lambda area, side: area / side**4),
+    ("squares", "part_of_a_variance", lambda dof, area, side: dof * area / side**2 / 2),
     ("squares", "one_pixel_only", lambda dof, area, side: 2 * dof),
     ("squares", "std_itself", lambda dof, area, side: 1),
     ("count", "divided_by_n", len),

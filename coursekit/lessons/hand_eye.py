@@ -228,6 +228,10 @@ def _no_signs(*motions: Floats) -> list[Floats]:
     return [np.array([V[:, np.argmin(abs(w - 1))].real for w, V in found]) for found in eigen]
 
 
+def _flipped(signs: Floats) -> Step:
+    return lambda *motions: [signs * Rotation.from_matrix(R).as_rotvec() for R in motions]
+
+
 def _same_frame(A: Floats, B: Floats) -> Floats:
     return np.asarray((A @ np.swapaxes(B, 1, 2)).mean(axis=0))
 
@@ -263,6 +267,7 @@ ROTATION_HALF.add_mistakes(
     ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: U.T @ D @ Vt)),
     ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: Vt @ U.T)),
     ("axes", "axis_without_sign", _no_signs),
+    *(("axes", "one_sign", _flipped(signs)) for signs in 1 - 2 * np.eye(3)),
     ("", "same_frame", lambda _: lambda A, B: A[0] @ B[0].T),
     ("", "largest_singular", lambda _: lambda A, B: _half_by_null_space(A, B, 0)),
     ("", "same_frame", lambda _: _same_frame),

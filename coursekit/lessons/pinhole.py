@@ -353,6 +353,7 @@ DEPROJECT.add_mistakes(
     ("lens", "times_focal_length", lambda fx, fy, cx, cy: (1 / fx, 1 / fy, cx, cy)),
     *_CAMERA,
     ("", "brackets_missing", lambda _: _only_the_centre_scaled),
+    ("", "depth_for_scale", lambda _: lambda uv, Z, K, *_: np.c_[uv, Z] @ np.linalg.inv(K).T),
     ("scale", "depth_along_ray", _along_the_ray),
     ("scale", "not_scaled", lambda x, y, w, depth: (x, y, w * depth)),
     ("scale", "divided_by_depth", lambda x, y, w, depth: (x / depth, y / depth, w * depth)),
