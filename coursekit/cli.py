@@ -130,15 +130,14 @@ def _board(options: argparse.Namespace) -> None:
     print(f"In Python: {board!r}")
 
 
-def _calibrate(options: argparse.Namespace) -> int:
+def _calibrate(options: argparse.Namespace) -> None:
     board = _described(options)
     views = ck.boards.detect_all(options.folder, board)
     lens = ck.intrinsics.calibrate(views, board)
     findings = ck.intrinsics.diagnose(views, board)
-    code = _say_how_good(lens, views.skipped, findings, options.details)
+    _say_how_good(lens, views.skipped, findings, options.details)
     done = ck.export(lens, options.to, options.out, overwrite=options.overwrite)
     print(replace(done, notes=done.notes[1:]))  # the first is the verdict
-    return code
 
 
 def _hand_eye(options: argparse.Namespace) -> int:
@@ -149,11 +148,10 @@ def _hand_eye(options: argparse.Namespace) -> int:
     session = ck.hand_eye.HandEyeSession.from_folder(*what, **said)
     place = session.solve()
     findings = ck.hand_eye.diagnose(session)
-    weak = place.judgement.weak
-    code = _say_how_good(place, session.skipped, findings, options.details, weak)
+    _say_how_good(place, session.skipped, findings, options.details, place.judgement.weak)
     done = _exported_place(place, options)
     print(replace(done, notes=done.notes[1:]))
-    return code
+    return 0 if place.judgement.trusted else NOT_TRUSTED
 
 
 def _say_how_good(
@@ -162,13 +160,12 @@ def _say_how_good(
     findings: Findings,
     details: bool,
     weak: Sequence[str] = (),
-) -> int:
-    """How far to trust the result, what to do first, what was not used; returns the exit code.
+) -> None:
+    """How far to trust the result, what to do first, what was not used.
 
     weak: what could be better and is no finding.
     """
     first, *more = (" ".join(part.split()) for part in re.split(r"\n(?=\S)", result.verdict()))
-    code = NOT_TRUSTED if first.startswith("Not to be trusted") else 0
     if details:
         print(_typed(f"{result.verdict()}\n{result}\n{findings!r}"))
     else:
@@ -187,7 +184,6 @@ def _say_how_good(
         print(wrapped(f"not used, either: {', '.join(rest)}"))
     if not details:
         print("Numbers, evidence and the other remedies: the same with --details.")
-    return code
 
 
 def _submit(options: argparse.Namespace) -> None:

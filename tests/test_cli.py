@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import tomllib
 from pathlib import Path
@@ -12,13 +13,16 @@ import pytest
 from common import EXPECTED
 from fake_realsense import real_library
 
+import coursekit as ck
 from coursekit import cli
 from coursekit.boards import Board, save_sheet
 from coursekit.boards.board import Skipped
 from coursekit.cameras import CameraError, open_camera
 from coursekit.cameras.simulated import SimulatedCamera
+from coursekit.geometry import Intrinsics
 from coursekit.results import ROOT
 from coursekit.simulation.arm_sessions import truth_of
+from coursekit.specifications import DATA
 from coursekit.words import Estimate, Finding, Findings
 
 FINDINGS = Path(cli.__file__).with_name("findings.toml")
@@ -182,16 +186,25 @@ class Judged(Estimate):
         return "X"
 
 
-GRADES = [("Not to be trusted", 3), ("Not good enough", 0), ("Good", 0)]
-
-
-@pytest.mark.parametrize(("grade", "code"), GRADES)
-def test_the_verdict_comes_first_and_decides_the_exit_code(grade, code, capsys):
+def test_the_verdict_comes_first(capsys):
     skipped = [Skipped(f"{k}.png", "blank" if k else "odd") for k in range(3)]
-    assert cli._say_how_good(Judged(grade), skipped, Findings(), False) == code
+    cli._say_how_good(Judged("Good"), skipped, Findings(), False)
     said = capsys.readouterr().out.splitlines()
-    assert said[:2] == [f"{grade}: the intervals hold.", "- turn the wrist."]
+    assert said[:2] == ["Good: the intervals hold.", "- turn the wrist."]
     assert said[2:4] == ["not used: 1.png, 2.png: blank", "not used, either: 0.png"]
+
+
+@pytest.mark.parametrize(("square_mm", "code", "verdict"), [(25, 0, "Good"), (32, 3, "Not to be")])
+def test_the_exit_code_says_what_is_not_to_be_trusted(square_mm, code, verdict, tmp_path, capsys):
+    session = DATA / "hand_eye_in_hand"
+    card = json.loads((session / "session.json").read_text("utf-8"))
+    lens = Intrinsics.from_dict(card["intrinsics"])
+    ck.export(lens, "ros", tmp_path / "lens.yaml")
+    options = f"--kind charuco --squares 9x6 --square-mm {square_mm} --mount eye_in_hand --parent x"
+    files = f"--lens {tmp_path / 'lens.yaml'} --out {tmp_path / 'camera.urdf'}"
+    assert cli.main(f"hand-eye {session} {options} {files}".split()) == code
+    assert capsys.readouterr().out.startswith(verdict)
+    assert (tmp_path / "camera.urdf").is_file()
 
 
 def test_a_finding_leaves_room_for_what_is_weak_besides(capsys):

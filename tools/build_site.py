@@ -257,17 +257,18 @@ def notebook_page(path: Path) -> Page:
     return page
 
 
-def markdown_page(path: Path, only_opening: bool = False) -> Page:
-    """The page of a Markdown file, or of what stands before its first section."""
+def markdown_page(path: Path, only: str = "") -> Page:
+    """The page of a Markdown file, or of its opening and `only` one of its sections."""
     sections = re.split(r"^(?=## )", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
     page = Page(path)
-    page.blocks = [markdown(page, text) for text in (sections[:1] if only_opening else sections)]
+    shown = [*sections[:1], *(text for text in sections[1:] if text.startswith(f"## {only}"))]
+    page.blocks = [markdown(page, text) for text in shown]
     return page
 
 
 def site() -> dict[str, bytes]:
     """All files of the site by their path in it."""
-    start = markdown_page(README, only_opening=True)
+    start = markdown_page(README, only="Bring your data")
     corrections, formats = markdown_page(CORRECTIONS), markdown_page(FORMATS)
     notebooks = [notebook_page(path) for path in find([])]
     templates = Environment(
