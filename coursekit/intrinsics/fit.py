@@ -26,7 +26,7 @@ what the corners cover (`coverage`) and from how the boards were tilted (`tilts`
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -186,18 +186,6 @@ class IntrinsicsResult(Estimate):
         """
         return self._scatter.covariance[: len(self.names), : len(self.names)]
 
-    @cached_property
-    def joint_covariance(self) -> Floats:
-        """The covariance (p + 6n, p + 6n) of the parameters, then (omega, v) of each pose."""
-        return self._without_extra(self.equations.covariance)
-
-    def _without_extra(self, covariance_of: Callable[[Floats, float], Floats]) -> Floats:
-        """A covariance of shared parameters and motions as the views scatter, without `extra`."""
-        covariance = covariance_of(self._scatter.covariance, self._scatter.variance)
-        extra = np.s_[len(self.names) : len(self.names) + len(self.extra)]
-        kept = np.delete(np.arange(len(covariance)), extra)
-        return covariance[np.ix_(kept, kept)]
-
     def value(self, name: str) -> float:
         """The estimate of one of `names`."""
         return float(derivatives.parameter_vector(self.intrinsics)[self._row(name)])
@@ -227,9 +215,11 @@ class IntrinsicsResult(Estimate):
         choice("fixed", fixed, ("world", "camera"))
         uv = array("pixels", pixels, (2,), leading=True)
         columns = projection_columns(self.intrinsics, uv.reshape(-1, 2), range_m, self.names)
-        covariance = self._without_extra(self.equations.mean_motion_covariance)
-        known = len(self.names) if fixed == "camera" else len(covariance)
-        columns, covariance = columns[..., :known], covariance[:known, :known]
+        scatter, p = self._scatter, len(self.names)
+        joint = self.equations.mean_motion_covariance(scatter.covariance, scatter.variance)
+        asked = np.delete(np.arange(len(joint)), np.s_[p : p + len(self.extra)])
+        asked = asked[:p] if fixed == "camera" else asked
+        columns, covariance = columns[..., : len(asked)], joint[np.ix_(asked, asked)]
         return (columns @ covariance @ np.swapaxes(columns, -1, -2)).reshape(*uv.shape, 2)
 
     def uncertainty_map(
@@ -267,13 +257,8 @@ class IntrinsicsResult(Estimate):
         None where there is none. Raises ValueError as `calibrate`.
         """
         smaller = list(MODELS)[: list(MODELS).index(self.model)]
-        for model in reversed(smaller):
-            fit = calibrate(
-                self.detections, self.board, model, "f" in self.names, None, self.points
-            )
-            if not fit.folded_share:
-                return fit
-        return None
+        fits = (self._refitted(self.detections, model) for model in reversed(smaller))
+        return next((fit for fit in fits if not fit.folded_share), None)
 
     def held_out_px(self) -> float:
         """The RMS in px of each half of the views under the camera of the other half.
@@ -284,10 +269,12 @@ class IntrinsicsResult(Estimate):
         squares = 0.0
         for part in (0, 1):
             views, others = self.detections[part::2], self.detections[1 - part :: 2]
-            same = "f" in self.names
-            lens = calibrate(views, self.board, self.model, same, None, self.points).intrinsics
+            lens = self._refitted(views, self.model).intrinsics
             squares += rms_under(lens, others, self.points) ** 2 * sum(map(len, others))
         return math.sqrt(squares / self.corners)
+
+    def _refitted(self, views: Sequence[Detection], model: str) -> IntrinsicsResult:
+        return calibrate(views, self.board, model, "f" in self.names, None, self.points)
 
     # --- in words ---
 
@@ -413,9 +400,8 @@ def calibrate(
     """
     choice("model", model, tuple(MODELS))
     check_detections(detections, board, MIN_CORNERS, MIN_VIEWS)
-    corners = array(
-        "points", board.points if points is None else points, board.points.shape, finite=True
-    )
+    points = board.points if points is None else points
+    corners = array("points", points, board.points.shape, finite=True)
     width, height = size = detections[0].size
     if guess is not None:
         want(guess.size == size, "guess", guess.size, f"the images' size, {size} px")
@@ -477,17 +463,8 @@ def evaluate(
         poses=tuple(block.reshape(-1, 6) for block in poses),
         residuals=np.concatenate([residuals.ravel(), -off[weights > 0]]),
     )
-    return IntrinsicsResult(
-        intrinsics=intrinsics,
-        model=model,
-        names=names,
-        T_camera_board=T_camera_board,
-        equations=equations,
-        board=board,
-        points=points,
-        detections=detections,
-        extra=tuple(extra),
-    )
+    fitted = intrinsics, model, names, T_camera_board, equations
+    return IntrinsicsResult(*fitted, board, points, detections, tuple(extra))
 
 
 def _solve(

@@ -213,8 +213,7 @@ def unknown_sessions(seed: int) -> dict[str, HandEyeSession]:
         "Q": HandEyeMistakes(inverted_poses=True),
         "R": HandEyeMistakes(slip_m=0.005),
     }
-    made = {name: hand_eye_session("eye_in_hand", seed, mistakes=m) for name, m in mistakes.items()}
-    return {name: session for name, (session, _) in made.items()}
+    return {n: hand_eye_session("eye_in_hand", seed, mistakes=m)[0] for n, m in mistakes.items()}
 
 
 def rendered_session(

@@ -28,7 +28,7 @@ import os
 import time
 import zlib
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -38,10 +38,9 @@ from numba import njit, prange
 
 from coursekit.arrays import ArrayLike, Floats, Grey, NDArray
 from coursekit.checks import number, positive, want
-from coursekit.geometry import Intrinsics, pixel_grid
-from coursekit.simulation import raycast
+from coursekit.geometry import Intrinsics
 from coursekit.simulation.raycast import is_lit, nearest_hit, texture_factor
-from coursekit.simulation.scenes import TEXTURES, Scene, box_table, check_scene, rays
+from coursekit.simulation.scenes import TEXTURES, Scene, box_table, check_scene
 
 FloatImage = NDArray[np.float32]  # (H, W)
 
@@ -507,7 +506,7 @@ class StereoFrame:
 class RigView:
     """A rig in front of a scene that stands still.
 
-    exposure_ms: of every frame, ms. truth_m: the exact depth.
+    exposure_ms: of every frame, ms.
     """
 
     def __init__(self, rig: Rig, scene: Scene) -> None:
@@ -551,15 +550,6 @@ class RigView:
         0 where there is no disparity and beyond 65,535 counts.
         """
         return counts(frame.disparity, self.rig.left.fx, self.rig.baseline_m, depth_scale_m)
-
-    @cached_property
-    def truth_m(self) -> Floats:
-        """The exact Z (H, W) of what the left eye's pixel centres see, m, 0 where there is none."""
-        left = self.rig.left
-        truth, index = np.empty(left.size[::-1]), np.empty(left.size[::-1], np.int16)
-        boxes = box_table(self.scene, None)
-        raycast.render_depth(boxes, rays(left, pixel_grid(*left.size)), truth, index)
-        return truth
 
 
 def counts(
