@@ -406,7 +406,7 @@ def test_the_depth_scale_has_an_honest_sigma() -> None:
         )
         scale = depth_scale(calibrate(detections, CHARUCO), list(truth.depth_m))
         assert scale is not None
-        off.append((scale.factor - 1.02) / scale.sigma)
+        off.append((scale[0] - 1.02) / scale[1])
     assert np.mean(np.square(off)) < 1.9  # chi2(20)/20 exceeds 1.9 in 1 % of all cases
     assert np.mean(np.square(off)) > 0.1
 

@@ -43,7 +43,7 @@ from coursekit.checks import want
 from coursekit.geometry import Intrinsics, distort, moved
 from coursekit.intrinsics import derivatives
 from coursekit.intrinsics.fit import MIN_CORNERS, IntrinsicsResult, evaluate
-from coursekit.words import p_text
+from coursekit.words import p_text, say
 
 BOW, HEIGHTS, FLEX = "bowed_board", "heights", "flexing_board"
 STRETCH, PRINT = "stretch", "print"
@@ -810,10 +810,8 @@ class Bow:
     def __repr__(self) -> str:
         half = 1e3 * self.result.quantile() * self.sigma_m
         found = "a bow" if self.p_value < BOW_LEVEL else "no more than a flat board would show"
-        return (
-            f"the board's middle stands out by {1e3 * self.sag_m:+.2f} ± {half:.2f} mm (95 %):\n"
-            f"{found} ({p_text(self.p_value)})"
-        )
+        facts = {"sag": 1e3 * self.sag_m, "half": half, "found": found}
+        return say("intrinsics.bow", p=p_text(self.p_value), **facts)
 
 
 def fit_bow(result: IntrinsicsResult) -> Bow:
@@ -833,15 +831,14 @@ def fit_bow(result: IntrinsicsResult) -> Bow:
     columns, rows = result.board.corners
     outermost = shape[[0, columns - 1, (rows - 1) * columns, rows * columns - 1]].mean(axis=0)
     flat, bent = (float(np.sum(r.equations.residuals**2)) for r in (result, bowed))
+    ratio, dof = max(0.0, flat - bent) / 3 / (bent / bowed.equations.dof), bowed.equations.dof
     return Bow(
         # With the old origin z points out of the board.
         sag_m=float(outermost @ coefficients) * (-1 if result.board.old_origin else 1),
         sigma_m=math.sqrt(float(outermost @ covariance @ outermost)),
         coefficients=coefficients,
         covariance=covariance,
-        p_value=float(
-            f.sf(max(0.0, flat - bent) / 3 / (bent / bowed.equations.dof), 3, bowed.equations.dof)
-        ),
+        p_value=float(f.sf(ratio, 3, dof)),
         result=bowed,
     )
 

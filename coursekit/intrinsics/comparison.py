@@ -145,9 +145,8 @@ def difference_px(
     for _ in range(_GAUSS_NEWTON_STEPS):
         at = points[known] @ T[:3, :3].T + T[:3, 3]
         seen, _, by_point = derivatives.project_with_derivatives(at, second)
-        columns = (weight[..., None] * derivatives.twist_columns(at, by_point)[..., :free]).reshape(
-            -1, free
-        )
+        columns = weight[..., None] * derivatives.twist_columns(at, by_point)[..., :free]
+        columns = columns.reshape(-1, free)
         residuals = (weight * (pixels[known] - seen)).ravel()
         twist = np.zeros(6)
         twist[:free] = derivatives.scaled_inverse(columns.T @ columns) @ (columns.T @ residuals)
@@ -214,10 +213,8 @@ class Comparison:
     def __repr__(self) -> str:
         lines = ["fitted - factory:"]
         for name, difference, sigma in zip(self.names, self.differences, self.sigmas, strict=True):
-            places = 2 if name[0] in "fc" else 4
-            lines.append(
-                f"{name:>4} {difference:+9.{places}f}, {difference / sigma:+6.1f} of its sigma"
-            )
+            off = f"{difference:+9.2f}" if name[0] in "fc" else f"{difference:+9.4f}"
+            lines.append(f"{name:>4} {off}, {difference / sigma:+6.1f} of its sigma")
         maps = (self.difference_px, 1e3 * self.shift_m, 1e3 * self.expected_shift_m)
         px, mm, sigma = ({"median": np.nanmedian(m), "worst": np.nanmax(m)} for m in maps)
         facts = {"p": p_text(self.p_value), "range_m": self.range_m, "px": px, "mm": mm}
@@ -256,9 +253,8 @@ def compare(
     theirs = deproject(grid, depth, factory.K, factory.dist)
     shift = np.linalg.norm(deproject(grid, depth, ours.K, ours.dist) - theirs, axis=1)
     full = derivatives.parameter_vector(ours) - derivatives.parameter_vector(factory)
-    difference = (
-        np.linalg.pinv(derivatives.selection(names)) @ full
-    )  # "f" against the mean of fx and fy
+    # "f" against the mean of fx and fy
+    difference = np.linalg.pinv(derivatives.selection(names)) @ full
     sigma_px = result.uncertainty_map(range_m, shape, "camera")
     return Comparison(
         names=names,

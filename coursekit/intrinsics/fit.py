@@ -286,9 +286,8 @@ class IntrinsicsResult(Estimate):
         by what the corners cover, and by how the boards are tilted; not by the RMS.
         """
         range_m, wide, views = self.board_range_m, self.quantile(), len(self.residuals)
-        near, far = (
-            wide * float(np.nanquantile(self.uncertainty_map(r), 0.95)) for r in (range_m, math.inf)
-        )
+        maps = (self.uncertainty_map(r) for r in (range_m, math.inf))
+        near, far = (wide * float(np.nanquantile(sigmas, 0.95)) for sigmas in maps)
         focal = wide * max(self.sigma(f) / self.value(f) for f in ("fx", "fy"))
         centre = wide * max(self.sigma(c) for c in ("cx", "cy"))
         determined = max(focal, centre / self.value("fx")) < DETERMINED_SHARE
@@ -310,13 +309,9 @@ class IntrinsicsResult(Estimate):
         return "\n".join(map(wrapped, lines))
 
     def __repr__(self) -> str:
-        width, height = self.intrinsics.size
-        lines = [
-            f"{width}x{height} px, model {self.model}, {len(self.residuals)} views, "
-            f"{self.corners} corners"
-            + (", the board's shape fitted too" if self.extra else "")
-            + ("" if self.converged else "; NOT CONVERGED")
-        ]
+        lines = [say("intrinsics.fit", fit=self, views=len(self.residuals))]
+        lines[0] += ", the board's shape fitted too" if self.extra else ""
+        lines[0] += "" if self.converged else "; NOT CONVERGED"
         for name in self.names:
             places, unit = (2, " px") if name[0] in "fc" else (4, "")
             half = self.quantile() * self.sigma(name)
@@ -594,15 +589,16 @@ class Coverage:
         """The sides of the image where more than a tenth of it saw no corner."""
         return tuple(s for s, m in zip(SIDES, self.margins, strict=True) if m > GOOD_MARGIN)
 
+    @property
+    def percent(self) -> dict[str, float]:
+        """How far out corners reach, and what is empty at each side, in per cent."""
+        shares = zip(("reach", *SIDES), (self.reach, *self.margins), strict=True)
+        return {name: 100 * share for name, share in shares}
+
     def __repr__(self) -> str:
-        margins = ", ".join(
-            f"{100 * m:.0f} % {side}" for side, m in zip(SIDES, self.margins, strict=True)
-        )
-        rows, columns = self.counts.shape
-        return (
-            f"corners in {100 * self.fraction:.0f} % of {columns}x{rows} image cells, out to "
-            f"{100 * self.reach:.0f} % of the half diagonal\nempty margins: {margins}"
-        )
+        (rows, columns), covered = self.counts.shape, 100 * self.fraction
+        facts = {"rows": rows, "columns": columns, "covered": covered}
+        return say("intrinsics.coverage", **facts, **self.percent)
 
 
 def coverage(detections: Sequence[Detection], cells: tuple[int, int] = (6, 8)) -> Coverage:
@@ -651,11 +647,8 @@ class Tilts:
         return float(np.std(self.about_x_deg)), float(np.std(self.about_y_deg))
 
     def __repr__(self) -> str:
-        spread = "{:.0f} and {:.0f}".format(*self.spread_deg)
-        return (
-            f"boards tilted {self.total_deg.min():.0f} to {self.total_deg.max():.0f} deg, "
-            f"spread {spread} deg about x and y"
-        )
+        least, most = self.total_deg.min(), self.total_deg.max()
+        return say("intrinsics.tilts", least=least, most=most, spread=self.spread_deg)
 
 
 def tilts(result: IntrinsicsResult) -> Tilts:
@@ -698,9 +691,9 @@ def _fewer_coefficients(result: IntrinsicsResult) -> str:
     fit = result.simpler
     if fit is None:
         return "no smaller model here does better: push the board into the image's corners."
-    says = f"fit fewer coefficients, calibrate(..., model='{fit.model}'): "
+    held_out, fx = "", "f" if "f" in result.names else "fx"
     if len(result.detections) >= 2 * MIN_VIEWS:
-        says += f"held-out views RMS {fit.held_out_px():.2f} px, with these coefficients "
-        says += f"{result.held_out_px():.2f} px; "
-    fx = "f" if "f" in result.names else "fx"
-    return f"{says}sigma of fx {fit.sigma(fx):.2f} px, with these {result.sigma(fx):.2f} px."
+        rms = {"theirs": fit.held_out_px(), "ours": result.held_out_px()}
+        held_out = say("intrinsics.held_out", **rms)
+    sigmas = {"theirs": fit.sigma(fx), "ours": result.sigma(fx)}
+    return say("intrinsics.fewer", model=fit.model, held_out=held_out, **sigmas)
