@@ -244,12 +244,9 @@ class Calibration:
         shared = [by_camera @ self.estimated, *(columns[c] for c in self.shared)]
         own = [derivatives.twist_columns(points, by_point), *(columns[c] for c in self.own)]
         moved_centre = principal + number[:, None] * values[DRIFT][1:]
-        return Linear(
-            corners.pixels - moved_centre - from_axis * scale[:, 0],
-            np.concatenate(shared, axis=2),
-            np.concatenate(own, axis=2),
-            columns,
-        )
+        residuals = corners.pixels - moved_centre - from_axis * scale[:, 0]
+        jacobians = (np.concatenate(blocks, axis=2) for blocks in (shared, own))
+        return Linear(residuals, *jacobians, columns)
 
     @property
     def shape(self) -> Floats:
@@ -832,15 +829,10 @@ def fit_bow(result: IntrinsicsResult) -> Bow:
     outermost = shape[[0, columns - 1, (rows - 1) * columns, rows * columns - 1]].mean(axis=0)
     flat, bent = (float(np.sum(r.equations.residuals**2)) for r in (result, bowed))
     ratio, dof = max(0.0, flat - bent) / 3 / (bent / bowed.equations.dof), bowed.equations.dof
-    return Bow(
-        # With the old origin z points out of the board.
-        sag_m=float(outermost @ coefficients) * (-1 if result.board.old_origin else 1),
-        sigma_m=math.sqrt(float(outermost @ covariance @ outermost)),
-        coefficients=coefficients,
-        covariance=covariance,
-        p_value=float(f.sf(ratio, 3, dof)),
-        result=bowed,
-    )
+    # With the old origin z points out of the board.
+    sag_m = float(outermost @ coefficients) * (-1 if result.board.old_origin else 1)
+    sigma_m = math.sqrt(float(outermost @ covariance @ outermost))
+    return Bow(sag_m, sigma_m, coefficients, covariance, float(f.sf(ratio, 3, dof)), bowed)
 
 
 # --- the shape, corner by corner ---

@@ -111,15 +111,11 @@ def halves(
     apart = np.array([second.value(name) - first.value(name) for name in first.names])
     known = len(apart)
     noise = [r.sigma_px**2 * r.equations.shared_covariance[:known, :known] for r in both]
-    return HalvesDifference(
-        first=first,
-        second=second,
-        range_m=range_m,
-        difference_px=difference.reshape(*shape, 2),
-        expected_px=worst_direction(spread @ total @ np.swapaxes(spread, -1, -2)).reshape(shape),
-        p_value=_wald(apart, total, min(first.dof, second.dof)),
-        noise_p_value=_wald(apart, noise[0] + noise[1], min(r.equations.dof for r in both)),
-    )
+    expected = worst_direction(spread @ total @ np.swapaxes(spread, -1, -2)).reshape(shape)
+    p_value = _wald(apart, total, min(first.dof, second.dof))
+    noise_p_value = _wald(apart, noise[0] + noise[1], min(r.equations.dof for r in both))
+    maps = difference.reshape(*shape, 2), expected
+    return HalvesDifference(first, second, range_m, *maps, p_value, noise_p_value)
 
 
 def difference_px(
@@ -255,15 +251,8 @@ def compare(
     full = derivatives.parameter_vector(ours) - derivatives.parameter_vector(factory)
     # "f" against the mean of fx and fy
     difference = np.linalg.pinv(derivatives.selection(names)) @ full
-    sigma_px = result.uncertainty_map(range_m, shape, "camera")
-    return Comparison(
-        names=names,
-        differences=difference,
-        sigmas=np.sqrt(np.diag(result.covariance)),
-        p_value=_wald(difference, result.covariance, result.dof),
-        range_m=float(range_m),
-        difference_px=np.linalg.norm(pixels, axis=-1),
-        shift_m=shift.reshape(shape),
-        expected_shift_m=sigma_px * range_m / result.value("fx"),
-        size=ours.size,
-    )
+    sigmas = np.sqrt(np.diag(result.covariance))
+    p_value = _wald(difference, result.covariance, result.dof)
+    expected = result.uncertainty_map(range_m, shape, "camera") * range_m / result.value("fx")
+    maps = np.linalg.norm(pixels, axis=-1), shift.reshape(shape), expected
+    return Comparison(names, difference, sigmas, p_value, float(range_m), *maps, ours.size)

@@ -453,11 +453,10 @@ def evaluate(
     weights, off = held or (np.zeros(len(extra)), np.zeros(len(extra)))
     known = np.concatenate([np.zeros((len(extra), len(names))), np.diag(weights)], axis=1)
     seen = np.concatenate(shared, axis=-1).reshape(2 * len(ids), -1)
-    equations = derivatives.NormalEquations(
-        shared=np.concatenate([seen, known[weights > 0]]),
-        poses=tuple(block.reshape(-1, 6) for block in poses),
-        residuals=np.concatenate([residuals.ravel(), -off[weights > 0]]),
-    )
+    rows = np.concatenate([seen, known[weights > 0]])
+    blocks = tuple(block.reshape(-1, 6) for block in poses)
+    left = np.concatenate([residuals.ravel(), -off[weights > 0]])
+    equations = derivatives.NormalEquations(rows, blocks, left)
     fitted = intrinsics, model, names, T_camera_board, equations
     return IntrinsicsResult(*fitted, board, points, detections, tuple(extra))
 
@@ -505,10 +504,8 @@ def _solve(
         cv2.setNumThreads(threads)
     if not all(np.isfinite(found).all() for found in (K, dist, *rotations, *translations)):
         raise CalibrationFailed("detections: the solver ran away to infinity; tilt the board more")
-    poses = np.stack([
-        make_transform(Rotation.from_rotvec(r.ravel()), t.ravel())
-        for r, t in zip(rotations, translations, strict=True)
-    ])  # fmt: skip
+    places = zip(map(np.ravel, rotations), map(np.ravel, translations), strict=True)
+    poses = np.stack([make_transform(Rotation.from_rotvec(r), t) for r, t in places])
     depths = [p @ T[2, :3] + T[2, 3] for T, p in zip(poses, points, strict=True)]
     in_front = all((z > 0).all() for z in depths)
     if min(K[0, 0], K[1, 1]) < LEAST_FOCAL * size[0] or not in_front:
@@ -615,17 +612,13 @@ def coverage(detections: Sequence[Detection], cells: tuple[int, int] = (6, 8)) -
     width, height = size = np.array(detections[0].size)
     pixels = np.concatenate([d.pixels for d in detections])
     # pixel 0 is the centre of the first pixel: the image reaches from -0.5 to size - 0.5
-    counts, _, _ = np.histogram2d(
-        pixels[:, 1], pixels[:, 0], cells, [(-0.5, height - 0.5), (-0.5, width - 0.5)]
-    )
+    spans = (-0.5, height - 0.5), (-0.5, width - 0.5)
+    counts, _, _ = np.histogram2d(pixels[:, 1], pixels[:, 0], cells, spans)
     left, top = (pixels.min(axis=0) + 0.5) / size
     right, bottom = (size - 0.5 - pixels.max(axis=0)) / size
     outermost = np.linalg.norm(pixels - (size - 1) / 2, axis=1).max()
-    return Coverage(
-        counts.astype(np.intp),
-        (float(left), float(top), float(right), float(bottom)),
-        float(outermost / np.linalg.norm(size / 2)),
-    )
+    margins = float(left), float(top), float(right), float(bottom)
+    return Coverage(counts.astype(np.intp), margins, float(outermost / np.linalg.norm(size / 2)))
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -160,13 +160,11 @@ def default_setup(mount: Mount) -> Setup:
     >>> default_setup("eye_to_hand").board.squares
     (7, 5)
     """
-    arm = widowx()
-    lens = device(WHOSE_LENS[choice("mount", mount, MOUNTS)]).unit.color
-    if mount == "eye_in_hand":
-        X, board = arm.T_gripper_camera, TABLE_BOARD
-        return Setup(arm, mount, X, arm_poses.board_on_table(board), lens, board)
-    board = HELD_BOARD
-    X, Y = arm_poses.over_the_shoulder(), arm_poses.board_in_gripper(board)
+    arm, lens = widowx(), device(WHOSE_LENS[choice("mount", mount, MOUNTS)]).unit.color
+    board, X, Y = TABLE_BOARD, arm.T_gripper_camera, arm_poses.board_on_table(TABLE_BOARD)
+    if mount == "eye_to_hand":
+        board, X = HELD_BOARD, arm_poses.over_the_shoulder()
+        Y = arm_poses.board_in_gripper(board)
     return Setup(arm, mount, X, Y, lens, board)
 
 
@@ -419,17 +417,10 @@ def _reported(truth: HandEyeTruth, q: Floats, dq: Floats, found: Detections) -> 
     if mistakes.millimetres == "arm":
         T[:, :3, 3] *= 1e3
     only_poses = mistakes.inverted_poses or mistakes.degrees == "rotation_vectors"
-    session = HandEyeSession(
-        mount=setup.mount,
-        T_base_gripper=T,
-        seen=found,
-        board=setup.board,
-        intrinsics=setup.intrinsics,
-        q=None if only_poses else q,
-        dq=dq if dq.any() and not only_poses else None,
-        times=np.arange(len(q)) * np.float64(SECONDS),
-        names=tuple(view.name for view in found),
-    )
+    joints = (None, None) if only_poses else (q, dq if dq.any() else None)
+    times, names = np.arange(len(q)) * np.float64(SECONDS), tuple(view.name for view in found)
+    seen_by = setup.board, setup.intrinsics
+    session = HandEyeSession(setup.mount, T, found, *seen_by, *joints, times, names)
     if mistakes.inverted_detections or mistakes.millimetres == "board":
         T = session.T_camera_board.copy()
         T = invert_transform(T) if mistakes.inverted_detections else T
