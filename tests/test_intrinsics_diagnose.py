@@ -119,7 +119,7 @@ def test_two_causes_are_both_named_and_measured() -> None:
     findings = diagnose(detections, CHECKERBOARD)
     assert set(findings.names) == {"bowed_board", "spoiled_view"}
     spoiled, bowed = findings
-    assert f"view {truth.spoiled_view:02d}:" in spoiled.evidence
+    assert f"view {truth.draw.spoiled_view:02d}:" in spoiled.evidence
     found = searched(detections)
     assert {step.test.cause for step in found.accepted} == {"bowed_board", "spoiled_view"}
     sag, sigma = causes.sag(found.model)
@@ -134,14 +134,14 @@ def test_the_sizes_of_focus_drift_and_shutter_motion_come_out() -> None:
     )
     model = searched(drifting).model
     assert tuple(model.sizes) == (causes.FOCUS,)
-    assert model.sizes[causes.FOCUS] == pytest.approx(truth.focal_scale.std(), rel=0.25)
+    assert model.sizes[causes.FOCUS] == pytest.approx(truth.draw.focal_scale.std(), rel=0.25)
     moving, truth = corner_session(
         CHECKERBOARD, LENS, FIRST_SEED + 1, effects=Effects(readout_s=0.02, speed_m_s=0.1)
     )
     model = searched(moving).model
     assert tuple(model.sizes) == (causes.SHUTTER,)
     assert np.sqrt(3) * model.sizes[causes.SHUTTER] == pytest.approx(0.002, rel=0.25)
-    estimated, true = model.values[causes.SHUTTER][:, :2], 0.02 * truth.velocity_m_s[:, :2]
+    estimated, true = model.values[causes.SHUTTER][:, :2], 0.02 * truth.draw.velocity_m_s[:, :2]
     assert np.corrcoef(estimated.ravel(), true.ravel())[0, 1] > 0.7
 
 

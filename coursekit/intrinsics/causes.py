@@ -245,8 +245,8 @@ class Calibration:
         own = [derivatives.twist_columns(points, by_point), *(columns[c] for c in self.own)]
         moved_centre = principal + number[:, None] * values[DRIFT][1:]
         residuals = corners.pixels - moved_centre - from_axis * scale[:, 0]
-        jacobians = (np.concatenate(blocks, axis=2) for blocks in (shared, own))
-        return Linear(residuals, *jacobians, columns)
+        of_all, of_each = (np.concatenate(blocks, axis=2) for blocks in (shared, own))
+        return Linear(residuals, of_all, of_each, columns)
 
     @property
     def shape(self) -> Floats:

@@ -418,7 +418,7 @@ SPECKLE_SIGMA_PX = 0.6
 LENS_SIGMA_PX = 0.5  # blur
 GREY_PER_MS = 100.0  # exposed to unit light
 LONGEST_MS = 33.0  # auto exposure ends where the next frame begins
-METERED = (0.25, 99.8)  # auto exposure: this part of the width and height, and this percentile
+METERED = (0.375, 0.625), 99.8  # auto exposure: from, to of width and height; this percentile
 BRIGHT_GREY = 235.0  # ... of the left image come to this
 BLACK_GREY = 4.0
 PRNU, DSNU_GREY = 0.01, 0.5  # fixed pattern: std of the pixels' gain and of their offset
@@ -591,11 +591,9 @@ def _light(scene: Scene, rig: Rig) -> list[tuple[FloatImage, FloatImage]]:
 
 def _metered(radiance: FloatImage) -> float:
     """The exposure in ms that makes the dots in the middle bright and hardly saturated."""
-    part, percentile = METERED
-    rows, columns = (
-        slice(round((1 - part) / 2 * n), round((1 + part) / 2 * n)) for n in radiance.shape
-    )
-    bright = float(np.percentile(radiance[rows, columns], percentile))
+    (low, high), percentile = METERED
+    middle = tuple(slice(round(low * n), round(high * n)) for n in radiance.shape)
+    bright = float(np.percentile(radiance[middle], percentile))
     return min(LONGEST_MS, BRIGHT_GREY / (GREY_PER_MS * bright)) if bright > 0 else LONGEST_MS
 
 
@@ -630,9 +628,8 @@ def _grain(size: int = 512, levels: int = 6) -> FloatImage:
     spectrum = np.fft.rfft2(rng.standard_normal((size, size)))
     spectrum /= np.where(frequency > 0, frequency, np.inf)
     blurs = [0.4 * 2**level if level else 0.0 for level in range(levels)]
-    tiles = [
-        np.fft.irfft2(spectrum * np.exp(-2 * (np.pi * frequency * blur) ** 2)) for blur in blurs
-    ]
+    decays = (np.exp(-2 * (np.pi * frequency * blur) ** 2) for blur in blurs)
+    tiles = [np.fft.irfft2(spectrum * decay) for decay in decays]
     return (np.stack(tiles) / tiles[0].std()).astype(np.float32)
 
 
