@@ -105,7 +105,7 @@ class Truth:
     """
 
     T_camera_board: Floats
-    draw: Draw
+    draw: Drawn
     bad_corners: tuple[tuple[int, int], ...]
     depth_m: tuple[Floats, ...]
     points: Floats
@@ -174,7 +174,7 @@ def corner_session(
     # then has the poses and the noise of the healthy session with the same seed.
     poses = view_poses(board, lens, np.random.default_rng([seed, 0]), views, effects)
     rng = np.random.default_rng([seed, 1])
-    draw = Draw(rng, views, effects)
+    draw = Drawn(rng, views, effects)
     street = np.random.default_rng([seed, 2])  # drawn after and apart: the rest stays as it is
     points = printed(board, effects, street)
     looks = [_look(board, points, lens, poses[i], draw, i) for i in range(views)]
@@ -273,7 +273,7 @@ def _visible(points: Floats, lens: Intrinsics, T: Floats, effects: Effects) -> B
 # --- what is seen of them ---
 
 
-class Draw:
+class Drawn:
     """The random numbers of a session's effects, all drawn whether an effect is on or not.
 
     focal_scale (n,): of each view. velocity_m_s (n, 3): of the board in the camera's frame.
@@ -298,7 +298,7 @@ class Draw:
 
 
 def _look(
-    board: Board, shape: Floats, lens: Intrinsics, T: Floats, draw: Draw, view: int
+    board: Board, shape: Floats, lens: Intrinsics, T: Floats, draw: Drawn, view: int
 ) -> tuple[Integers, Floats, Floats]:
     """The ids of the corners in the image, their pixels (N, 2) without noise, and their Z (N,)."""
     effects, scale, velocity = draw.effects, draw.focal_scale[view], draw.velocity_m_s[view]
