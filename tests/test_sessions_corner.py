@@ -97,8 +97,8 @@ def test_an_effect_leaves_poses_and_noise_of_the_seed_as_they_are() -> None:
     assert (truth.T_camera_board == same.T_camera_board).all()
     pairs = zip(healthy, spoiled, strict=True)
     off = [np.linalg.norm(a.pixels - b.pixels, axis=1) for a, b in pairs]
-    assert same.spoiled_view is not None
-    assert np.allclose(off.pop(same.spoiled_view), 3.0)
+    assert same.draw.spoiled_view is not None
+    assert np.allclose(off.pop(same.draw.spoiled_view), 3.0)
     assert max(o.max() for o in off) == 0.0
 
 
