@@ -38,8 +38,8 @@ def _noise_by_disparity(Z: Any, fx: float, baseline: float, sigma_d: float) -> A
     return fx * baseline / d**2 * sigma_d
 
 
-DEPTH_NOISE = Exercise(
-    name="depth_noise.depth_noise",
+DEPTH_NOISE = Exercise.told(
+    "depth_noise.depth_noise",
     build=_build_depth_noise,
     steps={
         "power": lambda Z: Z**2,
@@ -48,19 +48,8 @@ DEPTH_NOISE = Exercise(
         "noise": lambda slope, sigma_d, Z: slope * sigma_d,
         "result": lambda sigma: sigma,
     },
-    cases=[
-        (0.4, 447.0, 0.05, 0.08),
-        (1.0, 447.0, 0.05, 0.08),
-        (np.array([0.30, 0.45, 0.60]), 431.1, 0.0502, 0.08),
-        (np.array([0.15, 0.20, 0.30, 0.45]), 425.0, 0.018, 0.06),
-        (np.array([[0.5, 0.7, 1.1], [1.3, 1.9, 7.5]]), 390.4, 0.0951, 0.25),
-    ],
-    per_row=1,
-    unit="m",
-    tolerance=1e-8,
     describe=_describe_depth_noise,
     styles=[_noise_by_disparity],
-    show=lambda row: ", ".join(f"{v:.7g}" for v in np.ravel(row)),
 )
 
 
@@ -177,8 +166,8 @@ def _describe_robust_depth(args: tuple[Any, ...]) -> str:
     return f"{text} ({inside})"
 
 
-ROBUST_DEPTH = Exercise(
-    name="depth_noise.robust_depth",
+ROBUST_DEPTH = Exercise.told(
+    "depth_noise.robust_depth",
     build=_build_robust_depth,
     steps={
         "read": lambda u, v: (u, v),
@@ -194,10 +183,8 @@ ROBUST_DEPTH = Exercise(
     },
     cases=[(IMAGE, *pixel) for pixel in WINDOWS["near"]]
     + [(7 * IMAGE, *pixel) for pixel in WINDOWS["far"]],
-    unit="m",
     describe=_describe_robust_depth,
     show=lambda depth: "NaN" if np.isnan(depth) else f"{float(depth):.5f}",
-    nan_answers=True,
 )
 
 
@@ -360,8 +347,8 @@ def _row_by_sums(counts: Any, scale: float, distance: float) -> Any:
     return np.nanmean(error), np.sqrt(np.mean(variance)), np.sum(counts == 0) / counts.size
 
 
-TABLE_ROW = Exercise(
-    name="depth_noise.table_row",
+TABLE_ROW = Exercise.told(
+    "depth_noise.table_row",
     build=_build_table_row,
     steps={
         "depth": lambda counts, step: np.where(counts > 0, step * counts, np.nan),
@@ -380,14 +367,8 @@ TABLE_ROW = Exercise(
         _table_case((10, 5, 4), 0.00025, 0.3, 5),
         _table_case((16, 4, 5), 0.0001, 0.6, 7),
     ],
-    parts=("the bias", "the std", "the invalid part"),
-    unit="(mm, mm, 1)",
-    tolerance=1e-4,
     describe=_describe_table_row,
-    show=lambda row: f"({', '.join(f'{v:.5g}' for v in np.ravel(row))})",
-    nan_answers=True,
     styles=[_row_by_lines, _row_by_sums],
-    way="mismatches kept",
     ways=[  # how the means and variances of pixels with holes are weighted is free
         (f"mismatches {way}{mean}{mix}", {"keep": keep, "level": level, "std": std})
         for way, keep in (("kept", lambda z: (z, z)), ("left out", lambda z: (_left_out(z),) * 2))
@@ -528,8 +509,8 @@ def _errors_by_stds(z: Floats) -> Any:
     return np.sqrt(stays**2 + moves**2), std / np.sqrt(2 * nu)
 
 
-STANDARD_ERRORS = Exercise(
-    name="depth_noise.standard_errors",
+STANDARD_ERRORS = Exercise.told(
+    "depth_noise.standard_errors",
     build=_build_standard_errors,
     steps={
         "levels": lambda z: np.nanmean(z, axis=(1, 2)),
@@ -546,14 +527,8 @@ STANDARD_ERRORS = Exercise(
         "sum": math.hypot,
     },
     cases=[_errors_case((5 + 3 * i, 12 + 8 * i, 12 + 9 * i), i) for i in range(3)],
-    parts=("the bias's ±", "the std's ±"),
-    unit="mm",
-    tolerance=1e-5,
     describe=lambda args: f"z of shape {args[0].shape}, {np.sum(np.isnan(args[0]))} of it NaN",
-    show=TABLE_ROW.show,
-    nan_answers=True,
     styles=[_errors_by_variances, _errors_by_stds],
-    way="n = frames, holes or not",
     ways=[
         ("n = each pixel's valid samples" + mix, {"count": _freedom, "pooled": std})
         for mix, std in (("", _pooled), _BY_SAMPLES)

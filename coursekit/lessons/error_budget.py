@@ -37,8 +37,8 @@ def _prices_by_differences(u: float, Z: float, fx: float, cx: float, depth_error
     return dX_du, dX_dZ, (u - cx) * (Z + depth_error) / fx - X
 
 
-SENSITIVITIES = Exercise(
-    name="error_budget.sensitivities",
+SENSITIVITIES = Exercise.told(
+    "error_budget.sensitivities",
     build=_build,
     steps={
         "pixel": lambda u, Z, fx, cx: Z / fx,
@@ -46,19 +46,9 @@ SENSITIVITIES = Exercise(
         "leak": lambda dX_du, dX_dZ, depth_error, Z: dX_dZ * depth_error,
         "order": lambda dX_du, dX_dZ, leak: np.array([dX_du, dX_dZ, leak]),
     },
-    cases=[
-        (524.0, 0.5, 500.0, 424.0, 0.004),
-        (847.0, 0.45, 447.0, 424.0, 0.005),
-        (20.0, 0.30, 612.0, 322.0, 0.003),
-        (700.0, 3.70, 390.4, 331.4, -0.006),
-    ],
-    parts=("dX/du", "dX/dZ", "the leak"),
-    unit="m/px, 1 and m",
-    tolerance=1e-9,
     describe=lambda args: (
         "u = {:g} px, Z = {:g} m, fx = {:g} px, cx = {:g} px, depth error {:g} m".format(*args)
     ),
-    show=lambda row: "(" + ", ".join(f"{v:.6g}" for v in np.ravel(row)) + ")",
     styles=[_prices, _prices_by_differences],
 )
 
@@ -163,8 +153,8 @@ def _sums_by_rows(rows: Rows, tolerance: float) -> Any:
     return np.sqrt(noise), worst, np.sqrt(quadrature), share
 
 
-ADD_UP = Exercise(
-    name="error_budget.add_up",
+ADD_UP = Exercise.told(
+    "error_budget.add_up",
     build=_build_sums,
     steps={
         "kinds": _sorted,
@@ -191,11 +181,8 @@ ADD_UP = Exercise(
         ([(2.0, 4.0, None, "bias"), (0.8, 0.8, _tilted(30), "noise"),
           (0.5, 5.0, (0.6, 0.0, -0.8), "bias"), (0.4, 0.4, None, "noise")], 0.8),
     ],
-    parts=("the noise", "the worst case", "the quadrature", "the share"),
-    unit="(mm, mm, mm and a share)",
     describe=lambda args: "; ".join(_row_in_words(row) for row in args[0])
     + f"; tolerance {args[1]:g} mm",
-    show=lambda row: "(" + ", ".join(f"{v:.4g}" for v in np.ravel(row)) + ")",
     styles=[_sums_by_rows],
 )  # fmt: skip
 

@@ -64,13 +64,17 @@ class Mistake:
 class Core:
     """The part of an exercise that comes first, where the rest may wait.
 
-    of(args) is a case without the rest; the cases that it leaves as they are belong to the core.
+    It uses the first so many `arguments`; the cases that have no more belong to it.
     The verdict calls them "the cases <which>", and what may wait `rest`.
     """
 
-    of: Callable[[tuple[Any, ...]], tuple[Any, ...]]
+    arguments: int
     which: str
     rest: str
+
+    def of(self, args: tuple[Any, ...]) -> tuple[Any, ...]:
+        """A case without the rest."""
+        return args[: self.arguments]
 
 
 @dataclass(kw_only=True)
@@ -98,7 +102,7 @@ class Exercise:
     unit: str
     describe: Callable[[tuple[Any, ...]], str]
     show: Callable[[Floats], str]
-    parts: tuple[str, ...] = ()
+    parts: Sequence[str] = ()
     seen: str = ""
     per_row: int = 0
     tolerance: float = 1e-6
@@ -115,6 +119,26 @@ class Exercise:
     _edits: list[list[Mistake]] = field(default_factory=list, init=False, repr=False)
     _alone: list[Exercise] = field(default_factory=list, init=False, repr=False)  # the core
 
+    @classmethod
+    def told(cls, name: str, cases: Sequence[tuple[Any, ...]] = (), **own: Any) -> Exercise:
+        """An exercise of which the lesson's TOML file tells the rest; `cases` follow those there.
+
+        A list there is an array, and a name in a case is what stands under it in [given].
+        """
+        texts = questions.lesson_texts(name.partition(".")[0])
+        facts = dict(texts["exercises"][name.partition(".")[2]])
+
+        def argument(value: Any) -> Any:
+            value = texts["given"][value] if isinstance(value, str) else value
+            return np.array(value) if isinstance(value, list) else value
+
+        written = [tuple(map(argument, case)) for case in facts.pop("cases", ())]
+        if "core" in facts:
+            facts["core"] = Core(**facts["core"])
+        if "show" in facts:
+            facts["show"] = partial(in_digits, facts["show"])
+        return cls(name=name, cases=[*written, *cases], **facts, **own)
+
     @property
     def function(self) -> str:
         """The learner's function's name."""
@@ -127,13 +151,10 @@ class Exercise:
         student reads stands under it in the lesson's TOML file: what is wrong, and a question that
         leads on. Without a step, the wrong one is made of the whole function, and stands alone.
         """
-        texts = self._written("mistakes")
+        texts = questions.lesson_texts(self.name.partition(".")[0])["mistakes"]
         for step, name, instead in wrong:
             says, ask = (" ".join(text.split()) for text in texts[name])
             self.mistakes.append(Mistake(name, says, ask, step, instead, alone or not step))
-
-    def _written(self, table: str) -> dict[str, Any]:
-        return dict(questions.lesson_texts(self.name.partition(".")[0])[table])
 
     def model(self, *mistakes: Mistake) -> Model:
         """The right function with these mistakes built in."""
@@ -542,6 +563,12 @@ class Exercise:
 
     def _say(self, kind: Any, text: str, *lines: str, named: str | None = None) -> Verdict:
         return Verdict(self.name, kind, f"{self.function}: {text}", lines, named)
+
+
+def in_digits(form: str, values: Any) -> str:
+    """Numbers by a format, such as ".3f", or "(.3f)" with brackets around them."""
+    digits = form.strip("()")
+    return form.replace(digits, ", ".join(f"{v:{digits}}" for v in np.ravel(values)))
 
 
 def _has_hole(args: tuple[Any, ...]) -> bool:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from coursekit.arrays import Floats
 from coursekit.geometry import make_transform
-from coursekit.lessons.exercises import Exercise, Model, Step
+from coursekit.lessons.exercises import Exercise, Model, Step, in_digits
 
 Pair = tuple[Floats, Floats]
 
@@ -60,10 +60,6 @@ def _describe_pair(args: tuple[Floats, ...]) -> str:
     return text.format(*places) + end
 
 
-def _vector(T: Floats) -> str:
-    return "(" + ", ".join(f"{v:.3f}" for v in T[:3, 3]) + ")"
-
-
 def _pair_by_halves(gripper_i: Floats, gripper_j: Floats, board_i: Floats, board_j: Floats) -> Any:
     A, B = np.eye(4), np.eye(4)
     A[:3, :3] = gripper_j[:3, :3].T @ gripper_i[:3, :3]
@@ -73,8 +69,8 @@ def _pair_by_halves(gripper_i: Floats, gripper_j: Floats, board_i: Floats, board
     return A, B
 
 
-MOTION_PAIR = Exercise(
-    name="hand_eye.motion_pair",
+MOTION_PAIR = Exercise.told(
+    "hand_eye.motion_pair",
     build=_build_pair,
     steps={
         "read": lambda *poses: poses,
@@ -86,10 +82,10 @@ MOTION_PAIR = Exercise(
         "order": lambda A, B: np.stack([A, B]),
     },
     cases=[_session_pair(0, plain=True), *(_session_pair(seed) for seed in range(1, 5))],
-    parts=("A", "B"),
-    unit="m",
     describe=_describe_pair,
-    show=lambda row: f"translations of A and B {_vector(row[0])} and {_vector(row[1])}",
+    show=lambda row: "translations of A and B {} and {}".format(
+        *(in_digits("(.3f)", T[:3, 3]) for T in row)
+    ),
     styles=[_pair_by_halves],
 )
 
@@ -194,8 +190,8 @@ def _half_by_null_space(R_A: Floats, R_B: Floats, row: int = -1) -> Any:
     return U @ Vt
 
 
-ROTATION_HALF = Exercise(
-    name="hand_eye.rotation_half",
+ROTATION_HALF = Exercise.told(
+    "hand_eye.rotation_half",
     build=_build_half,
     steps={
         "axes": lambda *motions: [Rotation.from_matrix(R).as_rotvec() for R in motions],
@@ -211,7 +207,6 @@ ROTATION_HALF = Exercise(
         _motions(3, 6),
         _motions(4, 20),
     ],
-    unit="(rotation matrix)",
     describe=lambda args: (
         "the arm turns by 60 degrees about x, then by 40 about y; X is a quarter turn about z"
         if np.array_equal(args[0], _quarter_turns()[0])
