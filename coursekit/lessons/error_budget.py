@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from coursekit.arrays import Floats
-from coursekit.lessons.exercises import Exercise, Model, Step
+from coursekit.lessons.exercises import Exercise, Step, Steps
 
 # --- sensitivities ---
 
 
-def _build(steps: Mapping[str, Step]) -> Model:
-    def sensitivities(u: float, Z: float, fx: float, cx: float, depth_error: float) -> Floats:
-        dX_du, dX_dZ = steps["pixel"](u, Z, fx, cx), steps["depth"](u, Z, fx, cx)
-        return steps["order"](dX_du, dX_dZ, steps["leak"](dX_du, dX_dZ, depth_error, Z))
-
-    return sensitivities
+def _sensitivities(
+    steps: Steps, u: float, Z: float, fx: float, cx: float, depth_error: float
+) -> Floats:
+    dX_du, dX_dZ = steps["pixel"](u, Z, fx, cx), steps["depth"](u, Z, fx, cx)
+    return steps["order"](dX_du, dX_dZ, steps["leak"](dX_du, dX_dZ, depth_error, Z))
 
 
 def _prices(u: float, Z: float, fx: float, cx: float, depth_error: float) -> Any:
@@ -39,7 +37,7 @@ def _prices_by_differences(u: float, Z: float, fx: float, cx: float, depth_error
 
 SENSITIVITIES = Exercise.told(
     "error_budget.sensitivities",
-    build=_build,
+    build=_sensitivities,
     steps={
         "pixel": lambda u, Z, fx, cx: Z / fx,
         "depth": lambda u, Z, fx, cx: (u - cx) / fx,
@@ -79,26 +77,20 @@ SENSITIVITIES.add_mistakes(
 Rows = list[tuple[float, float, Any, str]]
 
 
-def _build_sums(steps: Mapping[str, Step]) -> Model:
-    def add_up(rows: Rows, tolerance: float) -> Floats:
-        noise, bias = steps["kinds"](rows)
-        along = steps["along"]
-        noises = [high * steps["noise part"](toward, along) for _, high, toward, _ in noise]
-        most = [steps["most"](low, high, toward) * along(toward) for low, high, toward, _ in bias]
-        squares, others = (
-            [
-                steps["square"](low, high) * steps["part"](toward, along)
-                for low, high, toward, _ in of
-            ]
-            for of in (bias, noise)
-        )
-        variance = steps["rigs"](squares, noises, others)
-        summed = steps["summed"](most, noises)
-        sums = steps["noise"](noises), steps["worst"](summed), steps["quadrature"](summed)
-        sigma = steps["sigma"](variance, most)
-        return steps["order"](*sums, steps["share"](tolerance / sigma if sigma else math.inf))
-
-    return add_up
+def _add_up(steps: Steps, rows: Rows, tolerance: float) -> Floats:
+    noise, bias = steps["kinds"](rows)
+    along = steps["along"]
+    noises = [high * steps["noise part"](toward, along) for _, high, toward, _ in noise]
+    most = [steps["most"](low, high, toward) * along(toward) for low, high, toward, _ in bias]
+    squares, others = (
+        [steps["square"](low, high) * steps["part"](toward, along) for low, high, toward, _ in of]
+        for of in (bias, noise)
+    )
+    variance = steps["rigs"](squares, noises, others)
+    summed = steps["summed"](most, noises)
+    sums = steps["noise"](noises), steps["worst"](summed), steps["quadrature"](summed)
+    sigma = steps["sigma"](variance, most)
+    return steps["order"](*sums, steps["share"](tolerance / sigma if sigma else math.inf))
 
 
 def _sorted(rows: Rows) -> tuple[Rows, Rows]:
@@ -155,7 +147,7 @@ def _sums_by_rows(rows: Rows, tolerance: float) -> Any:
 
 ADD_UP = Exercise.told(
     "error_budget.add_up",
-    build=_build_sums,
+    build=_add_up,
     steps={
         "kinds": _sorted,
         "along": _along,

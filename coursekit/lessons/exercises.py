@@ -38,6 +38,7 @@ from coursekit.lessons import questions
 from coursekit.lessons.questions import Verdict
 
 Step = Callable[..., Any]
+Steps = Mapping[str, Step]
 Model = Callable[..., Any]
 
 
@@ -81,7 +82,7 @@ class Core:
 class Exercise:
     """A function the learner writes, and all that is known about getting it wrong.
 
-    build(steps) returns the model that uses these steps. Cases go from small to large, and the
+    build(steps, *args) is the model that uses these steps. Cases go from small to large, and the
     first one that fails is shown: `describe(args)` and `show(row)` put it into words. Where a
     result has rows and the first `per_row` arguments have the same, one row of them is shown;
     otherwise (a result that is one number, say) the whole case. parts: what the columns of a
@@ -96,7 +97,7 @@ class Exercise:
     """
 
     name: str
-    build: Callable[[Mapping[str, Step]], Model]
+    build: Model
     steps: dict[str, Step]
     cases: list[tuple[Any, ...]]
     unit: str
@@ -158,7 +159,7 @@ class Exercise:
 
     def model(self, *mistakes: Mistake) -> Model:
         """The right function with these mistakes built in."""
-        model = self.build(self.steps | {m.step: m.wrong for m in mistakes if m.step})
+        model = partial(self.build, self.steps | {m.step: m.wrong for m in mistakes if m.step})
         for mistake in mistakes:
             model = model if mistake.step else mistake.wrong(model)
         return model
@@ -696,7 +697,7 @@ def _all_edits(exercise: Exercise) -> tuple[list[Mistake], list[Mistake], list[M
         return seen[name][1]
 
     split = partial(_split, exercise)
-    result = split(exercise.build({name: partial(watched, name) for name in steps})(*args))
+    result = split(exercise.build({name: partial(watched, name) for name in steps}, *args))
     inputs = [f"`{name}`" for name in inspect.signature(exercise.model()).parameters]
     rewritten = [(name, edit) for name, step in steps.items() for edit in _rewritten(step)]
     found: list[tuple[str, str, str, Step]] = []

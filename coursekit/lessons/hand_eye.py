@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from coursekit.arrays import Floats
 from coursekit.geometry import make_transform
-from coursekit.lessons.exercises import Exercise, Model, Step, in_digits
+from coursekit.lessons.exercises import Exercise, Step, Steps, in_digits
 
 Pair = tuple[Floats, Floats]
 
@@ -23,19 +23,13 @@ def _pose(rng: np.random.Generator, reach_m: float = 0.5) -> Floats:
 # --- motion_pair ---
 
 
-def _build_pair(steps: Mapping[str, Step]) -> Model:
-    def motion_pair(
-        gripper_i: Floats, gripper_j: Floats, board_i: Floats, board_j: Floats
-    ) -> Floats:
-        gripper_i, gripper_j, board_i, board_j = steps["read"](
-            gripper_i, gripper_j, board_i, board_j
-        )
-        invert = steps["inverse"]
-        A = steps["A"](*steps["A pair"](gripper_i, gripper_j), invert)
-        B = steps["B"](*steps["B pair"](board_i, board_j), invert)
-        return steps["order"](A, B)
-
-    return motion_pair
+def _motion_pair(
+    steps: Steps, gripper_i: Floats, gripper_j: Floats, board_i: Floats, board_j: Floats
+) -> Floats:
+    i, j, seen_i, seen_j = steps["read"](gripper_i, gripper_j, board_i, board_j)
+    A = steps["A"](*steps["A pair"](i, j), steps["inverse"])
+    B = steps["B"](*steps["B pair"](seen_i, seen_j), steps["inverse"])
+    return steps["order"](A, B)
 
 
 def _session_pair(seed: int, plain: bool = False) -> tuple[Floats, ...]:
@@ -71,7 +65,7 @@ def _pair_by_halves(gripper_i: Floats, gripper_j: Floats, board_i: Floats, board
 
 MOTION_PAIR = Exercise.told(
     "hand_eye.motion_pair",
-    build=_build_pair,
+    build=_motion_pair,
     steps={
         "read": lambda *poses: poses,
         "inverse": np.linalg.inv,
@@ -144,11 +138,8 @@ def _turn(a: Floats, b: Floats) -> Floats:
     return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
 
 
-def _build_half(steps: Mapping[str, Step]) -> Model:
-    def rotation_half(R_A: Floats, R_B: Floats) -> Floats:
-        return steps["result"](steps["turn"](*steps["used"](*steps["axes"](R_A, R_B))))
-
-    return rotation_half
+def _rotation_half(steps: Steps, R_A: Floats, R_B: Floats) -> Floats:
+    return steps["result"](steps["turn"](*steps["used"](*steps["axes"](R_A, R_B))))
 
 
 def _motions(seed: int, n: int, parallel: bool = False) -> Pair:
@@ -192,7 +183,7 @@ def _half_by_null_space(R_A: Floats, R_B: Floats, row: int = -1) -> Any:
 
 ROTATION_HALF = Exercise.told(
     "hand_eye.rotation_half",
-    build=_build_half,
+    build=_rotation_half,
     steps={
         "axes": lambda *motions: [Rotation.from_matrix(R).as_rotvec() for R in motions],
         "used": lambda a, b: (a, b),

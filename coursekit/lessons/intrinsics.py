@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from coursekit.arrays import Floats
-from coursekit.lessons.exercises import Exercise, Model, Step
+from coursekit.lessons.exercises import Exercise, Steps
 
 # --- reprojection_rms ---
 
 
-def _build_rms(steps: Mapping[str, Step]) -> Model:
-    def reprojection_rms(observed: Floats, predicted: Floats) -> Floats:
-        residuals = steps["difference"](observed, predicted)
-        axes = steps["axis"](residuals)
-        both = steps["both"](residuals, axes)
-        result = steps["order"](steps["shown"](residuals, axes), both)
-        return steps["whole"](residuals, result)
-
-    return reprojection_rms
+def _reprojection_rms(steps: Steps, observed: Floats, predicted: Floats) -> Floats:
+    residuals = steps["difference"](observed, predicted)
+    axes = steps["axis"](residuals)
+    both = steps["both"](residuals, axes)
+    result = steps["order"](steps["shown"](residuals, axes), both)
+    return steps["whole"](residuals, result)
 
 
 def _corners(seed: int, n: int, spread: tuple[float, float], offset: float) -> tuple[Any, ...]:
@@ -61,7 +57,7 @@ def _rms_by_rows(observed: Floats, predicted: Floats) -> Any:
 
 REPROJECTION_RMS = Exercise.told(
     "intrinsics.reprojection_rms",
-    build=_build_rms,
+    build=_reprojection_rms,
     steps={
         "difference": lambda observed, predicted: observed - predicted,
         "axis": lambda residuals: np.sqrt(np.mean(residuals**2, axis=0)),
@@ -128,13 +124,10 @@ REPROJECTION_RMS.add_mistakes(
 # --- focal_sigma ---
 
 
-def _build_sigma(steps: Mapping[str, Step]) -> Model:
-    def focal_sigma(J: Floats, residuals: Floats) -> Any:
-        noise = steps["noise"](residuals, steps["freedom"](J, residuals))
-        first = steps["first"](steps["information"](J))
-        return steps["root"](steps["scale"](noise, first))
-
-    return focal_sigma
+def _focal_sigma(steps: Steps, J: Floats, residuals: Floats) -> Any:
+    noise = steps["noise"](residuals, steps["freedom"](J, residuals))
+    first = steps["first"](steps["information"](J))
+    return steps["root"](steps["scale"](noise, first))
 
 
 def _least_squares(seed: int, rows: int, columns: int, sigma: float) -> tuple[Floats, Floats]:
@@ -166,7 +159,7 @@ def _sigma_by_pinv(J: Floats, residuals: Floats) -> Any:
 
 FOCAL_SIGMA = Exercise.told(
     "intrinsics.focal_sigma",
-    build=_build_sigma,
+    build=_focal_sigma,
     steps={
         "freedom": lambda J, residuals: J.shape[0] - J.shape[1],
         "noise": lambda residuals, freedom: residuals @ residuals / freedom,  # a variance

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from coursekit.arrays import Floats
-from coursekit.lessons.exercises import Exercise, Model, Step, in_digits
+from coursekit.lessons.exercises import Exercise, Step, Steps, in_digits
 
 # --- project ---
 
@@ -61,17 +60,14 @@ def _image(points: Floats, normalise: Step, bend: Step, to_pixels: Step) -> Any:
     return to_pixels(*bend(x, y), w)
 
 
-def _build_project(steps: Mapping[str, Step]) -> Model:
-    def project(points: Floats, K: Floats, dist: Floats | None = None) -> Any:
-        def bend(x: Floats, y: Floats) -> Any:
-            return (x, y) if dist is None else steps["bend"](x, y, *steps["read"](*dist))
+def _project(steps: Steps, points: Floats, K: Floats, dist: Floats | None = None) -> Any:
+    def bend(x: Floats, y: Floats) -> Any:
+        return (x, y) if dist is None else steps["bend"](x, y, *steps["read"](*dist))
 
-        def to_pixels(x: Floats, y: Floats, w: Any) -> Any:
-            return steps["to_pixels"](x, y, w, *steps["lens"](*_lens(K)))
+    def to_pixels(x: Floats, y: Floats, w: Any) -> Any:
+        return steps["to_pixels"](x, y, w, *steps["lens"](*_lens(K)))
 
-        return steps["columns"](*steps["image"](points.T, steps["normalise"], bend, to_pixels))
-
-    return project
+    return steps["columns"](*steps["image"](points.T, steps["normalise"], bend, to_pixels))
 
 
 def _describe_camera(K: Floats, dist: Floats | None = None) -> str:
@@ -88,7 +84,7 @@ def _describe_project(args: tuple[Any, ...]) -> str:
 
 PROJECT = Exercise.told(
     "pinhole.project",
-    build=_build_project,
+    build=_project,
     steps={
         "lens": lambda fx, fy, cx, cy: (fx, fy, cx, cy),
         "normalise": lambda X, Y, Z: (X / Z, Y / Z, 1.0),
@@ -206,15 +202,14 @@ def _scale(x: Floats, y: Floats, w: Any, depth: Floats) -> Any:
     return x * depth, y * depth, w * depth
 
 
-def _build_deproject(steps: Mapping[str, Step]) -> Model:
-    def deproject(pixels: Floats, depth: Floats, K: Floats, dist: Floats | None = None) -> Any:
-        x, y, w = steps["rays"](*pixels.T, *steps["lens"](*_lens(K)))
-        if dist is not None:
-            read = steps["read"](*dist)
-            x, y = steps["unbend"](x, y, lambda x, y: steps["bend"](x, y, *read), *read)
-        return steps["points"](*steps["scale"](x, y, w, depth))
-
-    return deproject
+def _deproject(
+    steps: Steps, pixels: Floats, depth: Floats, K: Floats, dist: Floats | None = None
+) -> Any:
+    x, y, w = steps["rays"](*pixels.T, *steps["lens"](*_lens(K)))
+    if dist is not None:
+        read = steps["read"](*dist)
+        x, y = steps["unbend"](x, y, lambda x, y: steps["bend"](x, y, *read), *read)
+    return steps["points"](*steps["scale"](x, y, w, depth))
 
 
 def _describe_deproject(args: tuple[Any, ...]) -> str:
@@ -226,7 +221,7 @@ def _describe_deproject(args: tuple[Any, ...]) -> str:
 
 DEPROJECT = Exercise.told(
     "pinhole.deproject",
-    build=_build_deproject,
+    build=_deproject,
     steps={
         "lens": PROJECT.steps["lens"],
         "rays": _to_normalised,
