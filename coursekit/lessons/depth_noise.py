@@ -10,7 +10,7 @@ import numpy as np
 
 from coursekit.arrays import Floats
 from coursekit.lessons import questions
-from coursekit.lessons.exercises import Exercise, Model, Step, Steps
+from coursekit.lessons.exercises import Exercise, Step, Steps
 from coursekit.specifications import device
 
 Bounds = tuple[int, int, int, int]  # first row, the one after the last; the same for columns
@@ -49,16 +49,16 @@ DEPTH_NOISE = Exercise.told(
 )
 
 
-def _difference(divisor: Step) -> Step:
+def _difference(of_part: tuple[float, int]) -> Step:
     """fx B / (d - sigma_d) - Z; Z - fx B / (d + sigma_d); half of the two together; and the same
-    with half of sigma_d to each side: divisor(what part of Z the noise is) tells which.
+    with half of sigma_d to each side: the factor and the power of what part of Z the noise is.
     """
-    return lambda slope, sigma_d, Z: slope * sigma_d / divisor(slope * sigma_d / Z)
+    factor, power = of_part
+    return lambda slope, sigma_d, Z: slope * sigma_d / (1 + factor * (slope * sigma_d / Z) ** power)
 
 
 DEPTH_NOISE.add_mistakes(
-    ("power", "linear_in_Z", lambda Z: Z),
-    ("power", "linear_in_Z", lambda Z: 2 * Z),
+    ("power", "linear_in_Z", lambda Z: Z, lambda Z: 2 * Z),
     ("", "depth_for_slope", lambda _: lambda Z, fx, baseline, sigma_d: Z * sigma_d),
     ("power", "cubed", lambda Z: Z**3),
     ("constant", "baseline_forgotten", lambda fx, baseline: fx),
@@ -72,10 +72,7 @@ DEPTH_NOISE.add_mistakes(
     ("divide", "upside_down", lambda power, constant: constant / power),
     ("noise", "noise_divided", lambda slope, sigma_d, Z: slope / sigma_d),
     ("noise", "noise_forgotten", lambda slope, sigma_d, Z: slope),
-    ("noise", "difference", _difference(lambda part: 1 - part)),
-    ("noise", "difference", _difference(lambda part: 1 + part)),
-    ("noise", "difference", _difference(lambda part: 1 - part**2)),
-    ("noise", "difference", _difference(lambda part: 1 - (part / 2) ** 2)),
+    ("noise", "difference", *map(_difference, ((-1, 1), (1, 1), (-1, 2), (-1 / 4, 2)))),
     ("result", "negative", lambda sigma: -sigma),
     ("", "disparity", lambda law: lambda Z, fx, baseline, sigma_d: fx * baseline / Z),
 )
@@ -210,11 +207,8 @@ ROBUST_DEPTH.add_mistakes(
     ("window", "last_missing", lambda *at: np.subtract(_window(*at), (0, 1, 0, 1))),
     ("window", "half_ignored", lambda row, column, half: _window(row, column, 2)),
     ("window", "half_halved", lambda row, column, half: _window(row, column, half // 2)),
-    ("shortcut", "pixel_alone", _pixel_alone),
-    ("shortcut", "pixel_alone", _pixel_alone_if_valid),
-    ("shortcut", "pixel_alone", _pixel_alone_if_positive),
-    ("cut", "negative_index", _cut(_as_they_come)),
-    ("cut", "negative_index", _cut(_as_they_come, _inside)),
+    ("shortcut", "pixel_alone", _pixel_alone, _pixel_alone_if_valid, _pixel_alone_if_positive),
+    ("cut", "negative_index", _cut(_as_they_come), _cut(_as_they_come, _inside)),
     ("cut", "negative_index", _cut(_inside, _as_they_come)),
     ("cut", "negative_index", _cut(lambda a, b, size: np.arange(a, min(b, size)))),
     ("cut", "negative_end", _cut(lambda a, b, size: slice(max(a, 0), b))),
@@ -228,8 +222,7 @@ ROBUST_DEPTH.add_mistakes(
     ("cut", "height_width_swapped", _height_width_swapped),
     ("cut", "border_refused", _cut(lambda a, b, size: slice(a, b if a >= 0 and b <= size else a))),
     ("zeros", "zeros_counted", lambda pixels: pixels),
-    ("finite", "nan_counted", lambda pixels: pixels),
-    ("finite", "nan_counted", lambda pixels: pixels[~np.isinf(pixels)]),
+    ("finite", "nan_counted", lambda pixels: pixels, lambda pixels: pixels[~np.isinf(pixels)]),
     ("finite", "infinity_counted", lambda pixels: pixels[~np.isnan(pixels)]),
     ("enough", "min_valid_ignored", lambda valid, pixels, min_valid: True),
     ("enough", "min_valid_fixed", lambda valid, pixels, min_valid: len(valid) >= 5),
@@ -353,25 +346,17 @@ TABLE_ROW = Exercise.told(
 )
 
 
-def _mismatches_invalid(row: Model) -> Model:
-    def part(c: Floats) -> Any:
-        return np.isnan(_left_out(np.where(c, c, np.nan))).mean()
-
-    return lambda c, *at: np.r_[row(c, *at)[:2], part(c)]
+def _instead(at: int, part: Step) -> Step:
+    """Another way to one part of the whole result."""
+    return lambda right: lambda *args: np.r_[right(*args)[:at], part(*args), right(*args)[at + 1 :]]
 
 
-def _wraps_round(row: Model) -> Model:
-    def bias(c: Any, scale: float, distance: float) -> Any:
-        return 1e3 * scale * np.mean(c[c > 0] - np.uint16(distance / scale))
-
-    return lambda *args: np.r_[bias(*args), row(*args)[1:]]
+def _bias_wrapped(c: Any, scale: float, distance: float) -> Any:
+    return 1e3 * scale * np.mean(c[c > 0] - np.uint16(distance / scale))
 
 
-def _about_the_distance(row: Model) -> Model:
-    def std(c: Any, scale: float, distance: float) -> Any:
-        return 1e3 * np.sqrt(np.nanmean((np.where(c > 0, scale * c, np.nan) - distance) ** 2))
-
-    return lambda *args: np.array([row(*args)[0], std(*args), row(*args)[2]])
+def _about_the_distance(c: Any, scale: float, distance: float) -> Any:
+    return 1e3 * np.sqrt(np.nanmean((np.where(c > 0, scale * c, np.nan) - distance) ** 2))
 
 
 # Tried two at a time are only these steps': with eight ways to be right, all would take too long.
@@ -399,22 +384,16 @@ TABLE_ROW.add_mistakes(
     ("std", "over_space", lambda z: np.nanmean(np.nanstd(z, axis=(1, 2)))),
     ("std", "over_space", lambda z: np.nanstd(np.nanmean(z, axis=0))),
     ("std", "over_space", lambda z: np.nanstd(np.nanmean(z, axis=0), ddof=1)),
-    ("std", "over_everything", np.nanstd),
-    ("std", "over_everything", lambda z: np.nanstd(z, ddof=1)),
+    ("std", "over_everything", np.nanstd, lambda z: np.nanstd(z, ddof=1)),
     ("bias", "distance_in_metres", lambda level, distance: level - distance / 1e3),
-    ("", "about_the_distance", _about_the_distance),
-    ("keep", "mixed_treatment", lambda z: (_left_out(z), z)),
-    ("keep", "mixed_treatment", lambda z: (z, _left_out(z))),
+    ("", "about_the_distance", _instead(1, _about_the_distance)),
+    ("keep", "mixed_treatment", lambda z: (_left_out(z), z), lambda z: (z, _left_out(z))),
     ("keep", "median_of_all", lambda z: (_left_out(z, None),) * 2),
     ("keep", "steady_only", lambda z: (_steady(z),) * 2),
     ("std", "steady_only", lambda z: _pooled(_steady(z))),
-    ("", "mismatches_invalid", _mismatches_invalid),
-    ("", "wraps_round", _wraps_round),
-    (
-        "depth",
-        "wraps_round",
-        lambda c, step: np.where(c, c * np.uint16(1000) * (step / 1e3), np.nan),
-    ),
+    ("invalid", "mismatches_invalid", lambda c: np.isnan(_left_out(np.where(c, c, np.nan))).mean()),
+    ("", "wraps_round", _instead(0, _bias_wrapped)),
+    ("depth", "wraps_round", lambda c, mm: np.where(c, c * np.uint16(1000) * (mm / 1e3), np.nan)),
     ("std", "over_space", lambda z: np.sqrt(np.nanmean(np.nanvar(z, axis=1, ddof=1)))),
     ("std", "over_space", lambda z: np.sqrt(np.nanmean(np.nanvar(z, axis=2, ddof=1)))),
     ("std", "median_deviation", lambda z: 1.4826 * np.nanmedian(abs(z - np.nanmedian(z, axis=0)))),
@@ -519,7 +498,7 @@ def _samples_independent(z: Floats) -> Floats:
 
 def _of_every_frame(spread: Step) -> Step:
     """The bias's ± as if each frame had patches of its own, which scatter by so much."""
-    return lambda errors: lambda z: np.array([12 * spread(z) / math.sqrt(z.size), errors(z)[1]])
+    return _instead(0, lambda z: 12 * spread(z) / math.sqrt(z.size))
 
 
 STANDARD_ERRORS.add_mistakes(
@@ -554,8 +533,7 @@ STANDARD_ERRORS.add_mistakes(
     ("pooled", "divided_by_n", lambda z: np.sqrt(np.nanmean(_variances(z, 0)))),
     ("pooled", "variance_pooled", lambda z: np.nanmean(_variances(z))),
     ("pooled", "stds_averaged", lambda z: np.nanmean(np.sqrt(_variances(z)))),
-    ("pooled", "over_everything", np.nanstd),
-    ("pooled", "over_everything", lambda z: np.nanstd(z, ddof=1)),
+    ("pooled", "over_everything", np.nanstd, lambda z: np.nanstd(z, ddof=1)),
     ("pooled", "nan_spreads", lambda z: np.sqrt(np.mean(np.var(z, axis=0, ddof=1)))),
     ("", "nan_spreads", lambda f: lambda z: f(z) * np.where(np.isnan(z).any(), np.nan, 1)),
 )

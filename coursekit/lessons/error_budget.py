@@ -52,11 +52,7 @@ SENSITIVITIES = Exercise.told(
 
 
 SENSITIVITIES.add_mistakes(
-    (
-        "leak",
-        "whole_shift",
-        lambda dX_du, dX_dZ, depth_error, Z: depth_error * math.hypot(1, dX_dZ),
-    ),
+    ("leak", "whole_shift", lambda dX_du, dX_dZ, off, Z: off * math.hypot(1, dX_dZ)),
     ("pixel", "distance_forgotten", lambda u, Z, fx, cx: 1 / fx),
     ("pixel", "not_differentiated", lambda u, Z, fx, cx: (u - cx) * Z / fx),
     ("depth", "not_differentiated", lambda u, Z, fx, cx: (u - cx) * Z / fx),
@@ -100,6 +96,10 @@ def _sorted(rows: Rows) -> tuple[Rows, Rows]:
 
 def _along(toward: Any) -> float:
     return 1.0 if toward is None else abs(toward[0])
+
+
+def _third_along(toward: Any) -> float:
+    return 3**-0.5 if toward is None else _along(toward)
 
 
 def _part(toward: Any, along: Step, third: float = 1 / 3) -> float:
@@ -187,8 +187,7 @@ def _row_in_words(row: tuple[float, float, Any, str]) -> str:
 
 ADD_UP.add_mistakes(
     ("kinds", "kinds_exchanged", lambda rows: _sorted(rows)[::-1]),
-    ("kinds", "noise_in_the_bias", lambda rows: (_sorted(rows)[0], rows)),
-    ("kinds", "noise_in_the_bias", lambda rows: ([], rows)),
+    ("kinds", "noise_in_the_bias", lambda rows: (_sorted(rows)[0], rows), lambda rows: ([], rows)),
     ("kinds", "kind_ignored", lambda rows: (rows, rows)),
     ("", "first_row_only", lambda sums: lambda rows, tolerance: sums(rows[:1], tolerance)),
     ("noise part", "noise_shared_out", lambda way, along: along(way) if way else 3**-0.5),
@@ -198,12 +197,8 @@ ADD_UP.add_mistakes(
     ("along", "direction_sign", lambda toward: 1.0 if toward is None else toward[0]),
     ("along", "other_axis", lambda toward: 1.0 if toward is None else abs(toward[1])),
     ("along", "any_way_nothing", lambda toward: 0.0 if toward is None else abs(toward[0])),
-    (
-        "most",
-        "third_of_the_worst",
-        lambda low, high, toward: high * (3**-0.5 if toward is None else abs(toward[0])),
-    ),
-    ("along", "third_of_the_worst", lambda toward: 3**-0.5 if toward is None else abs(toward[0])),
+    ("most", "third_of_the_worst", lambda low, high, toward: high * _third_along(toward)),
+    ("along", "third_of_the_worst", _third_along),
     ("most", "least_for_most", lambda low, high, toward: low),
     ("most", "middle_for_most", lambda low, high, toward: (low + high) / 2),
     ("noise", "noise_added", sum),
@@ -224,12 +219,8 @@ ADD_UP.add_mistakes(
     ("part", "half_for_third", lambda toward, along: _part(toward, along, 0.5)),
     ("part", "third_for_all", lambda toward, along: 1 / 3),
     ("part", "not_squared", lambda toward, along: 1 / 3 if toward is None else along(toward)),
-    (
-        "rigs",
-        "noise_in_the_share",
-        lambda squares, noises, others: sum(squares) + _root(noises) ** 2,
-    ),
-    ("rigs", "noise_in_the_share", lambda squares, noises, others: sum(squares) + sum(others)),
+    ("rigs", "noise_in_the_share", lambda squares, noise, _: sum(squares) + _root(noise) ** 2),
+    ("rigs", "noise_in_the_share", lambda squares, noise, others: sum(squares) + sum(others)),
     ("sigma", "variance_for_sigma", lambda variance, most: variance),
     ("sigma", "quadrature_for_sigma", lambda variance, most: _root(most)),
     ("sigma", "quadrature_over_root_3", lambda variance, most: _root(most) / 3**0.5),

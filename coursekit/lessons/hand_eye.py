@@ -101,12 +101,9 @@ for _step in ("A", "B"):
         (_step, "product_inverted", lambda i, j, inverse: inverse(j @ i)),
         (_step, "product_inverted", lambda i, j, inverse: inverse(i @ j)),
         (_step, "elementwise", lambda i, j, inverse: inverse(j) * i),
-        (_step, "elementwise", lambda i, j, inverse: j * inverse(i)),
-        (_step, "elementwise", lambda i, j, inverse: j * i),
-        (_step, "subtracted", lambda i, j, inverse: j - i),
-        (_step, "subtracted", lambda i, j, inverse: i - j),
-        (_step, "places_subtracted", _places_subtracted(_motion, 1)),
-        (_step, "places_subtracted", _places_subtracted(_motion, -1)),
+        (_step, "elementwise", lambda i, j, inverse: j * inverse(i), lambda i, j, _: j * i),
+        (_step, "subtracted", lambda i, j, inverse: j - i, lambda i, j, inverse: i - j),
+        (_step, "places_subtracted", *(_places_subtracted(_motion, sign) for sign in (1, -1))),
     )
 MOTION_PAIR.add_mistakes(
     ("read", "gripper_twice", lambda gi, gj, bi, bj: (gi, gj, gi, gj)),
@@ -222,6 +219,10 @@ def _same_frame(A: Floats, B: Floats) -> Floats:
     return np.asarray((A @ np.swapaxes(B, 1, 2)).mean(axis=0))
 
 
+def _mean_turn(R: Floats) -> Floats:
+    return np.asarray(Rotation.from_matrix(R).mean().as_matrix())
+
+
 def _kabsch(product: Callable[[Floats, Floats, Floats], Floats]) -> Step:
     """Kabsch's method with another product of U, V^T and the matrix that makes it a rotation."""
 
@@ -237,8 +238,7 @@ def _kabsch(product: Callable[[Floats, Floats, Floats], Floats]) -> Step:
 ROTATION_HALF.add_mistakes(
     ("result", "inverse_of_x", lambda R: R.T),
     ("turn", "not_a_rotation", lambda a, b: np.linalg.lstsq(b, a, rcond=None)[0].T),
-    ("turn", "not_a_rotation", lambda a, b: a.T @ b),
-    ("turn", "not_a_rotation", lambda a, b: a.T @ b / len(a)),
+    ("turn", "not_a_rotation", lambda a, b: a.T @ b, lambda a, b: a.T @ b / len(a)),
     ("used", "first_motion_only", lambda a, b: (a[:1], b[:1])),
     ("result", "negative", lambda R: -R),
     ("used", "mean_taken_off", lambda a, b: (a - a.mean(axis=0), b - b.mean(axis=0))),
@@ -253,15 +253,11 @@ ROTATION_HALF.add_mistakes(
     ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: U.T @ D @ Vt)),
     ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: Vt @ U.T)),
     ("axes", "axis_without_sign", _no_signs),
-    *(("axes", "one_sign", _flipped(signs)) for signs in 1 - 2 * np.eye(3)),
+    ("axes", "one_sign", *map(_flipped, 1 - 2 * np.eye(3))),
     ("", "same_frame", lambda _: lambda A, B: A[0] @ B[0].T),
     ("", "largest_singular", lambda _: lambda A, B: _half_by_null_space(A, B, 0)),
     ("", "same_frame", lambda _: _same_frame),
     ("", "same_frame", lambda _: lambda *AB: Rotation.from_matrix(_same_frame(*AB)).as_matrix()),
     ("", "same_frame", lambda _: lambda A, B: _same_frame(*np.swapaxes([A, B], 2, 3))),
-    (
-        "",
-        "same_frame",
-        lambda _: lambda A, B: Rotation.from_matrix(np.swapaxes(A, 1, 2) @ B).mean().as_matrix(),
-    ),
+    ("", "same_frame", lambda _: lambda A, B: _mean_turn(np.swapaxes(A, 1, 2) @ B)),
 )

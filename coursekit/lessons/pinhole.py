@@ -132,7 +132,7 @@ def _bent_last_about_the_centre(
 
 
 # What goes wrong in this exercise and in the next.
-_CAMERA: list[tuple[str, str, Step]] = [
+_CAMERA: list[tuple[str, str, *tuple[Step, ...]]] = [
     ("lens", "y_up", lambda fx, fy, cx, cy: (fx, -fy, cx, cy)),
     ("lens", "fx_fy_swapped", lambda fx, fy, cx, cy: (fy, fx, cx, cy)),
     ("lens", "fx_for_both", lambda fx, fy, cx, cy: (fx, fx, cx, cy)),
@@ -145,20 +145,14 @@ _CAMERA: list[tuple[str, str, Step]] = [
     ("read", "k3_before_p1", lambda k1, k2, p1, p2, k3: (k1, k2, p2, k3, p1)),
     ("read", "r6_missing", lambda k1, k2, p1, p2, k3: (k1, k2, p1, p2, 0.0)),
     ("read", "tangential_missing", lambda k1, k2, p1, p2, k3: (k1, k2, 0.0, 0.0, k3)),
-    ("bend", "factor_2_missing", _bent(cross=1)),
-    ("bend", "factor_2_missing", _bent(square=1)),
-    ("bend", "factor_2_missing", _bent(cross=1, square=1)),
+    ("bend", "factor_2_missing", _bent(cross=1), _bent(square=1), _bent(cross=1, square=1)),
     ("bend", "x_overwritten", _x_overwritten),
     ("bend", "tangential_after_radial", _tangential_after_radial),
-    ("bend", "r_for_r2", _bent((0.5, 1, 1.5))),
-    ("bend", "r_for_r2", _bent((0.5, 1, 1.5), tangential=0.5)),
-    ("bend", "r2_for_r", _bent((2, 4, 6))),
-    ("bend", "r2_for_r", _bent((2, 4, 6), tangential=2)),
-    ("bend", "r2_for_r", _bent((1, 4, 6))),
+    ("bend", "r_for_r2", _bent((0.5, 1, 1.5)), _bent((0.5, 1, 1.5), tangential=0.5)),
+    ("bend", "r2_for_r", _bent((2, 4, 6)), _bent((2, 4, 6), tangential=2), _bent((1, 4, 6))),
 ]
 PROJECT.add_mistakes(
-    ("normalise", "no_division", lambda X, Y, Z: (X, Y, 1.0)),
-    ("normalise", "no_division", lambda X, Y, Z: (X, Y, Z)),
+    ("normalise", "no_division", lambda X, Y, Z: (X, Y, 1.0), lambda X, Y, Z: (X, Y, Z)),
     ("normalise", "divided_by_range", lambda *P: (*(P[:2] / np.linalg.norm(P, axis=0)), 1.0)),
     ("normalise", "centre_divided", lambda X, Y, Z: (X / Z, Y / Z, 1.0 / Z)),
     ("normalise", "upside_down", lambda X, Y, Z: (Z / X, Z / Y, 1.0)),
@@ -169,8 +163,7 @@ PROJECT.add_mistakes(
     *_CAMERA,
     ("bend", "one_missing", lambda x, y, *dist: np.subtract(_bend(x, y, *dist), (x, y))),
     ("image", "bent_before_division", _bent_first),
-    ("image", "distortion_in_pixels", _bent_last),
-    ("image", "distortion_in_pixels", _bent_last_about_the_centre),
+    ("image", "distortion_in_pixels", _bent_last, _bent_last_about_the_centre),
 )
 
 
@@ -285,8 +278,7 @@ def _along_the_ray(x: Floats, y: Floats, w: Any, depth: Floats) -> Any:
 DEPROJECT.add_mistakes(
     ("rays", "inverse_missing", lambda u, v, *lens: (*_to_pixels(u, v, 1.0, *lens), 1.0)),
     ("rays", "input_swapped", lambda u, v, *lens: _to_normalised(v, u, *lens)),
-    ("rays", "inverse_transposed", _from_the_wrong_side),
-    ("rays", "inverse_transposed", _from_the_wrong_side_scaled),
+    ("rays", "inverse_transposed", _from_the_wrong_side, _from_the_wrong_side_scaled),
     ("lens", "principal_point_added", lambda fx, fy, cx, cy: (fx, fy, -cx, -cy)),
     ("lens", "brackets_missing", lambda fx, fy, cx, cy: (1.0, 1.0, cx / fx, cy / fy)),
     ("lens", "times_focal_length", lambda fx, fy, cx, cy: (1 / fx, 1 / fy, cx, cy)),
@@ -297,8 +289,7 @@ DEPROJECT.add_mistakes(
     ("scale", "not_scaled", lambda x, y, w, depth: (x, y, w * depth)),
     ("scale", "divided_by_depth", lambda x, y, w, depth: (x / depth, y / depth, w * depth)),
     ("unbend", "distorted_again", lambda x, y, bend, *dist: bend(x, y)),
-    ("unbend", "one_step", _iterate(1)),
-    ("unbend", "one_step", _divide(1)),
+    ("unbend", "one_step", _iterate(1), _divide(1)),
 )
 
 # With more rounds than these, all cases agree. Of each long family a few are tried in pairs, too.
@@ -308,5 +299,5 @@ for _name, _family, _every, _in_pairs in (
     ("target_overwritten", _overwritten, (*range(2, 51), 100), (5, 10, 20, 50)),
 ):
     for _rounds in _every:
-        _mistake = ("unbend", _name, _family(_rounds))
-        DEPROJECT.add_mistakes(_mistake, alone=_rounds not in _in_pairs)
+        _alone = _rounds not in _in_pairs
+        DEPROJECT.add_mistakes(("unbend", _name, _family(_rounds)), alone=_alone)
