@@ -5,8 +5,6 @@ everything else right (hashes and checksums too), so that what refuses them is t
 are about.
 """
 
-from __future__ import annotations
-
 import bz2
 import hashlib
 import io

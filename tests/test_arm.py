@@ -1,7 +1,5 @@
 """The arm against its maker's own parameters, SciPy, numerical derivatives and Monte Carlo."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The same tests for the simulated camera and a recording of it, then what is special to each."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from common import NIGHTLY

@@ -1,7 +1,5 @@
 """A live RealSense, played by a fake of the vendor's module: no test machine has one."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from common import EXPECTED

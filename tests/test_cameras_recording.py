@@ -1,7 +1,5 @@
 """Recordings: what is written is what is read, and every bad file ends in words of advice."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import shutil

@@ -4,8 +4,6 @@ The stub plays a hand that carries the board from pose to pose, so that stillnes
 from motion in pictures, not in made-up numbers.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import pickle

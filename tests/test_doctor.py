@@ -1,7 +1,5 @@
 """`coursekit doctor`: each fault has its line and its remedy, and none stops the rest."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import re

@@ -1,7 +1,5 @@
 """Hand-eye: closed forms, OpenCV's solvers, the pose of a board, observability, the next pose."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

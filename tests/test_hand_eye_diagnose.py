@@ -4,8 +4,6 @@ Thresholds were set on sessions with the seeds 0 to 99; the tests use seeds from
 nothing was tuned on those. COURSEKIT_NIGHTLY=1 runs 100 sessions a mistake and 200 healthy ones.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 from functools import lru_cache

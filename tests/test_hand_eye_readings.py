@@ -4,8 +4,6 @@ Sessions of arms that reach every pose and err by 0.1 to 0.5 deg and 0.5 to 2 mm
 pose: nobody's kinematics, and no error that poses share. COURSEKIT_NIGHTLY=1 runs 100 seeds a kind.
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Simulated hand-eye sessions against their own truth, and sessions in folders."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

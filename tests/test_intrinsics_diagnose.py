@@ -4,8 +4,6 @@ Thresholds were set on sessions with the seeds 0 to 999; the tests use seeds fro
 nothing was tuned on those. COURSEKIT_NIGHTLY=1 runs 100 sessions a cause and 200 healthy ones.
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Lesson 02: its exercises name every mistake, and its checkpoints' numbers and texts are right."""
 
-from __future__ import annotations
-
 import math
 import re
 from statistics import median

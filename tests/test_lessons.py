@@ -1,7 +1,5 @@
 """The check engine and the checkpoints: verdicts on right, wrong, blank and broken answers."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import json

@@ -1,7 +1,5 @@
 """Placing and lighting things before a camera, recorded sets, and that a session comes back."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Figures by their data, labels and words, not by their pixels."""
 
-from __future__ import annotations
-
 import base64
 import html
 from types import SimpleNamespace

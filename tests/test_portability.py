@@ -3,8 +3,6 @@
 Also what a hub needs (`.binder`), because nothing here can build its image.
 """
 
-from __future__ import annotations
-
 import ast
 import json
 import os

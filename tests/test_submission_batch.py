@@ -1,7 +1,5 @@
 """A folder of bundles is graded to its end, whatever is in it, and goes on where it was stopped."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import io

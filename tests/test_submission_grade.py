@@ -1,7 +1,5 @@
 """Grading: honest work gets full points, a changed number is noticed, a mistake gets its name."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,7 +1,5 @@
 """The notebooks, cell by cell, on a recording of a real D435 instead of the simulated camera."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`diagnose` on MoveIt's fifty pose pairs: quiet as they are, and each mistake by its name."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

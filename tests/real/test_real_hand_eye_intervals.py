@@ -3,8 +3,6 @@
 Sources and published answers: README.md and SOURCE.md in the folder of real data.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

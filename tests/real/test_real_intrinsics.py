@@ -1,7 +1,5 @@
 """OpenCV's own calibration pictures, against what its authors published and what it hides."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

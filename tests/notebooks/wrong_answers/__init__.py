@@ -8,8 +8,6 @@ What must be said is the name of a misconception, or a kind of verdict, or "no n
 that is wrong in a way that has none. All are written without a look at coursekit's wrong models.
 """
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
