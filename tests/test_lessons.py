@@ -122,7 +122,7 @@ def test_two_mistakes_are_called_more_than_one(exercise: Exercise) -> None:
     steps = list(exercise.steps)
     alone = {}  # numbers of each mistake by itself
     pairs = itertools.permutations([m for m in exercise.mistakes if not m.alone], 2)
-    for a, b in itertools.islice(pairs, None, None, 1 if NIGHTLY else 7):
+    for a, b in itertools.islice(pairs, None, None, 1 if NIGHTLY else 19):
         if steps.index(a.step) >= steps.index(b.step) or a.name == b.name:
             continue
         pair = exercise.model(a, b)
@@ -149,7 +149,7 @@ def same_numbers(exercise: Exercise, one: np.ndarray, other: np.ndarray) -> bool
 
 @each_exercise
 def test_a_near_match_is_not_named(exercise: Exercise) -> None:
-    for mistake in exercise.mistakes[:: 1 if NIGHTLY else 8]:
+    for mistake in exercise.mistakes[:: 1 if NIGHTLY else 24]:
         model = exercise.model(mistake)
         verdict = exercise.judge(lambda *args, f=model: f(*args) + 0.02 * (1 + abs(f(*args))))
         assert verdict.kind == "wrong"

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from common import NIGHTLY
-from hostile_bundles import ZOE, hostile
+from hostile_bundles import ZOE
 from sample_submissions import canvas, class_names, class_zip, moodle
 
 from coursekit import cli
@@ -34,7 +34,6 @@ from coursekit.submission.report import ReportLine, not_graded
 pytestmark = pytest.mark.usefixtures("ctrl_c_is_heard")
 USUAL = {"impossible_times", "not_distance_dependent"}  # of the small bundle
 SAMPLES = DATA / "sample_bundles"
-AS_IF_PLAIN = ("not_plain", "unknown_member")  # some are read: the hashes vouch for the members
 GRADED = ("ada_good", "ben_weak", "cleo_wrong", "dan_copied", "eve_formula")
 REFUSED = {
     "hostile_bomb": "too_large",
@@ -127,17 +126,6 @@ def test_the_same_bytes_come_out_however_many_processes_there_are(in_process, re
             assert (tmp_path / "one" / path.relative_to(report)).read_bytes() == path.read_bytes()
 
 
-def test_every_hostile_bundle_is_a_row_with_its_reason(tmp_path):
-    cases = [case for case in hostile().values() if case[0]]
-    folder, out = quick(tmp_path / "in", ()), tmp_path / "out"
-    for i, (_, data) in enumerate(cases):
-        (folder / f"{i:03d}.zip").write_bytes(data)
-    summary = graded(folder, out, workers=2)
-    assert (len(cases), summary.graded + summary.refused, summary.failed) == (195, 195, 0)
-    for (reason, _), row in zip(cases, table(out), strict=True):
-        assert row["status"] == f"not graded: {reason}" or reason in AS_IF_PLAIN
-
-
 # --- what a bundle can do to a process ---
 
 
@@ -220,8 +208,8 @@ def test_processes_that_start_from_nothing_do_the_same(monkeypatch):
 
 def test_processes_are_replaced_after_some_bundles(monkeypatch):
     monkeypatch.setattr(batch, "MAX_TASKS", 2)
-    found = outcomes("abcd", Limits(1))
-    assert len({line.says for line in found.values()}) == 3  # 4, and one that shows it is there
+    found = outcomes("abc", Limits(1))
+    assert len({line.says for line in found.values()}) == 2  # 3, and one that shows it is there
 
 
 def fail(memory_bytes: int) -> None:
