@@ -113,8 +113,10 @@ def test_intervals_hold_published_cameras_or_those_fit_far_worse(real_data, heal
 
 @pytest.mark.parametrize("camera", [1, *(pytest.param(k, marks=nightly) for k in (2, 4))])
 def test_the_lens_of_another_camera_is_named(webcams, camera: int) -> None:
-    """That of `udacity_chessboard`, given by mistake; it is too near to what cam3's images say. With
-    its own none is accused of it: test_real_hand_eye_diagnose.py."""
+    """That of `udacity_chessboard`, given by mistake; it is too near to what cam3's images say.
+
+    With its own none is accused of it: test_real_hand_eye_diagnose.py.
+    """
     lens = webcams[camera].intrinsics
     other = replace(lens, fx=1161.0, fy=1157.0)
     assert he.diagnose(replace(webcams[camera], intrinsics=other)).names[0] == "foreign_lens"
