@@ -541,14 +541,3 @@ test_what_cannot_be_is_refused = refusals(
     *each("360 x 270 mm does not fit on A4: take A2, or .* 20 mm", printed, "board", LARGE),
     *each("take a print shop, or squares of at most 9.9 mm", printed, "board", HUGE),
 )
-
-
-def test_it_is_corner_sub_pix_where_nothing_is_different():
-    """Seen squarely, on the smoothed image, with 0.4 of a square for its window."""
-    T = pose(CHECKERBOARD, tilt_deg=0.0, roll_deg=0.0, z_m=0.5, shift_m=(0.0013, 0.0007))
-    image = photograph(view(CHECKERBOARD, T)[0])  # 30 px a square
-    seen = detect(image, CHECKERBOARD)
-    smooth = cv2.GaussianBlur(image.astype(np.float32), (7, 7), 1.0)
-    theirs = np.rint(seen.pixels).astype(np.float32).reshape(-1, 1, 2)
-    cv2.cornerSubPix(smooth, theirs, (12, 12), (-1, -1), (3, 100, 1e-4))
-    np.testing.assert_allclose(seen.pixels, theirs.reshape(-1, 2), atol=0.01)
