@@ -10,7 +10,7 @@ import cv2
 import matplotlib as mpl
 import numpy as np
 import pytest
-from common import CHARUCO, CHECKERBOARD, NIGHTLY, each, named, refusals
+from common import CHARUCO, CHECKERBOARD, EXPECTED, NIGHTLY, each, named, refusals
 
 import coursekit.boards.detector
 from coursekit.boards import Board, BoardNotFound, detect, detect_all, save_sheet
@@ -291,16 +291,7 @@ def test_says_which_checkerboard_it_sees():
     assert "a checkerboard of 10x7 squares, without markers: use Board('checkerboard'" in said
 
 
-@pytest.mark.parametrize(
-    ("asked", "said"),
-    [
-        ({"squares": (6, 9)}, "27 markers of DICT_5X5_250 as on a board of 9x6 squares"),
-        ({"squares": (8, 6)}, "use squares=(9, 6)"),
-        ({"dictionary": "DICT_6X6_250"}, "use dictionary='DICT_5X5_250'"),
-        ({"dictionary": "DICT_APRILTAG_36H11"}, "27 markers of DICT_5X5_250"),
-        ({"old_origin": True}, "use old_origin=False"),
-    ],
-)
+@pytest.mark.parametrize(("asked", "said"), EXPECTED["other_charuco_boards"])
 def test_says_which_charuco_board_it_sees(asked, said):
     assert said in not_found(shot(CHARUCO), replace(CHARUCO, **asked))
 

@@ -136,13 +136,7 @@ def test_a_copy_keeps_its_widgets_and_the_users_environment(built, tmp_path, mon
 
 
 @pytest.mark.usefixtures("built")
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["07_arm"], "there is no notebook '07_arm'; there are 01_toy"),
-        (["--run"], "--run belongs to --check"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "says"), EXPECTED["bad_builds"])
 def test_what_cannot_be_done_is_refused(arguments, says, capsys):
     with pytest.raises(SystemExit):
         build_notebooks.main(arguments)
