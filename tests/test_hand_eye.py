@@ -5,6 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from common import by_opencv
 from scipy.spatial.transform import Rotation
 from simulated_hand_eye import BOARD, LENS, arm_session, corners_at, free_session, typical
 
@@ -219,9 +220,7 @@ def test_the_pose_of_a_board_is_where_least_squares_ends():
     better = session.corners().linear(turned(T, step), 1.0)[0]
     np.testing.assert_allclose(squares, better, rtol=1e-9)
     for detection, pose in zip(session.detections, session.board_poses, strict=True):
-        rotation = cv2.Rodrigues(pose.T_camera_board[:3, :3])[0]
-        place = pose.T_camera_board[:3, 3]
-        predicted = cv2.projectPoints(BOARD.points, rotation, place, LENS.K, LENS.dist)[0][:, 0]
+        predicted = by_opencv(BOARD.points, pose.T_camera_board, LENS)
         rms = np.sqrt(np.mean(np.sum((predicted - detection.pixels) ** 2, axis=1)))
         assert pose.rms_px == pytest.approx(rms, rel=1e-6)
         assert not pose.ambiguous
