@@ -21,14 +21,7 @@ from common import NIGHTLY, each, named, refusals
 from scipy.spatial.transform import Rotation
 from scipy.stats import f, f_oneway, ncf, t
 
-from coursekit.attribution import (
-    Entry,
-    Ledger,
-    attribute,
-    four_sets,
-    significance,
-    simulate_misses,
-)
+from coursekit.attribution import Entry, Ledger, attribute, four_sets, significance, simulate_misses
 from coursekit.attribution.ledger import LEDGER_HEADER
 from coursekit.attribution.significance import mean_test, place_test, pose_columns, pose_test
 from coursekit.attribution.verdict import REMEDY

@@ -21,15 +21,7 @@ from scipy.spatial.transform import Rotation
 from coursekit.boards import Board, Detection, detect, detect_all
 from coursekit.cameras import Camera, CameraError, Frame, simulated
 from coursekit.cameras import capture as module
-from coursekit.cameras.capture import (
-    LiveImage,
-    Screen,
-    Sight,
-    capture,
-    guidance,
-    is_still,
-    outline,
-)
+from coursekit.cameras.capture import LiveImage, Screen, Sight, capture, guidance, is_still, outline
 from coursekit.cameras.simulated import SimulatedCamera
 from coursekit.geometry import Intrinsics, make_transform, project, transform_points
 from coursekit.simulation.board_images import render_board

@@ -17,13 +17,7 @@ from coursekit.hand_eye import error_study
 from coursekit.intrinsics import calibrate, compare, stored_power
 from coursekit.plots import depth_noise, error_budget, hand_eye, intrinsics, pinhole
 from coursekit.plots.style import label
-from coursekit.simulation import (
-    Effects,
-    corner_session,
-    default_setup,
-    tabletop,
-    unknown_sessions,
-)
+from coursekit.simulation import Effects, corner_session, default_setup, tabletop, unknown_sessions
 
 D435 = specifications.device("D435").unit
 LENSES = {n: specifications.lens(n).intrinsics for n in ("opencv_left", "d405_color")}

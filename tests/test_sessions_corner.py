@@ -10,12 +10,7 @@ from simulated_corners import CHARUCO, CHECKERBOARD, LENS
 
 from coursekit.boards import Board
 from coursekit.geometry import Intrinsics, project
-from coursekit.simulation.corner_sessions import (
-    Effects,
-    bowed,
-    corner_session,
-    rolling_shutter,
-)
+from coursekit.simulation.corner_sessions import Effects, bowed, corner_session, rolling_shutter
 
 BOWED, LARGER = bowed(CHECKERBOARD, 1e-3), 1.03 * CHECKERBOARD.points
 
