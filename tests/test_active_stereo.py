@@ -309,38 +309,19 @@ def test_z16_rounds_to_counts_and_refuses_what_it_cannot_hold():
         assert counts[0, 0] == counts[0, 1] == 0
 
 
-def test_pixel_locking_beside_opencvs_matchers():
-    """Mean error against the sub-pixel part of the true disparity, the same pairs for all."""
-
-    def padded(matcher):
-        matcher.setUniquenessRatio(12)
-        matcher.setDisp12MaxDiff(1)
-
-        def matched(*pair):
-            wide = [cv2.copyMakeBorder(x, 0, 0, 128, 0, cv2.BORDER_CONSTANT) for x in pair]
-            return matcher.compute(*wide)[:, 128:].astype(np.float32) / 16
-
-        return matched
-
-    block, semi_global = cv2.StereoBM_create(128, 11), cv2.StereoSGBM_create(0, 128, 5, 200, 800)
-    matchers = {"match": match, "BM": padded(block), "SGBM": padded(semi_global)}
-    total = {name: np.zeros(16) for name in matchers}
-    count = {name: np.zeros(16) for name in matchers}
+def test_errors_hardly_depend_on_the_sub_pixel_part_of_the_disparity():
+    """Pixel locking: the mean error of each sixteenth of a pixel."""
+    total, count = np.zeros((2, 16))
     for seed, distance in enumerate((0.5, 0.85, 1.0, 1.4)):
         view = on_wall(replace(D435, seed=seed), distance)
         rows = slice(160, 320)
-        pair = [eye[rows] for eye in view.images(np.random.default_rng(seed))]
         true = true_disparity(view)[rows]
-        phase = (true % 1 * 16).astype(int)
-        for name, matcher in matchers.items():
-            error = matcher(*pair) - true
-            good = np.abs(error) < 1
-            total[name] += np.bincount(phase[good], error[good], 16)
-            count[name] += np.bincount(phase[good], minlength=16)
-    locking = {name: float(np.ptp(total[name] / count[name])) for name in matchers}
-    assert locking["match"] <= 0.03
-    assert locking["SGBM"] > 0.1
-    assert locking["BM"] < 0.06
+        error = match(*(eye[rows] for eye in view.images(np.random.default_rng(seed)))) - true
+        good = np.abs(error) < 1
+        phase = (true % 1 * 16).astype(int)[good]
+        total += np.bincount(phase, error[good], 16)
+        count += np.bincount(phase, minlength=16)
+    assert np.ptp(total / count) <= 0.03
 
 
 # What comes out

@@ -140,10 +140,9 @@ def degenerate(kind):
 
 
 def test_a_grid_at_fixed_orientation_leaves_the_translation_free():
+    """Of exact poses: claim H5."""
     session, X, _ = degenerate("grid")
     T = session.T_base_gripper
-    with pytest.raises(he.NotDetermined, match="translation is free in all directions"):
-        session.solve()
     assert he.observability(T, "eye_in_hand").free == ("translation along all axes is free",)
     R = he.rotation_from_shifts(T, session.T_camera_board, "eye_in_hand")
     assert np.degrees(Rotation.from_matrix(R @ X[:3, :3].T).magnitude()) < 1.0

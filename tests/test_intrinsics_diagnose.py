@@ -29,7 +29,7 @@ from coursekit.intrinsics.derivatives import (
 )
 from coursekit.intrinsics.diagnosis import blur_lengths_px, depth_scale, diagnose, stored_power
 from coursekit.intrinsics.fit import calibrate
-from coursekit.simulation.corner_sessions import Effects, Truth, corner_session, ordinary
+from coursekit.simulation.corner_sessions import Effects, Truth, corner_session
 from tools import make_data
 
 FIRST_SEED = 100_000
@@ -195,15 +195,6 @@ def test_the_fisheye_is_opencvs_with_its_derivatives() -> None:
         lenses = (with_parameters(lens, parameter_vector(lens) + d) for d in (step, -step))
         ahead, back = (fisheye_with_derivatives(points, moved)[0] for moved in lenses)
         np.testing.assert_allclose((ahead - back) / 2e-6, by_parameter[:, :, k], atol=1e-3)
-
-
-@pytest.mark.parametrize("seed", [FIRST_SEED, FIRST_SEED + 1])
-def test_a_lens_of_the_model_is_not_beaten_by_a_fisheye(seed: int) -> None:
-    """With a bow, a drifting focus or a shutter on top; lenses with tangential coefficients."""
-    for effects in (Effects(bow_m=1e-3), Effects(focus_drift=0.02), ordinary(seed)):
-        detections, _, board = session(seed, effects)
-        start = causes.refit(Calibration.of(calibrate(detections, board)))
-        assert causes.as_fisheye(start)[1] > 0.01
 
 
 def test_the_size_of_a_cause_is_the_restricted_maximum_likelihood() -> None:

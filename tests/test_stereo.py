@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from common import NIGHTLY, each, named, refusals
 from scipy.ndimage import gaussian_filter
-from scipy.optimize import curve_fit
 from scipy.spatial.transform import Rotation
 
 from coursekit import stereo
@@ -773,22 +772,3 @@ test_what_cannot_be_is_refused = refusals(
     *each("^depth: got", face, "depth", np.zeros((3, 48, 84), np.uint16)),
     *named(face, depth_scale_m=[None], intrinsics=[None], width_m=[-1.0], near=[(5000, 5000)]),
 )
-
-
-def test_noise_fit_agrees_with_scipy_s_curve_fit():
-    rng = np.random.default_rng(21)
-    dof = 4000
-    stds = stds_of(rng, FAR, dof)
-    fit = stereo.fit_noise(FAR, stds, dof, FX, BASELINE)
-
-    def law(z, sigma_d, power):
-        return fit.reference_m**2 * sigma_d / FB * (z / fit.reference_m) ** power
-
-    how = {"sigma": stds / math.sqrt(2 * dof), "absolute_sigma": True}
-    (sigma_d, power), covariance = curve_fit(law, FAR, stds, (0.1, 1.5), **how)
-    error = np.sqrt(np.diag(covariance))
-    assert fit.sigma_d_px == pytest.approx(sigma_d, abs=0.1 * error[0])
-    assert fit.exponent == pytest.approx(power, abs=0.1 * error[1])
-    width = fit.exponent_interval[1] - fit.exponent_interval[0]
-    assert width == pytest.approx(2 * 1.96 * error[1], rel=0.02)
-    assert fit.reference_m == pytest.approx(np.exp(np.log(FAR).mean()))
