@@ -91,7 +91,6 @@ def test_similar_triangles_shows_f_x_over_z() -> None:
 
 
 def test_displacement_is_opencvs(figures) -> None:
-
     lens = LENSES["opencv_left"]
     _, size = pinhole.displacement_px(lens)
     ray = np.linalg.solve(lens.K, [0, 0, 1])
@@ -252,7 +251,6 @@ def intrinsics_figures() -> dict[str, plots.LessonFigure]:
 
 
 def test_outlines_are_opencvs() -> None:
-
     found, _ = corner_session(BOARD, D435.color, seed=1, views=10)
     result = calibrate(found, BOARD)
     T, lens = result.T_camera_board[3], result.intrinsics
