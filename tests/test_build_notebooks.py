@@ -13,14 +13,7 @@ from common import EXPECTED
 from tools import build_notebooks
 from tools.build_notebooks import WIDGET_VIEW, code_cells, joined, problems, read
 
-SOURCES = {
-    "setup": "import os\nimport coursekit as ck",
-    "question": 'ck.checkpoint("pinhole.pitch")',
-    "stub": "def half(x):\n    ...",
-    "check": 'for part in ("one", "two"):\n    print(part, flush=True)\nhalf(3.0)',
-    "answer": "# An answer. Open it after your own attempt.\ndef half_answer(x):\n    return x / 2",
-    "sum": "print(f\"{1 / 7 + 1 / 3:.3f} m, camera {os.environ.get('COURSEKIT_CAMERA')}\")",
-}
+SOURCES = dict(EXPECTED["toy_notebook"])
 
 
 def toy(sources, path):

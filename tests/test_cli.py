@@ -156,18 +156,9 @@ def test_a_remedy_speaks_of_options(name):
     assert not re.search(r"(?<!/)\b\w+\([^)]*\)|=['\"(\[]|`\w+[.(]|square_m|np\.|\[:", said), said
 
 
-ADVICE = {
-    "use squares=(10, 8)": "use --squares 10x8",
-    "say angle='rad'": "say --angle rad",
-    'rotation="rotation_vector"': "--rotation rotation_vector",
-    "use Board('checkerboard', (10, 7), ...)": "use --kind checkerboard --squares 10x7",
-    "print a board with ck.boards.save_sheet": "print a board with coursekit board",
-}
-
-
-@pytest.mark.parametrize("python", ADVICE)
-def test_advice_speaks_of_options(python):
-    assert cli._typed(python) == ADVICE[python]
+@pytest.mark.parametrize(("python", "typed"), EXPECTED["advice"])
+def test_advice_speaks_of_options(python, typed):
+    assert cli._typed(python) == typed
 
 
 class Judged(Estimate):

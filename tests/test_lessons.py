@@ -13,7 +13,7 @@ from statistics import mean
 import cv2
 import numpy as np
 import pytest
-from common import NIGHTLY
+from common import EXPECTED, NIGHTLY
 
 from coursekit import lessons
 from coursekit.lessons import CHECKPOINTS, EXERCISES, questions
@@ -198,18 +198,7 @@ def core_in_place(points, K, dist=None):
     return right(points, K)
 
 
-CORE_RIGHT = (
-    "project: the core is right: all 4 cases without distortion agree. "
-    "Deeper: the other 6 use `dist`."
-)
-TRANSPOSED_CORE = (
-    "project: your result is transposed: one column a point, and one row a point is wanted. "
-    "The numbers are right. (`dist` can wait.)"
-)
-IN_PLACE_CORE = (
-    "project: your function changes the array it is given. The numbers are right. "
-    "(`dist` can wait.)"
-)
+CORE_RIGHT, TRANSPOSED_CORE, IN_PLACE_CORE = EXPECTED["of_the_core"]
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from common import NIGHTLY
+from common import EXPECTED, NIGHTLY
 from hostile_bundles import ZOE
 from sample_submissions import canvas, class_names, class_zip, moodle
 
@@ -464,14 +464,7 @@ def test_everybody_of_a_class_has_a_row_and_nobodys_grade_is_anothers(
         )
 
 
-GRADEBOOK = """Student,ID,SIS User ID,SIS Login ID,Section,Homework depth noise (4711)
-    Points Possible,,,,,100
-"Martin, Eve",1000,s0,eve,A,
-"Żółć, Łukasz",1001,s1,luk,B,
-"Lee, Bo",1002,s2,bo,B,
-"Absent, Ann",1003,s3,ann,B,
-"Student, Test",1004,,,B,
-"""
+GRADEBOOK = EXPECTED["gradebook"]
 
 
 @pytest.mark.parametrize("lms", LMS)
