@@ -45,7 +45,7 @@ def fit(board: Board, seed: int, **session) -> intrinsics.IntrinsicsResult:
 
 def dense_jacobian(result: intrinsics.IntrinsicsResult) -> np.ndarray:
     """Of a fit's residuals by the shared parameters and by six numbers of each view."""
-    shared, poses = result.jacobian
+    shared, poses = result.equations.shared, result.equations.poses
     whole = np.zeros((len(shared), shared.shape[1] + 6 * len(poses)))
     whole[:, : shared.shape[1]] = shared
     for i, (block, rows) in enumerate(zip(poses, result.equations.slices, strict=True)):

@@ -155,7 +155,7 @@ def seen_by_opencv(parameters: np.ndarray, T: np.ndarray, points: np.ndarray) ->
 
 
 def test_jacobian_is_the_numerical_derivative_of_opencvs_projection(result):
-    shared, poses = result.jacobian
+    shared, poses = result.equations.shared, result.equations.poses
     parameters, steps = parameter_vector(result.intrinsics), np.diag([1e-3] * 4 + [1e-5] * 5)
     for view in (0, 7, 27):
         rows = result.equations.slices[view]

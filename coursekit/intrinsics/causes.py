@@ -874,14 +874,5 @@ def shaped(model: Calibration, result: IntrinsicsResult) -> IntrinsicsResult:
     extra = {f"{c} {k}": moves[c][:, :, k] for c in sizes for k in range(moves[c].shape[2])}
     held = _prior(replace(model, sizes=sizes), own=False)
     weights, off = (part[model.estimated.shape[1] :] for part in held)
-    return evaluate(
-        model.camera,
-        model.poses,
-        result.detections,
-        result.board,
-        model.board + model.shape,
-        result.names,
-        result.model,
-        extra,
-        (weights, off),
-    )
+    given = result.detections, result.board, model.board + model.shape, result.names, result.model
+    return evaluate(model.camera, model.poses, *given, extra, (weights, off))

@@ -78,7 +78,6 @@ def halves(
     detections: Sequence[Detection],
     board: Board,
     model: str = "brown_conrady",
-    same_focal: bool = False,
     range_m: float | None = None,
     shape: tuple[int, int] = MAP_SHAPE,
     points: ArrayLike | None = None,
@@ -95,10 +94,8 @@ def halves(
     """
     if len(detections) < 6:
         raise ValueError(f"detections: got {len(detections)} views, halves need at least 6")
-    first, second = both = [
-        calibrate([detections[i] for i in part], board, model, same_focal, points=points)
-        for part in (range(0, len(detections), 2), range(1, len(detections), 2))
-    ]
+    parts = detections[::2], detections[1::2]
+    first, second = both = [calibrate(part, board, model, points=points) for part in parts]
     range_m = first.board_range_m if range_m is None else float(range_m)
     grid = image_grid(first.intrinsics, shape).reshape(-1, 2)
     weights = 1.0 / np.hypot(*(r.uncertainty_map(range_m, shape).ravel() for r in both))

@@ -279,12 +279,10 @@ def _gain_px(steps: _Steps) -> float:
 
 
 def _spoiled_views(search: _Search, steps: _Steps, model: Calibration) -> _Told:
-    residuals = steps[-1].after.linear.residuals
-    return "spoiled_view", {
-        "names": _listed([search.model.names[step.test.at] for step in steps]),
-        "rms": ", ".join(f"{step.test.size:.2f}" for step in steps),
-        "others": math.sqrt(float(np.mean(residuals**2))),
-    }
+    others = math.sqrt(float(np.mean(steps[-1].after.linear.residuals ** 2)))
+    names = _listed([search.model.names[step.test.at] for step in steps])
+    rms = ", ".join(f"{step.test.size:.2f}" for step in steps)
+    return "spoiled_view", {"names": names, "rms": rms, "others": others}
 
 
 def _bad_corners(search: _Search, steps: _Steps, model: Calibration) -> _Told:
@@ -354,11 +352,8 @@ _FIGURES: tuple[tuple[tuple[str, ...], Callable[[_Search, _Steps, Calibration], 
     ((causes.SHUTTER,), _shutter),
     ((causes.LENS,), _lens),
 )
-_ENTRY = {
-    causes.HEIGHTS: "bowed_board",
-    causes.PRINT: "uneven_print",
-    causes.STRETCH: "uneven_print",
-}
+_OF_PRINT = (causes.PRINT, causes.STRETCH)
+_ENTRY = {causes.HEIGHTS: "bowed_board", **dict.fromkeys(_OF_PRINT, "uneven_print")}
 
 
 def _unexplained(model: Calibration, result: IntrinsicsResult, some: bool) -> Iterator[Finding]:

@@ -164,15 +164,6 @@ class IntrinsicsResult(Estimate):
 
     # --- what the parameters are known to ---
 
-    @property
-    def jacobian(self) -> tuple[Floats, tuple[Floats, ...]]:
-        """d predicted pixels / d parameters (2N, p), and / d pose of view i (2 N_i, 6).
-
-        Rows are u, v of each corner, view after view. Columns of a pose: (omega, v), rad and m,
-        of T <- exp(omega, v) T in the camera's frame.
-        """
-        return self.equations.shared[:, : len(self.names)], tuple(self.equations.poses)
-
     @cached_property
     def _scatter(self) -> derivatives.Scatter:
         return self.equations.scatter(len(self.names))
@@ -653,11 +644,8 @@ def tilts(result: IntrinsicsResult) -> Tilts:
     """
     normals = result.T_camera_board[:, :3, 2]
     x, y, z = (normals * np.sign(normals[:, 2:])).T  # away from the camera, whatever the origin
-    return Tilts(
-        about_x_deg=np.degrees(np.arctan2(-y, z)),
-        about_y_deg=np.degrees(np.arctan2(x, z)),
-        total_deg=np.degrees(np.arccos(np.clip(z, -1.0, 1.0))),
-    )
+    about_x_deg, about_y_deg = np.degrees(np.arctan2(-y, z)), np.degrees(np.arctan2(x, z))
+    return Tilts(about_x_deg, about_y_deg, np.degrees(np.arccos(np.clip(z, -1.0, 1.0))))
 
 
 def _weaknesses(result: IntrinsicsResult) -> Iterator[str]:

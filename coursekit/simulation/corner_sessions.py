@@ -119,9 +119,9 @@ def ordinary(seed: int) -> Effects:
     reaches a square or two), printed some tenths of a per cent too wide, high or oblique (0.02 to
     0.64 %), corners whose noise differs from view to view (by 18 to 34 %) and of which neighbours
     share a part (correlation 0.08 to 0.42), of which the detector may state a thirtieth (real
-    photographs; of JPEGs from `board_images.as_taken` a quarter to the whole). A lens that breathes
-    0.03 % and a board held so still that it moves less than 0.1 mm while an image is read: nobody
-    could call that a fault.
+    photographs; of JPEGs as tests/test_board_images.py makes them a quarter to the whole). A lens
+    that breathes 0.03 % and a board held so still that it moves less than 0.1 mm while an image is
+    read: nobody could call that a fault.
 
     >>> ordinary(1).bow_m, 5e-5 <= ordinary(1).wave_m <= 5e-4
     (0.0, True)
@@ -193,7 +193,10 @@ def corner_session(
         noise = with_street_errors(noise, sigma_px, board, ids, effects, street)
         spoiled = effects.spoiled_px * (i == draw.spoiled_view)
         bad = np.isin(ids, [corner for view, corner in wrong if view == i])
-        wild = _directions(rng, ids.size) * np.where(bad, effects.bad_corner_px, spoiled)[:, None]
+        wild = (
+            _directions(rng, ids.size, 2 * np.pi)
+            * np.where(bad, effects.bad_corner_px, spoiled)[:, None]
+        )
         measured = _measured_blur(rng, blur)
         found = pixels + noise + wild
         said_px = effects.claimed * sigma_px
@@ -287,8 +290,7 @@ class Drawn:
         direction = rng.normal(size=(views, 3))
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         self.velocity_m_s = effects.speed_m_s * direction
-        angle = rng.uniform(0, np.pi, views)
-        self.along = np.column_stack([np.cos(angle), np.sin(angle)])
+        self.along = _directions(rng, views, np.pi)
         order = rng.permutation(views)
         count = round(effects.blur_share * views) if effects.blur_px else 0
         self.blurred = tuple(sorted(order[:count].tolist()))
@@ -438,9 +440,9 @@ def with_street_errors(
     return noise * spread + effects.shared * sigma_px * np.column_stack(shared)
 
 
-def _directions(rng: np.random.Generator, count: int) -> Floats:
-    """Unit vectors (count, 2), each in a direction of its own."""
-    angle = rng.uniform(0, 2 * np.pi, count)
+def _directions(rng: np.random.Generator, count: int, most: float) -> Floats:
+    """Unit vectors (count, 2), each in a direction of its own, 0 to `most` rad from the x axis."""
+    angle = rng.uniform(0, most, count)
     return np.column_stack([np.cos(angle), np.sin(angle)])
 
 
