@@ -464,11 +464,6 @@ def _free(cause: str, rows: NDArray[np.intp], at: int = 0, tried: int = 1) -> en
     return engine.Hypothesis(cause, np.eye(len(rows)), at, rows, TYPICAL[cause], tried)
 
 
-def search_residuals(start: Calibration) -> engine.CauseSearch[Calibration]:
-    """The causes that the residuals of a fit speak for, the strongest first."""
-    return engine.search(start, CHANCE_LEVEL)
-
-
 def as_fisheye(model: Calibration) -> tuple[Calibration, float]:
     """The same views through a fisheye with three coefficients, fitted from the same poses.
 

@@ -18,7 +18,7 @@ import numpy as np
 from coursekit.arrays import ArrayLike, Floats
 from coursekit.boards import Board, Detection, Detections, Skipped
 from coursekit.boards.board import by_reason
-from coursekit.causes import Accepted, CauseSearch, DiagnosisTexts
+from coursekit.causes import Accepted, CauseSearch, DiagnosisTexts, search
 from coursekit.checks import array, want
 from coursekit.geometry import fold_radius
 from coursekit.intrinsics import causes
@@ -94,8 +94,7 @@ def diagnose(
     if depth_m is not None:
         wanted = f"{len(detections)} views, each with its Z"
         want(len(depth_m) == len(detections), "depth_m", len(depth_m), wanted)
-        counts = [len(detection.ids) for detection in detections]
-        depths = [array(f"depth_m[{i}]", z, (counts[i],)) for i, z in enumerate(depth_m)]
+        depths = [array(f"depth_m[{i}]", z, (len(detections[i]),)) for i, z in enumerate(depth_m)]
     found, used = _images(detections, board)
     unseen = [] if depths else [_TEXTS.not_tested["squares"]]
     if all(detections[i].blur is None for i in used):
@@ -144,10 +143,8 @@ def _images(detections: Sequence[Detection], board: Board) -> tuple[list[Finding
     common = max(set(sizes), key=sizes.count) if sizes else (0, 0)
     others = [d.name or f"view {i}" for i, d in enumerate(detections) if d.size != common]
     skipped: Sequence[Skipped] = getattr(detections, "skipped", ())
-    if others and sizes:
-        width, height = common
-        listed = _listed(others)
-        found.append(_TEXTS.finding("mixed_sizes", width=width, height=height, others=listed))
+    if others:
+        found.append(_TEXTS.finding("mixed_sizes", common=common, others=_listed(others)))
     used = [i for i, d in enumerate(detections) if d.size == common and len(d.ids) >= MIN_CORNERS]
     layout = _layout([detections[i] for i in used], board)
     refused = [s for s in skipped if s.kind == "other_board"]
@@ -208,12 +205,12 @@ def _lattice_misfit(detections: list[Detection], columns: int) -> float:
 
 def _residuals(start: Calibration, result: IntrinsicsResult, unseen: list[str]) -> list[Finding]:
     """What the residuals of a fit speak for; what could not be tested is added to `unseen`."""
-    search = causes.search_residuals(start)
-    model, steps = causes.explained(search), causes.named(search)
+    found_causes = search(start, causes.CHANCE_LEVEL)
+    model, steps = causes.explained(found_causes), causes.named(found_causes)
     found = []
     for alike, figures_of in _FIGURES:
         mine = [step for step in steps if step.test.cause in alike]
-        told = figures_of(search, mine, model) if mine else None
+        told = figures_of(found_causes, mine, model) if mine else None
         if told:
             key, figures = told
             if alike[0] in causes.PHYSICAL:

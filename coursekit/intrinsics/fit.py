@@ -320,8 +320,7 @@ def folded_text(share: float) -> list[str]:
     if not share:
         return []
     where = "in its corners" if share < MOST_FOLDED else "from some distance to its centre on"
-    folds = "the fitted lens folds back: it has no figures"
-    return [f"in {100 * share:.1f} % of the image ({where}) {folds}"]
+    return [say("intrinsics.folds", percent=100 * share, where=where)]
 
 
 def rms_under(lens: Intrinsics, detections: Sequence[Detection], points: Floats) -> float:
@@ -400,7 +399,7 @@ def calibrate(
     fits: list[IntrinsicsResult] = []
     for start in starts:
         try:
-            lens, poses = _solve(corners, detections, model, same_focal, start)
+            lens, poses = _solve(corners, detections, names, start)
         except CalibrationFailed:
             if start is starts[-1] and not fits:
                 raise
@@ -453,27 +452,23 @@ def evaluate(
 
 
 def _solve(
-    corners: Floats,
-    detections: Sequence[Detection],
-    model: str,
-    same_focal: bool,
-    guess: Intrinsics | None,
+    corners: Floats, detections: Sequence[Detection], names: Sequence[str], guess: Intrinsics | None
 ) -> tuple[Intrinsics, Floats]:
-    """The camera and T_camera_board (n, 4, 4) of the least squares, by OpenCV.
+    """The camera and T_camera_board (n, 4, 4) of the least squares over `names`, by OpenCV.
 
     On one thread: on two, OpenCV adds sums in an order that changes from run to run. Raises
     CalibrationFailed where it gives up, runs away, or ends at a camera that cannot be.
     """
     import cv2
 
-    size, estimated = detections[0].size, MODELS[model]
+    size, same_focal = detections[0].size, "f" in names
     points = [corners[d.ids].astype(np.float32) for d in detections]
     pixels = [np.asarray(d.pixels, np.float32) for d in detections]
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, ITERATIONS, np.finfo(float).eps)
     flags = cv2.CALIB_FIX_ASPECT_RATIO if same_focal else 0
-    flags |= 0 if "p1" in estimated else cv2.CALIB_ZERO_TANGENT_DIST
+    flags |= 0 if "p1" in names else cv2.CALIB_ZERO_TANGENT_DIST
     for name in ("k1", "k2", "k3"):
-        flags |= 0 if name in estimated else getattr(cv2, f"CALIB_FIX_{name.upper()}")
+        flags |= 0 if name in names else getattr(cv2, f"CALIB_FIX_{name.upper()}")
     K0, dist0 = np.eye(3), np.zeros(5)
     if guess is not None:
         K0, dist0, flags = guess.K, np.array(guess.coeffs), flags | cv2.CALIB_USE_INTRINSIC_GUESS
@@ -501,7 +496,7 @@ def _solve(
     in_front = all((z > 0).all() for z in depths)
     if min(K[0, 0], K[1, 1]) < LEAST_FOCAL * size[0] or not in_front:
         raise CalibrationFailed(say("intrinsics.no_camera", fx=K[0, 0], fy=K[1, 1]))
-    kind = "brown_conrady" if estimated else "none"
+    kind = "brown_conrady" if "k1" in names else "none"
     coeffs = tuple(np.ravel(dist)[:5].tolist())
     return Intrinsics(*size, K[0, 0], K[1, 1], K[0, 2], K[1, 2], kind, coeffs), poses
 
