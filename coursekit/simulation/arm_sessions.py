@@ -283,7 +283,10 @@ def _poses(
 ) -> tuple[HandEyeTruth, Floats, Floats]:
     """The truth, and the joint angles and velocities (n, 6) that the encoders read."""
     rig, q = _placed(choice("mount", mount, MOUNTS), _stream(seed, b"poses"), n, mistakes.design)
-    offsets, joint = _joint_zero(seed, mistakes)
+    offsets, joint = np.zeros(6), None
+    if mistakes.joint_offset_deg:
+        joint = int(_stream(seed, b"zero").integers(1, 5))
+        offsets[joint] = np.radians(mistakes.joint_offset_deg)
     arm = SimulatedArm(seed, errors or ArmErrors(0.0, 0.0, 0.0, 0.0))
     dq = np.zeros_like(q)
     if mistakes.moving or mistakes.late_s:
@@ -337,16 +340,6 @@ def _placed(mount: Mount, rng: np.random.Generator, n: int, design: Design) -> t
         except ValueError:  # too few are left, or they turn too little: another place then
             continue
     return default, arm_poses.careful_poses(default, rng, n) if design == "careful" else sets[0]
-
-
-def _joint_zero(seed: int, mistakes: HandEyeMistakes) -> tuple[Floats, int | None]:
-    """By how much each joint's zero is off, (6,) rad, and which one that is."""
-    offsets = np.zeros(6)
-    if not mistakes.joint_offset_deg:
-        return offsets, None
-    joint = int(_stream(seed, b"zero").integers(1, 5))
-    offsets[joint] = np.radians(mistakes.joint_offset_deg)
-    return offsets, joint
 
 
 def _slipping(Y: Floats, seed: int, n: int, mistakes: HandEyeMistakes) -> tuple[Floats, int | None]:
