@@ -300,7 +300,11 @@ def _poses(
     for view in outliers:  # the image was taken while the arm swung, or somebody leant on it
         true[view] = turned(true[view], _twist(bumps, mistakes.outlier_m, mistakes.outlier_deg))
     true = turned(true, _scatter(_stream(seed, b"scatter"), len(q), mistakes))
-    Y, slipped_at = _slipping(rig.Y, seed, len(q), mistakes)
+    Y, slipped_at = np.repeat(rig.Y[None], len(q), axis=0), None
+    if mistakes.slip_m or mistakes.slip_deg:
+        rng, third = _stream(seed, b"slip"), len(q) // 3
+        slipped_at = int(rng.integers(third, max(third + 1, 2 * len(q) // 3 + 1)))
+        Y[slipped_at:] = turned(rig.Y, _twist(rng, mistakes.slip_m, mistakes.slip_deg))
     T_camera_board = camera_board(true, rig.X, Y, rig.mount)
     bad = tuple(sorted(outliers.tolist()))
     truth = HandEyeTruth(rig, mistakes, true, T_camera_board, Y, slipped_at, bad, joint, arm)
@@ -340,17 +344,6 @@ def _placed(mount: Mount, rng: np.random.Generator, n: int, design: Design) -> t
         except ValueError:  # too few are left, or they turn too little: another place then
             continue
     return default, arm_poses.careful_poses(default, rng, n) if design == "careful" else sets[0]
-
-
-def _slipping(Y: Floats, seed: int, n: int, mistakes: HandEyeMistakes) -> tuple[Floats, int | None]:
-    """Where the board is at each view, (n, 4, 4), and the first view after the slip."""
-    stands = np.repeat(Y[None], n, axis=0)
-    if not (mistakes.slip_m or mistakes.slip_deg):
-        return stands, None
-    rng = _stream(seed, b"slip")
-    at = int(rng.integers(n // 3, max(n // 3 + 1, 2 * n // 3 + 1)))
-    stands[at:] = turned(Y, _twist(rng, mistakes.slip_m, mistakes.slip_deg))
-    return stands, at
 
 
 def _scatter(rng: np.random.Generator, n: int, mistakes: HandEyeMistakes) -> Floats:

@@ -305,9 +305,8 @@ def _look(
 
 def _through(lens: Intrinsics, effects: Effects) -> Callable[[Floats], Floats]:
     """How points (N, 3) in front of the session's lens become pixels (N, 2)."""
-    if effects.see is None:
-        return lambda points: project(points, lens.K, lens.dist)
-    return partial(effects.see, lens=lens)
+    see = effects.see or (lambda points, lens: project(points, lens.K, lens.dist))
+    return lambda points: see(points, lens)
 
 
 def printed(board: Board, effects: Effects, rng: np.random.Generator) -> Floats:
