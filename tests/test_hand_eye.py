@@ -287,7 +287,7 @@ def test_observability_measures_angles():
     narrow = he.observability(free_session(19, n=25, tilt_deg=2.0).T, "eye_in_hand")
     wide = he.observability(free_session(19, n=25).T, "eye_in_hand")
     assert [int(np.sum(one.turns_deg > 10.0)) for one in (narrow, wide)] == [1, 3]
-    assert wide.determined
+    assert not wide.free
     assert max(map(len, repr(wide).splitlines())) <= 92
     assert wide.sigma_mm[-1] < narrow.sigma_mm[-1] / 3
     R = Rotation.from_matrix(free_session(19, n=25).T[:, :3, :3])

@@ -14,10 +14,10 @@ from common import NIGHTLY, check_named
 from scipy.spatial.transform import Rotation
 
 from coursekit.arm import ArmErrors, pose_difference, widowx
-from coursekit.causes import CauseSearch
+from coursekit.causes import CauseSearch, search
 from coursekit.geometry import invert_transform, make_transform
 from coursekit.hand_eye import causes, misread
-from coursekit.hand_eye.causes import Arms, MendedPairs, PosePairs
+from coursekit.hand_eye.causes import MendedPairs, PosePairs
 from coursekit.hand_eye.diagnosis import diagnose
 from coursekit.hand_eye.session import HandEyeSession
 from coursekit.simulation.arm_sessions import HandEyeMistakes as M
@@ -124,7 +124,8 @@ def search_of(given: HandEyeSession) -> CauseSearch[MendedPairs]:
     velocity = None
     if given.dq is not None:
         velocity = (widowx().jacobian(given.q) @ given.dq[..., None])[..., 0]
-    return causes.search_pairs(PosePairs.of(given), Arms(widowx(), None, given.q, velocity))
+    model = MendedPairs(widowx(), given.q, velocity, PosePairs.of(given).fit)
+    return search(model, causes.PAIRS_LEVEL)
 
 
 def test_two_mistakes_are_both_named() -> None:
