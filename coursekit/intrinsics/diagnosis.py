@@ -21,18 +21,10 @@ from coursekit.boards.board import by_reason
 from coursekit.causes import Accepted, CauseSearch, DiagnosisTexts, search
 from coursekit.checks import array, want
 from coursekit.geometry import fold_radius
-from coursekit.intrinsics import causes
+from coursekit.intrinsics import causes, fit
 from coursekit.intrinsics.causes import Calibration
 from coursekit.intrinsics.comparison import halves
-from coursekit.intrinsics.fit import (
-    MIN_CORNERS,
-    MIN_VIEWS,
-    CalibrationFailed,
-    IntrinsicsResult,
-    calibrate,
-    coverage,
-    tilts,
-)
+from coursekit.intrinsics.fit import MIN_CORNERS, MIN_VIEWS, CalibrationFailed, IntrinsicsResult
 from coursekit.results import read_json
 from coursekit.specifications import DATA
 from coursekit.words import Finding, Findings
@@ -104,7 +96,7 @@ def diagnose(
     views = Detections([detections[i] for i in used])
     if result is None or len(used) < len(detections):
         try:
-            result = calibrate(views, board, model=model)
+            result = fit.calibrate(views, board, model=model)
         except CalibrationFailed as error:
             failed = _TEXTS.finding("not_converged", why=error)
             found += [f for f in (failed, _no_edge_corners(views)) if f]
@@ -358,11 +350,11 @@ def _unexplained(model: Calibration, result: IntrinsicsResult, some: bool) -> It
     excess = math.sqrt(max(model.left_px**2 - model.noise_px**2, 0.0))
     if excess < max(UNEXPLAINED * model.noise_px, NORMAL_LENS_PX):
         return
-    fit = causes.shaped(model, result)
-    alone = fit.sigma_px**2 * np.diag(fit.equations.shared_covariance)
-    centre = [fit.names.index(name) for name in fit.names if name[0] in "fc"]
-    more = np.sqrt(np.maximum(np.diag(fit.covariance) - alone[: len(fit.names)], 0.0))
-    moved = fit.quantile() * float(more[centre].max())
+    shaped = causes.shaped(model, result)
+    alone = shaped.sigma_px**2 * np.diag(shaped.equations.shared_covariance)
+    centre = [shaped.names.index(name) for name in shaped.names if name[0] in "fc"]
+    more = np.sqrt(np.maximum(np.diag(shaped.covariance) - alone[: len(shaped.names)], 0.0))
+    moved = shaped.quantile() * float(more[centre].max())
     besides = " beside what was found" if some else ""
     figures = {"excess": _flat(excess), "noise": _flat(model.noise_px), "moved": moved}
     yield _TEXTS.finding("unexplained", besides=besides, **figures)
@@ -423,7 +415,7 @@ def _fronto_parallel(result: IntrinsicsResult) -> Finding | None:
     # same.
     fx = result.intrinsics.fx
     longest = min(1.0, float(np.hypot(*result.intrinsics.size)) / fx)
-    tilt = float(np.quantile(longest * tilts(result).total_deg, FLAT_VIEWS_SHARE))
+    tilt = float(np.quantile(longest * fit.tilts(result).total_deg, FLAT_VIEWS_SHARE))
     if tilt >= FLAT_TILT_DEG:
         return None
     sigma = 100 * result.sigma("fx") / fx
@@ -431,7 +423,7 @@ def _fronto_parallel(result: IntrinsicsResult) -> Finding | None:
 
 
 def _no_edge_corners(detections: Sequence[Detection]) -> Finding | None:
-    seen = coverage(detections)
+    seen = fit.coverage(detections)
     bare = [margin for margin in seen.margins if margin > BARE_MARGIN]
     if len(bare) < BARE_SIDES and max(seen.margins) < ONE_BARE_MARGIN:
         return None

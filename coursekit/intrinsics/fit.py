@@ -127,14 +127,10 @@ class IntrinsicsResult(Estimate):
         return _rms(self._all_residuals)
 
     @property
-    def rms_u_px(self) -> float:
-        """Root mean square residual along u, px."""
-        return _rms(self._all_residuals[:, 0])
-
-    @property
-    def rms_v_px(self) -> float:
-        """Root mean square residual along v, px."""
-        return _rms(self._all_residuals[:, 1])
+    def rms_uv_px(self) -> tuple[float, float]:
+        """Root mean square residual along u and along v, px."""
+        u, v = self._all_residuals.T
+        return _rms(u), _rms(v)
 
     @property
     def per_view_rms_px(self) -> Floats:

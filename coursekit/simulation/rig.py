@@ -584,7 +584,7 @@ def _light(scene: Scene, rig: Rig) -> list[tuple[FloatImage, FloatImage]]:
     for eye, facing in ((0.0, np.eye(3)), (rig.baseline_m * (1 + rig.baseline_error), turn)):
         laser, room = (np.empty(left.size[::-1], np.float32) for _ in range(2))
         render_eye(boxes, skins, np.array([eye, 0.0, 0.0]), facing, lens, lamp, laser, room)
-        grains = _blurred(rng.standard_normal(laser.shape, np.float32), SPECKLE_SIGMA_PX)
+        grains = _blurred(rng.standard_normal(left.size[::-1], np.float32), SPECKLE_SIGMA_PX)
         laser *= 1 + np.float32(SPECKLE) * (grains / grains.std())
         eyes.append((_blurred(laser, LENS_SIGMA_PX), _blurred(room, LENS_SIGMA_PX)))
     return eyes
