@@ -240,12 +240,25 @@ def test_corners_are_found_with_a_noise_of_about_a_twentieth_of_a_pixel(board):
 # --- the same bytes, and refusals ---
 
 
+def test_light_falls_off_to_the_right_and_into_the_corners():
+    T = pose(CHECKERS, NEAR)
+    even, dim = (render_board(CHECKERS, T, LENS, None, uneven=share) for share in (0.0, 0.4))
+    left, right, corner = (
+        dim[rows, columns].mean() / even[rows, columns].mean()
+        for rows, columns in (
+            (slice(200, 280), slice(40)),
+            (slice(200, 280), slice(-40, None)),
+            (slice(20), slice(20)),
+        )
+    )
+    assert right < 0.75 * left < 0.75
+    assert corner < left - 0.05
+
+
 def as_taken(picture, quality):
-    """As a cheap camera takes and stores it: dim on the right and in the corners, red, green and
-    blue seen by every second or fourth pixel only, sharpened, a JPEG with colours at half size."""
-    across, down = np.meshgrid(*[np.linspace(-1, 1, size) for size in LENS.size])
-    dim = picture * (1 - 0.15 * (1 + across)) * (1 - 0.15 * (across**2 + down**2))
-    colours = cv2.cvtColor(np.rint(dim).astype(np.uint8), cv2.COLOR_BayerRGGB2BGR)
+    """As a cheap camera stores it: red, green and blue seen by every second or fourth pixel only,
+    sharpened, a JPEG with colours at half size."""
+    colours = cv2.cvtColor(picture, cv2.COLOR_BayerRGGB2BGR)
     sharp = cv2.addWeighted(colours, 2.0, cv2.GaussianBlur(colours, (0, 0), 1.0), -1.0, 0)
     _, stored = cv2.imencode(".jpg", sharp, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return np.asarray(cv2.imdecode(stored, cv2.IMREAD_GRAYSCALE), np.uint8)
@@ -258,7 +271,8 @@ def test_a_cheap_cameras_jpeg_adds_to_the_corners_noise_and_shifts_none(quality)
     errors, rng = [], np.random.default_rng(quality)
     for view in (NEAR, TILTED):
         T = pose(CHECKERS, view)
-        found = detect(as_taken(render_board(CHECKERS, T, LENS, rng), quality), CHECKERS)
+        picture = render_board(CHECKERS, T, LENS, rng, uneven=0.3)
+        found = detect(as_taken(picture, quality), CHECKERS)
         errors.append(found.pixels - by_opencv(CHECKERS.points, T, LENS)[found.ids])
     errors = np.concatenate(errors)
     assert 0.02 < errors.std() < 0.15

@@ -212,6 +212,7 @@ def render_board(
     velocity: ArrayLike = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
     readout_ms: float = 0.0,
     light: float = 1.0,
+    uneven: float = 0.0,
 ) -> Grey:
     """A grey picture (h, w) of a board on a table, as a camera with this lens takes it.
 
@@ -223,7 +224,8 @@ def render_board(
     about it in rad/s, along the camera's axes; the table goes along, as if the camera moved.
     readout_ms: from the exposure of the first row to that of the last. light: of the room, in units
     of an ordinary one; less light or exposure is not darker but noisier, for the camera's gain
-    makes up for it.
+    makes up for it. uneven: the share of it that is missing on the right, where it falls from the
+    left, and in the corners of the image, where a cheap lens is dark.
     Raises ValueError for a wrong argument, and for a board that does not face the camera.
 
     >>> T = np.eye(4)
@@ -241,12 +243,16 @@ def render_board(
         ("exposure_ms", exposure_ms, 0.01, 1000, "ms"),
         ("readout_ms", readout_ms, 0, 1000, "ms"),
         ("light", light, 0.001, 1000, "times an ordinary room's"),
+        ("uneven", uneven, 0, 0.9, "of the light"),
     ):
         checks.number(name, value, f"{least} to {most} {unit}", least=least, most=most)
     twist = checks.array("velocity", velocity, (6,), finite=True)
     middle = np.array([*board.size_m, 0.0]) / 2
     poses = _poses(T_camera_sheet, middle, twist, exposure_ms / 1e3, readout_ms / 1e3, lens.height)
     radiance = _radiance(board, poses, lens, bow_m)
+    if uneven:
+        across, down = np.meshgrid(*[np.linspace(-1, 1, size) for size in lens.size])
+        radiance *= (1 - uneven * (1 + across) / 2) * (1 - uneven * (across**2 + down**2) / 2)
     blurred = gaussian_filter(radiance, np.hypot(CAMERA_BLUR_PX, defocus_px), mode="nearest")
     return _expose(blurred, ELECTRONS_PER_MS * exposure_ms * light, rng)
 
