@@ -44,17 +44,6 @@ def _rms_by_axes(observed: Floats, predicted: Floats) -> Any:
     return u, v, np.sqrt(u**2 + v**2)
 
 
-def _rms_by_rows(observed: Floats, predicted: Floats) -> Any:
-    u = v = both = 0.0
-    for seen, there in zip(observed, predicted, strict=True):
-        du, dv = seen[0] - there[0], seen[1] - there[1]
-        u += du**2
-        v += dv**2
-        both += du**2 + dv**2
-    n = len(observed)
-    return np.sqrt(u / n), np.sqrt(v / n), np.sqrt(both / n)
-
-
 REPROJECTION_RMS = Exercise.told(
     "intrinsics.reprojection_rms",
     build=_reprojection_rms,
@@ -73,7 +62,7 @@ REPROJECTION_RMS = Exercise.told(
         _corners(3, 120, (0.25, 0.08), 0.05),
     ],
     describe=_describe_rms,
-    styles=[_rms_by_axes, _rms_by_rows],
+    styles=[_rms_by_axes],
 )
 
 
@@ -138,25 +127,6 @@ def _least_squares(seed: int, rows: int, columns: int, sigma: float) -> tuple[Fl
     return J, noise - J @ np.linalg.lstsq(J, noise, rcond=None)[0]
 
 
-def _sigma_by_covariance(J: Floats, residuals: Floats) -> Any:
-    M, P = J.shape
-    covariance = np.linalg.inv(J.T @ J) * np.sum(residuals**2) / (M - P)
-    return np.sqrt(covariance[0, 0])
-
-
-def _sigma_by_root(J: Floats, residuals: Floats) -> Any:
-    M, P = J.shape
-    sigma = np.linalg.norm(residuals) / np.sqrt(M - P)
-    return sigma * np.sqrt(np.linalg.inv(J.T @ J)[0, 0])
-
-
-def _sigma_by_pinv(J: Floats, residuals: Floats) -> Any:
-    M, P = J.shape
-    variance = np.sum(residuals**2) / (M - P)
-    gain = np.linalg.pinv(J)[0]
-    return np.sqrt(variance * np.sum(gain**2))
-
-
 FOCAL_SIGMA = Exercise.told(
     "intrinsics.focal_sigma",
     build=_focal_sigma,
@@ -178,7 +148,6 @@ FOCAL_SIGMA = Exercise.told(
         f"J is {args[0].shape[0]}x{args[0].shape[1]}"
         + (f" with rows {args[0].tolist()}, residuals {args[1].tolist()}" * (len(args[0]) < 7))
     ),
-    styles=[_sigma_by_covariance, _sigma_by_root, _sigma_by_pinv],
 )
 
 
