@@ -286,7 +286,7 @@ def panel(checkpoint: Checkpoint, say: Callable[[str], None]) -> Any:
 
 @cache
 def lesson_texts(lesson: str) -> dict[str, Any]:
-    """What the TOML file of a lesson holds: checkpoints, objectives and mistakes."""
+    """What the TOML file of a lesson holds: checkpoints, objectives, exercises and mistakes."""
     text = Path(__file__).with_name(f"{lesson}.toml").read_text(encoding="utf-8")
     return tomllib.loads(text)
 
