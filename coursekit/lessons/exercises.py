@@ -87,10 +87,10 @@ class Exercise:
     `tolerance` (in `unit`) or a millionth of their size, as float32 does, and NaN with NaN. Where
     `nan_answers`, NaN is an answer like any other; otherwise a wrong model that comes to NaN or
     infinity has overflowed. ways: other right answers, what each does and the steps that do it;
-    `way` is what the model does. styles: the whole function as learners write it, for the device to
-    edit. An
-    attempt that leaves out what is beyond the `core` is judged by the core cases alone: by an
-    exercise that has only those, and is `part_of` this one.
+    `way` is what the model does, and `another_way` says that it is one of them. styles: the whole
+    function as learners write it, for the device to edit. An attempt that leaves out what is beyond
+    the `core` is judged by the core cases alone: by an exercise that has only those, and is
+    `part_of` the whole.
     """
 
     name: str
