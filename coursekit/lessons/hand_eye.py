@@ -54,6 +54,15 @@ def _describe_pair(args: tuple[Floats, ...]) -> str:
     return text.format(*places) + end
 
 
+def _pair_by_halves(gripper_i: Floats, gripper_j: Floats, board_i: Floats, board_j: Floats) -> Any:
+    A, B = np.eye(4), np.eye(4)
+    A[:3, :3] = gripper_j[:3, :3].T @ gripper_i[:3, :3]
+    A[:3, 3] = gripper_j[:3, :3].T @ (gripper_i[:3, 3] - gripper_j[:3, 3])
+    B[:3, :3] = board_j[:3, :3] @ board_i[:3, :3].T
+    B[:3, 3] = board_j[:3, 3] - B[:3, :3] @ board_i[:3, 3]
+    return A, B
+
+
 MOTION_PAIR = Exercise.told(
     "hand_eye.motion_pair",
     build=_motion_pair,
@@ -71,6 +80,7 @@ MOTION_PAIR = Exercise.told(
     show=lambda row: "translations of A and B {} and {}".format(
         *(in_digits("(.3f)", T[:3, 3]) for T in row)
     ),
+    styles=[_pair_by_halves],
 )
 
 
