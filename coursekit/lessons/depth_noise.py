@@ -298,6 +298,15 @@ def _describe_table_row(args: tuple[Any, ...]) -> str:
     return f"{what}; scale = {scale:g} m, distance = {distance:g} m"
 
 
+def _row_by_sums(counts: Any, scale: float, distance: float) -> Any:
+    z = np.where(counts == 0, np.nan, counts * scale * 1000.0)
+    error = z - distance * 1000.0
+    n = np.sum(np.isfinite(z), axis=0)
+    off = z - np.nanmean(z, axis=0)
+    variance = np.nansum(off**2, axis=0) / (n - 1)
+    return np.nanmean(error), np.sqrt(np.mean(variance)), np.sum(counts == 0) / counts.size
+
+
 TABLE_ROW = Exercise.told(
     "depth_noise.table_row",
     build=_table_row,
@@ -319,6 +328,7 @@ TABLE_ROW = Exercise.told(
         _table_case((16, 4, 5), 0.0001, 0.6, 7),
     ],
     describe=_describe_table_row,
+    styles=[_row_by_sums],
     ways=[  # how the means and variances of pixels with holes are weighted is free
         (f"mismatches {way}{mean}{mix}", {"keep": keep, "level": level, "std": std})
         for way, keep in (("kept", lambda z: (z, z)), ("left out", lambda z: (_left_out(z),) * 2))
@@ -421,6 +431,17 @@ def _errors_case(shape: tuple[int, int, int], seed: int) -> tuple[Floats]:
     return (z.round(3),)
 
 
+def _errors_by_variances(z: Floats) -> Any:
+    frames, rows, columns = z.shape
+    pixel_means = np.nanmean(z, axis=0)
+    frame_means = np.nanmean(z, axis=(1, 2))
+    stays = np.nanvar(pixel_means, ddof=1) / (rows * columns / 12**2)
+    moves = np.nanvar(frame_means, ddof=1) / frames
+    variance = np.nanmean(np.nanvar(z, axis=0, ddof=1))
+    nu = (frames - 1) * (rows * columns / 8**2)
+    return np.sqrt(stays + moves), np.sqrt(variance / (2 * nu))
+
+
 def _errors_by_stds(z: Floats) -> Any:
     frames, rows, columns = z.shape
     patches = rows * columns / 12**2
@@ -450,7 +471,7 @@ STANDARD_ERRORS = Exercise.told(
     },
     cases=[_errors_case((5 + 3 * i, 12 + 8 * i, 12 + 9 * i), i) for i in range(3)],
     describe=lambda args: f"z of shape {args[0].shape}, {np.sum(np.isnan(args[0]))} of it NaN",
-    styles=[_errors_by_stds],
+    styles=[_errors_by_variances, _errors_by_stds],
     ways=[
         ("n = each pixel's valid samples" + mix, {"count": _freedom, "pooled": std})
         for mix, std in (("", _pooled), _BY_SAMPLES)

@@ -29,7 +29,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
 from types import CodeType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -162,19 +162,13 @@ class Exercise:
             model = model if mistake.step else mistake.wrong(model)
         return model
 
-    def check(self, function: Callable[..., Any]) -> Verdict:
-        """The verdict on a learner's function; never raises, and notes the attempt."""
-        return questions.noted(self.judge(function))
-
     def judge(self, function: Callable[..., Any]) -> Verdict:
-        """The verdict on a learner's function, without noting it."""
+        """The verdict on a learner's function; never raises."""
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            verdicts = [exercise._verdict(function) for exercise in (*self._others, self)]
+            verdicts = [one._verdict(function) for one in (self, *reversed(self._others))]
         known = ("right", *(m.name for m in self.mistakes))
-        return min(
-            verdicts[::-1], key=lambda v: (v.kind != "right", (v.named or v.kind) not in known)
-        )
+        return min(verdicts, key=lambda v: (v.kind != "right", (v.named or v.kind) not in known))
 
     @cached_property
     def _others(self) -> list[Exercise]:
@@ -576,8 +570,7 @@ FOUND = questions.lesson_texts("exercises")
 IN_PLACE, TRANSPOSED, RANDOM = (Mistake(name, *texts) for name, texts in FOUND["formal"].items())
 
 
-@dataclass(frozen=True)
-class Run:
+class Run(NamedTuple):
     """One call of a function on copies of its arguments."""
 
     value: Any

@@ -44,6 +44,17 @@ def _rms_by_axes(observed: Floats, predicted: Floats) -> Any:
     return u, v, np.sqrt(u**2 + v**2)
 
 
+def _rms_by_rows(observed: Floats, predicted: Floats) -> Any:
+    u = v = both = 0.0
+    for seen, there in zip(observed, predicted, strict=True):
+        du, dv = seen[0] - there[0], seen[1] - there[1]
+        u += du**2
+        v += dv**2
+        both += du**2 + dv**2
+    n = len(observed)
+    return np.sqrt(u / n), np.sqrt(v / n), np.sqrt(both / n)
+
+
 REPROJECTION_RMS = Exercise.told(
     "intrinsics.reprojection_rms",
     build=_reprojection_rms,
@@ -62,7 +73,7 @@ REPROJECTION_RMS = Exercise.told(
         _corners(3, 120, (0.25, 0.08), 0.05),
     ],
     describe=_describe_rms,
-    styles=[_rms_by_axes],
+    styles=[_rms_by_axes, _rms_by_rows],
 )
 
 
@@ -82,8 +93,7 @@ for _step in ("axis", "shown"):  # whether or not the 2-D number is made of them
         (_step, "mean_absolute", lambda e, *_: np.mean(np.abs(e), axis=0)),
         (_step, "signed_mean", lambda e, *_: np.mean(e, axis=0)),
         (_step, "mean_before_square", lambda e, *_: np.abs(np.mean(e, axis=0))),
-        (_step, "first_only", lambda e, *_: np.abs(e[0]) / math.sqrt(len(e))),
-        (_step, "first_only", lambda e, *_: np.abs(e[0])),
+        (_step, "first_only", lambda e, *_: abs(e[0]) / len(e) ** 0.5, lambda e, *_: abs(e[0])),
         (_step, "first_column_twice", lambda e, *_: np.sqrt(np.mean(e**2, axis=0))[[0, 0]]),
         (_step, "no_root", lambda e, *_: np.mean(e**2, axis=0)),
         (_step, "summed", lambda e, *_: np.sqrt(np.sum(e**2, axis=0))),
@@ -165,8 +175,7 @@ FOCAL_SIGMA.add_mistakes(
     ("noise", "noise_not_squared", lambda e, freedom: np.linalg.norm(e) / freedom),
     ("scale", "noise_outside_the_root", lambda noise, first: noise**2 * first),
     ("noise", "noise_summed", lambda e, freedom: e @ e),
-    ("noise", "spread_of_residuals", lambda residuals, freedom: np.var(residuals)),
-    ("noise", "spread_of_residuals", lambda residuals, freedom: np.var(residuals, ddof=1)),
+    ("noise", "spread_of_residuals", lambda e, _: np.var(e), lambda e, _: np.var(e, ddof=1)),
     ("noise", "mean_taken_off", lambda e, freedom: len(e) * np.var(e) / freedom),
     ("noise", "divided_twice", lambda e, freedom: np.mean(e**2) / freedom),
     ("noise", "square_of_the_sum", lambda e, freedom: np.sum(e) ** 2 / freedom),
