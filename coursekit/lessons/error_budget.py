@@ -63,8 +63,7 @@ SENSITIVITIES.add_mistakes(
 
 # --- add_up ---
 
-Row = tuple[float, float, Any, str]
-Rows = list[Row]
+Rows = list[tuple[float, float, Any, str]]
 
 
 def _add_up(steps: Steps, rows: Rows, tolerance: float) -> Floats:
@@ -109,7 +108,7 @@ def _beyond(z: float) -> float:
     return math.erfc(z / math.sqrt(2))
 
 
-def _row(low: float, high: float, kind: str, *toward: float) -> Row:
+def _row(low: float, high: float, kind: str, *toward: float) -> tuple[float, float, Any, str]:
     return low, high, toward or None, kind
 
 
@@ -159,7 +158,7 @@ ADD_UP = Exercise.told(
 )
 
 
-def _row_in_words(row: Row) -> str:
+def _row_in_words(row: tuple[float, float, Any, str]) -> str:
     low, high, toward, kind = row
     way = "any way" if toward is None else "along ({:.2f}, {:.2f}, {:.2f})".format(*toward)
     return f"{kind} {low:g} to {high:g} mm {way}"
