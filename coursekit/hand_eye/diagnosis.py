@@ -253,7 +253,7 @@ class _Case:
     def ambiguous_boards(self) -> None:
         """Of the two poses that an image may allow, the one that the arm expects."""
         boards = self.session.board_poses
-        if not any(pose.ambiguous for pose in boards):
+        if all(pose.other is None for pose in boards):
             return
         fit = self.pairs.fit
         expected = camera_board(self.pairs.T_base_gripper, fit.X, fit.Y[0], self.pairs.mount)
