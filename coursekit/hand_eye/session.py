@@ -180,10 +180,8 @@ class HandEyeSession:
     def pick(self, which: Sequence[int] | Integers) -> HandEyeSession:
         """The pairs with these numbers, in this order."""
         which = np.asarray(which, int)
-        rows: dict[str, Any] = {
-            name: None if getattr(self, name) is None else getattr(self, name)[which]
-            for name in ("T_base_gripper", *OPTIONAL)
-        }
+        known = [n for n in ("T_base_gripper", *OPTIONAL) if getattr(self, n) is not None]
+        rows: dict[str, Any] = {name: getattr(self, name)[which] for name in known}
         seen = self.seen.pick(which) if isinstance(self.seen, Detections) else self.seen[which]
         names = tuple(self.names[i] for i in which)
         return replace(self, seen=seen, names=names, **rows)
@@ -530,8 +528,7 @@ def _first(
             X, Y = guess, mean_pose(stand_board(arm, measured, guess, mount))
         else:
             X, Y = closed_form(arm, measured, mount, method)
-        expected = camera_board(arm, X, Y, mount)
-        before, measured = measured, session.T_camera_board
+        before, expected = measured, camera_board(arm, X, Y, mount)
         if session.board_poses:
             measured = views.nearer(session.board_poses, expected)
         if np.array_equal(before, measured):
