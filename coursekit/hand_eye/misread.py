@@ -45,10 +45,8 @@ TEXT_ORDER = "sorted as text, img_10 before img_2"
 MOST_FIT = 0.8  # of the images, for the name of an order
 FEWEST_OF_HALF = 5  # pairs, to find X with
 ROTATION_VECTOR = "rotation_vector"
-FIXED, MOVING = (
-    ("xyz", "zyx", "xzy", "yxz", "yzx", "zxy"),
-    ("ZYX", "XYZ", "YZX", "ZXY", "XZY", "YXZ"),
-)
+FIXED = ("xyz", "zyx", "xzy", "yxz", "yzx", "zxy")
+MOVING = ("ZYX", "XYZ", "YZX", "ZXY", "XZY", "YXZ")
 TWICE = ("ZYZ", "ZXZ", "zyz", "zxz")  # about the first axis once more
 CAMERA_ON_GRIPPER_M = 0.4  # no wrist carries a camera farther away
 BOARD_IN_GRIPPER_M = 0.5  # nor a board
@@ -91,7 +89,7 @@ def other_rotations(pairs: PosePairs, expected: Floats) -> Reading | None:
     orders = ([1, 2, 3, 0], [3, 0, 1, 2])
     slips = [*(Rotation.from_quat(R.as_quat()[:, order]) for order in orders), R.inv()]
     named = zip(SENTENCES.words["other_rotations"], slips, strict=True)
-    found = [Reading("notation", w, with_rotations(pairs, R.as_matrix()).fit) for w, R in named]
+    found = [Reading("notation", w, with_rotations(pairs, S.as_matrix()).fit) for w, S in named]
     clear = [r for r in found if clearly_better(r.fit, pairs.fit, ROTATION_SHIFT_LEFT)]
     return best(clear) or undo_notation(pairs, expected)
 
