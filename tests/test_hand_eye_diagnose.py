@@ -126,7 +126,7 @@ def search_of(given: HandEyeSession) -> CauseSearch[MendedPairs]:
     if given.dq is not None:
         velocity = (widowx().jacobian(given.q) @ given.dq[..., None])[..., 0]
     model = MendedPairs(widowx(), given.q, velocity, PosePairs.of(given).fit)
-    return search(model, causes.CHANCE_LEVEL)
+    return search(model, causes.PAIRS_LEVEL)
 
 
 def test_two_mistakes_are_both_named() -> None:

@@ -45,7 +45,7 @@ SLIP, OUTLIER, STEADY = "slipping_board", "outlier_pose", "slow_drift"
 SMOOTH = (SCALE, LATE, ARM_ERROR)  # one number that acts on all pairs
 # At most 2 % of healthy sessions may get a finding, and five kinds of test at this level make
 # 0.05 %; the rest is for arms whose errors are not quite normal.
-CHANCE_LEVEL = 1e-4
+PAIRS_LEVEL = 1e-4
 # What careful people have, and no finding: squares measured with a ruler, a driver's own delay, a
 # board that settles, a pose in which the arm still swings, a zero that a jig sets.
 NORMAL_SIZE = {

@@ -272,7 +272,7 @@ class _Case:
             q = self._joints_that_fit(q)
         velocity = self._velocity(q)
         model = MendedPairs(self.session.arm, q, velocity, pairs.fit)
-        self.found += _from_residuals(search(model, causes.CHANCE_LEVEL), self.session)
+        self.found += _from_residuals(search(model, causes.PAIRS_LEVEL), self.session)
         judged = self.session.solve().judgement if not self.found else None
         if judged is not None and (judged.large or judged.broken):
             self.add("unexplained", why=" ".join([judged.large, *judged.broken]).strip())
