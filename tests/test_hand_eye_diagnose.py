@@ -4,8 +4,6 @@ Thresholds were set on sessions with the seeds 0 to 99; the tests use seeds from
 nothing was tuned on those. COURSEKIT_NIGHTLY=1 runs 100 sessions a mistake and 200 healthy ones.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 from functools import lru_cache
@@ -69,11 +67,12 @@ def session(seed: int, mistakes: M, **options) -> tuple[HandEyeSession, HandEyeT
 def test_a_mistake_is_named(label: str) -> None:
     """At least 95 of 100 named, at most 5 with a wrong name besides (nightly).
 
-    Of 2, both: what names 50 % passes that with a probability of 25 %. They are one of either
-    mount, one with and one without errors of the arm.
+    By day one, of either mount in turn, with and without errors of the arm: what names 80 % of all
+    passes the 19 with 1 %.
     """
     name, mistakes = CLASSES[label]
-    seeds = range(FIRST_SEED, FIRST_SEED + 100) if NIGHTLY else (FIRST_SEED, FIRST_SEED + 3)
+    first = FIRST_SEED if NIGHTLY else FIRST_SEED + [*CLASSES].index(label)
+    seeds = range(first, first + (100 if NIGHTLY else 1))
     found = Counter(diagnose(session(seed, mistakes)[0]).names for seed in seeds)
     check_named(found, name, label)
 

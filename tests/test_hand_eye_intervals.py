@@ -3,8 +3,6 @@
 COURSEKIT_NIGHTLY=1 counts over 1,000 sessions of each kind in place of 6.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

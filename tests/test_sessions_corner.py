@@ -2,30 +2,17 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
-from common import named, refusals
+from common import by_opencv, named, refusals
 from scipy.optimize import brentq
-from scipy.spatial.transform import Rotation
 from simulated_corners import CHARUCO, CHECKERBOARD, LENS
 
 from coursekit.boards import Board
 from coursekit.geometry import Intrinsics, project
-from coursekit.simulation.corner_sessions import (
-    Effects,
-    bowed,
-    corner_session,
-    rolling_shutter,
-)
+from coursekit.simulation.corner_sessions import Effects, bowed, corner_session, rolling_shutter
 
 BOWED, LARGER = bowed(CHECKERBOARD, 1e-3), 1.03 * CHECKERBOARD.points
-
-
-def opencv(points: np.ndarray, T: np.ndarray, lens: Intrinsics = LENS) -> np.ndarray:
-    rotation = Rotation.from_matrix(T[:3, :3]).as_rotvec()
-    pixels, _ = cv2.projectPoints(points, rotation, T[:3, 3], lens.K, np.array(lens.coeffs))
-    return pixels[:, 0]
 
 
 def tilts_deg(truth) -> np.ndarray:
@@ -48,7 +35,7 @@ def test_a_session_is_opencvs_projection_of_its_points(board, effects, points) -
     assert 0.75 * most <= drift <= most
     for view, T, scale in zip(session, truth.T_camera_board, truth.focal_scale, strict=True):
         lens = replace(LENS, fx=LENS.fx * scale, fy=LENS.fy * scale)
-        assert np.abs(view.pixels - opencv(points[view.ids], T, lens)).max() < 1e-9
+        assert np.abs(view.pixels - by_opencv(points[view.ids], T, lens)).max() < 1e-9
 
 
 @pytest.mark.parametrize("board", [CHARUCO, CHECKERBOARD])
@@ -120,13 +107,13 @@ def test_a_rolling_shutter_sees_each_corner_at_the_time_of_its_row() -> None:
     moved = 0.0
     for i in (0, 9, 21):
         T, velocity = truth.T_camera_board[i], truth.velocity_m_s[i]
-        still = opencv(CHECKERBOARD.points, T)
+        still = by_opencv(CHECKERBOARD.points, T, LENS)
         moved = max(moved, np.abs(session[i].pixels - still).max())
         for corner in (0, 13, 53):
             point = CHECKERBOARD.points[corner] @ T[:3, :3].T + T[:3, 3]
 
             def at(time: float, point: np.ndarray = point, v: np.ndarray = velocity) -> np.ndarray:
-                return opencv((point + time * v)[None], np.eye(4))[0]
+                return by_opencv((point + time * v)[None], np.eye(4), LENS)[0]
 
             def late(time: float, at=at) -> float:
                 return time - ((at(time)[1] + 0.5) / 480 - 0.5) * 0.02
