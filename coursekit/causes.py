@@ -97,14 +97,12 @@ class Hypothesis:
     cause: str
     columns: Floats
     at: int = 0
-    rows: Sequence[int] | NDArray[np.intp] | None = None
+    rows: Sequence[int] | NDArray[np.intp] | slice = field(default_factory=lambda: slice(None))
     typical: float = 1.0
     tried: int = 1
 
     def dense(self, n: int) -> Floats:
         """The columns (n, k) on all n residuals."""
-        if self.rows is None:
-            return self.columns
         full = np.zeros((n, self.columns.shape[1]))
         full[self.rows] = self.columns
         return full
@@ -371,8 +369,7 @@ def likelihood_ratios(
         deviance = 2.0 * float(np.log(np.diag(root)).sum()) + float(residuals @ seen)
         plain = min(plain, deviance)
         for number, hypothesis in enumerate(hypotheses):
-            rows = slice(None) if hypothesis.rows is None else hypothesis.rows
-            block = hypothesis.columns
+            rows, block = hypothesis.rows, hypothesis.columns
             right = block.T @ seen[rows]
             inner = block.T @ left[rows][:, rows] @ block
             own = np.asarray(np.linalg.pinv(inner, rcond=1e-9, hermitian=True), np.float64)

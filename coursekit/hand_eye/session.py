@@ -304,24 +304,17 @@ class HandEyeSession:
         for name in self.names:
             write_bytes(place / name, images[name])
         write_bytes(place / POSES, self._csv().encode())
-        card = {
-            "mount": self.mount,
-            "board": asdict(self.board) | {"squares": list(self.board.squares)},
-            "intrinsics": self.intrinsics.to_dict(),
-            **(about or {}),
-        }
+        card = {"mount": self.mount, "board": asdict(self.board)}
+        card |= {"intrinsics": self.intrinsics.to_dict(), **(about or {})}
         write_bytes(place / SESSION, (json.dumps(card, indent=1) + "\n").encode())
 
     def _csv(self) -> str:
         turns = Rotation.from_matrix(self.T_base_gripper[:, :3, :3]).as_quat(canonical=True)
-        columns = [*PLACE, *TURN]
-        blocks = [self.T_base_gripper[:, :3, 3], turns]
-        for name, names in OPTIONAL.items():
-            if getattr(self, name) is not None:
-                columns += names
-                blocks.append(getattr(self, name).reshape(len(self), -1))
-        lines = [",".join(["file", *columns])]
-        for name, row in zip(self.names, np.hstack(blocks), strict=True):
+        known = [name for name in OPTIONAL if getattr(self, name) is not None]
+        blocks = [self.T_base_gripper[:, :3, 3], turns, *(getattr(self, name) for name in known)]
+        columns = ["file", *PLACE, *TURN, *(one for name in known for one in OPTIONAL[name])]
+        lines = [",".join(columns)]
+        for name, row in zip(self.names, np.column_stack(blocks), strict=True):
             lines.append(",".join([name, *(f"{value + 0.0:.8g}" for value in row)]))
         return "\n".join(lines) + "\n"
 
