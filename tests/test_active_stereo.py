@@ -37,8 +37,12 @@ def plate(name: str, size: tuple, center: tuple, albedo: float, specular: float 
     return Box(name, np.array(size), T, (albedo,) * 3, specular=specular)
 
 
+def truth_m(view) -> np.ndarray:
+    return render(view.scene, view.rig.left).depth_m
+
+
 def true_disparity(view) -> np.ndarray:
-    return F * B / view.truth_m
+    return F * B / truth_m(view)
 
 
 def disparities(view, n: int, seed: int, rows: slice = slice(None)) -> np.ndarray:
@@ -105,8 +109,9 @@ def test_brightness_follows_lambert_and_the_inverse_square():
         view = on_wall(rig, distance, tilt)
         left = view.images(np.random.default_rng(0))[0] - rig_module.BLACK_GREY
         normal = np.array([np.sin(np.radians(tilt)), 0, -np.cos(np.radians(tilt))])
+        depth_m = truth_m(view)
         for u, v in ((424, 240), (120, 240), (728, 240), (424, 90), (150, 400)):
-            z = view.truth_m[v, u]
+            z = depth_m[v, u]
             point = np.array([(u - UNIT.depth.cx) / F, (v - UNIT.depth.cy) / F, 1.0]) * z
             to_lamp = PROJECTOR_M - point
             r = np.linalg.norm(to_lamp)
@@ -402,7 +407,7 @@ def test_flying_pixels_are_a_few_per_cent_of_the_edge(near, behind, seed):
     """Valid pixels within 8 px of the block's outline that are on neither surface (5 sigma_d)."""
     wall, block = wall_scene(near + behind, 0.0)[0], tabletop(near)[2]
     view = replace(D435, seed=seed).look_at((wall, block))
-    mask = (view.truth_m < near + 0.001).astype(np.uint8)
+    mask = (truth_m(view) < near + 0.001).astype(np.uint8)
     square = np.ones((17, 17), np.uint8)
     band = (cv2.dilate(mask, square) - cv2.erode(mask, square)) > 0
     d = disparities(view, 3, seed)[:, band]

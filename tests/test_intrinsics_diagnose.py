@@ -118,7 +118,7 @@ def test_two_causes_are_both_named_and_measured() -> None:
     findings = diagnose(detections, CHECKERBOARD)
     assert set(findings.names) == {"bowed_board", "spoiled_view"}
     spoiled, bowed = findings
-    assert f"view {truth.spoiled_view:02d}:" in spoiled.evidence
+    assert f"view {truth.draw.spoiled_view:02d}:" in spoiled.evidence
     found = searched(detections)
     assert {step.test.cause for step in found.accepted} == {"bowed_board", "spoiled_view"}
     sag, sigma = causes.sag(found.model)
@@ -133,14 +133,14 @@ def test_the_sizes_of_focus_drift_and_shutter_motion_come_out() -> None:
     )
     model = searched(drifting).model
     assert tuple(model.sizes) == (causes.FOCUS,)
-    assert model.sizes[causes.FOCUS] == pytest.approx(truth.focal_scale.std(), rel=0.25)
+    assert model.sizes[causes.FOCUS] == pytest.approx(truth.draw.focal_scale.std(), rel=0.25)
     moving, truth = corner_session(
         CHECKERBOARD, LENS, FIRST_SEED + 1, effects=Effects(readout_s=0.02, speed_m_s=0.1)
     )
     model = searched(moving).model
     assert tuple(model.sizes) == (causes.SHUTTER,)
     assert np.sqrt(3) * model.sizes[causes.SHUTTER] == pytest.approx(0.002, rel=0.25)
-    estimated, true = model.values[causes.SHUTTER][:, :2], 0.02 * truth.velocity_m_s[:, :2]
+    estimated, true = model.values[causes.SHUTTER][:, :2], 0.02 * truth.draw.velocity_m_s[:, :2]
     assert np.corrcoef(estimated.ravel(), true.ravel())[0, 1] > 0.7
 
 
@@ -397,7 +397,7 @@ def test_the_depth_scale_has_an_honest_sigma() -> None:
         )
         scale = depth_scale(calibrate(detections, CHARUCO), list(truth.depth_m))
         assert scale is not None
-        off.append((scale.factor - 1.02) / scale.sigma)
+        off.append((scale[0] - 1.02) / scale[1])
     assert np.mean(np.square(off)) < 1.9  # chi2(20)/20 exceeds 1.9 in 1 % of all cases
     assert np.mean(np.square(off)) > 0.1
 
