@@ -304,7 +304,7 @@ class HandEyeSession:
         for name in self.names:
             write_bytes(place / name, images[name])
         write_bytes(place / POSES, self._csv().encode())
-        card = {"mount": self.mount, "board": asdict(self.board)}
+        card: dict[str, object] = {"mount": self.mount, "board": asdict(self.board)}
         card |= {"intrinsics": self.intrinsics.to_dict(), **(about or {})}
         write_bytes(place / SESSION, (json.dumps(card, indent=1) + "\n").encode())
 
@@ -406,7 +406,7 @@ def _check_columns(columns: set[str]) -> None:
         raise ValueError(say("hand_eye.no_pose_column", **facts))
 
 
-def _stacked(rows: Sequence[PoseRow]) -> tuple[Floats, dict[str, Floats]]:
+def _stacked(rows: Sequence[PoseRow]) -> tuple[Floats, dict[str, Any]]:
     """T_base_gripper (n, 4, 4) of the rows of a table, and of `OPTIONAL` what it has."""
     known = {
         name: np.squeeze([[row.values[one] for one in names] for row in rows])
