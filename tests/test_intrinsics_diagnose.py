@@ -80,8 +80,8 @@ def test_a_cause_is_named(label: str) -> None:
 
 
 def test_healthy_sessions_get_no_finding() -> None:
-    """At most 4 of 200 (nightly); of 8 none: a rate of 25 % passes with 10 %."""
-    count, most = (200, 4) if NIGHTLY else (8, 0)
+    """At most 4 of 200 (nightly); of 4 none: a rate of 25 % passes with 32 %."""
+    count, most = (200, 4) if NIGHTLY else (4, 0)
     found: Counter[tuple[str, ...]] = Counter()
     for seed in range(FIRST_SEED + 1000, FIRST_SEED + 1000 + count):
         # every other pair of seeds, so that each kind of board has both
@@ -118,7 +118,7 @@ def test_two_causes_are_both_named_and_measured() -> None:
     findings = diagnose(detections, CHECKERBOARD)
     assert set(findings.names) == {"bowed_board", "spoiled_view"}
     spoiled, bowed = findings
-    assert f"view {truth.spoiled_view:02d}:" in spoiled.evidence
+    assert f"view {truth.draw.spoiled_view:02d}:" in spoiled.evidence
     found = searched(detections)
     assert {step.test.cause for step in found.accepted} == {"bowed_board", "spoiled_view"}
     sag, sigma = causes.sag(found.model)
@@ -133,14 +133,14 @@ def test_the_sizes_of_focus_drift_and_shutter_motion_come_out() -> None:
     )
     model = searched(drifting).model
     assert tuple(model.sizes) == (causes.FOCUS,)
-    assert model.sizes[causes.FOCUS] == pytest.approx(truth.focal_scale.std(), rel=0.25)
+    assert model.sizes[causes.FOCUS] == pytest.approx(truth.draw.focal_scale.std(), rel=0.25)
     moving, truth = corner_session(
         CHECKERBOARD, LENS, FIRST_SEED + 1, effects=Effects(readout_s=0.02, speed_m_s=0.1)
     )
     model = searched(moving).model
     assert tuple(model.sizes) == (causes.SHUTTER,)
     assert np.sqrt(3) * model.sizes[causes.SHUTTER] == pytest.approx(0.002, rel=0.25)
-    estimated, true = model.values[causes.SHUTTER][:, :2], 0.02 * truth.velocity_m_s[:, :2]
+    estimated, true = model.values[causes.SHUTTER][:, :2], 0.02 * truth.draw.velocity_m_s[:, :2]
     assert np.corrcoef(estimated.ravel(), true.ravel())[0, 1] > 0.7
 
 
@@ -215,7 +215,8 @@ def test_the_size_of_a_cause_is_the_restricted_maximum_likelihood() -> None:
     best = minimize_scalar(deviance, bounds=(-20, 5), method="bounded")
     V = np.eye(len(z)) + np.exp(best.x) * K @ K.T
     sigma = np.sqrt(z @ np.linalg.solve(V, z) / len(z))
-    size, gain = model.plain.explains(hypothesis).best_size()
+    test = model.plain.explains(hypothesis)
+    size, gain = test.size, test.gain
     assert size == pytest.approx(np.exp(best.x / 2) * sigma, rel=0.1)  # the grid's step is 13 %
     assert gain == pytest.approx(deviance(-60.0) - best.fun, abs=0.2)
 
@@ -277,7 +278,10 @@ def fisheye_views(focal: float, seed: int) -> Detections:
     return Detections(views)
 
 
-@pytest.mark.parametrize(("focal", "seed"), [(310.0, 3), (340.0, 4), (280.0, 5)])
+FISHEYES = [(310.0, 3), (340.0, 4), (280.0, 5)]
+
+
+@pytest.mark.parametrize(("focal", "seed"), FISHEYES if NIGHTLY else FISHEYES[2:])
 def test_a_fisheye_is_a_wrong_lens_and_nothing_else(focal: float, seed: int) -> None:
     findings = diagnose(fisheye_views(focal, seed), CHECKERBOARD)
     assert findings.names == ("lens_model",)
@@ -396,7 +400,7 @@ def test_the_depth_scale_has_an_honest_sigma() -> None:
         )
         scale = depth_scale(calibrate(detections, CHARUCO), list(truth.depth_m))
         assert scale is not None
-        off.append((scale.factor - 1.02) / scale.sigma)
+        off.append((scale[0] - 1.02) / scale[1])
     assert np.mean(np.square(off)) < 1.9  # chi2(20)/20 exceeds 1.9 in 1 % of all cases
     assert np.mean(np.square(off)) > 0.1
 

@@ -107,7 +107,7 @@ def folding(coefficients, seed: int) -> Detections:
     return Detections(views)
 
 
-@pytest.mark.parametrize("case", FOLDS)
+@pytest.mark.parametrize("case", FOLDS if NIGHTLY else [*FOLDS][:2])
 def test_where_a_lens_folds_it_has_no_figures_and_all_that_is_said_is_a_number(case) -> None:
     views = folding(*FOLDS[case])
     result = intrinsics.calibrate(views, CHECKERBOARD)
@@ -227,8 +227,7 @@ def test_a_bow_is_found_and_its_damage_undone(board: Board) -> None:
         bow = intrinsics.fit_bow(fit(board, seed, effects=Effects(bow_m=0.001)))
         assert bow.result.converged
         assert bow.p_value < 1e-6
-        low, high = bow.interval_m()
-        sag_held += low <= 0.001 <= high
+        sag_held += abs(bow.sag_m - 0.001) <= bow.result.quantile() * bow.sigma_m
         low, high = bow.result.interval("fx")
         fx_held += low <= LENS.fx <= high
         fitted.append(bow.result)
