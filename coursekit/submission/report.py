@@ -17,7 +17,6 @@ import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -57,24 +56,9 @@ PLOT = {"W": 480, "H": 320, "LEFT": 52, "RIGHT": 14, "TOP": 14, "BOTTOM": 46}
 LARGEST_MM = 1e6  # beyond this nothing is drawn
 
 
-@cache
-def _template() -> jinja2.Template:
-    """The template of all pages, read once; everything that it shows is escaped."""
-    loader = jinja2.FileSystemLoader(HERE)
-    pages = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True)
-    pages.filters |= {
-        "points": _points,
-        "result": _result,
-        "counted": counted,
-        "px": "{:.1f}".format,
-    }
-    pages.globals |= PLOT | {"style": Markup((HERE / "report.css").read_text(encoding="utf-8"))}
-    return pages.get_template("report.html.jinja")
-
-
 def _page(**values: Any) -> str:
     """One page; values: what the template shows, with `what` for the kind of page."""
-    return _template().render(**values).lstrip()
+    return TEMPLATE.render(**values).lstrip()
 
 
 @dataclass(frozen=True)
@@ -362,25 +346,14 @@ def page_body(grade: Grade, submission: Submission) -> str:
 
     No flags, which are the instructor's.
     """
-    camera = submission.camera
-    baseline = "unknown" if camera.baseline_m is None else f"{1e3 * camera.baseline_m:.2f} mm"
     return _page(
         what="body",
         submission=submission,
         made=_date(submission.made),
-        grade=grade,
-        facts=f"{camera.name} ({camera.source}), {camera.width}x{camera.height} px, "
-        f"fx = {camera.fx:.1f} px, baseline {baseline}, "
-        f"depth unit {1e3 * camera.depth_scale_m:g} mm",
         figure=_noise_figure(submission, grade.recomputed),
         comparison=list(_comparison(grade, submission)),
         lost=[item for item in grade.items if item.points < item.of],
         right=[item for item in grade.items if item.points >= item.of],
-        paragraph=submission.conclusion.paragraph.strip(),
-        outcomes=[
-            (name, "right" if outcome.right else "not yet", outcome.attempts)
-            for name, outcome in sorted(submission.outcomes.items())
-        ],
     )
 
 
@@ -390,28 +363,25 @@ def _comparison(grade: Grade, submission: Submission) -> Iterator[tuple[str, ...
     for m in grade.recomputed.at:
         same = (row for row in claims.rows if abs(row.distance_m - m.distance_m) < 0.005)
         row = next(same, TableRow(m.distance_m))
-        claim = _pair(row.depth_bias_mm, row.depth_bias_se_mm, "+.2f", ".2f")
-        found = _pair(getattr(m.bias, "value", None), m.bias_se_mm, "+.2f", ".2f")
+        claim = _pair(row.depth_bias_mm, "+.2f", row.depth_bias_se_mm)
+        found = _pair(getattr(m.bias, "value", None), "+.2f", m.bias_se_mm)
         yield f"{m.distance_m:.2f}\u00a0m", "bias (mm)", claim, found
-        claim = _pair(row.depth_std_mm, row.depth_std_se_mm, ".3f", ".3f")
-        found = _pair(getattr(m.std, "value", None), getattr(m.std, "se", None), ".3f", ".3f")
+        claim = _pair(row.depth_std_mm, ".3f", row.depth_std_se_mm)
+        found = _pair(getattr(m.std, "value", None), ".3f", getattr(m.std, "se", None))
         yield "", "std (mm)", claim, found
         percent = None if row.invalid_fraction is None else 100 * row.invalid_fraction
-        yield "", "invalid (%)", _pair(percent), _pair(100 * m.invalid.value)
+        yield "", "invalid (%)", _pair(percent, ".1f"), _pair(100 * m.invalid.value, ".1f")
     sigma_d, ends = (law.sigma_d_px, law.sigma_d_interval_px) if law else (None, None)
-    claim, found = (_pair(value, None, ".3f") for value in (claims.sigma_d_px, sigma_d))
-    yield "all", "σ_d (px)", claim, found
+    yield "all", "σ_d (px)", _pair(claims.sigma_d_px, ".3f"), _pair(sigma_d, ".3f")
     yield "", "95 % (px)", _ends(claims.sigma_d_interval_px), _ends(ends)
 
 
-def _pair(
-    value: float | None, error: float | None = None, digits: str = ".1f", error_digits: str = ".2f"
-) -> str:
-    """A value and its error in fixed formats, such as "+1.25 ± 0.10"; "-" for what is not there."""
+def _pair(value: float | None, digits: str, error: float | None = None) -> str:
+    """A value and its error in a fixed format, such as "+1.25 ± 0.10"; "-" for none."""
     if value is None:
         return "-"
     text = _fixed(value, digits)
-    return text if error is None else f"{text} ± {_fixed(error, error_digits)}"
+    return text if error is None else f"{text} ± {_fixed(error, digits.lstrip('+'))}"
 
 
 def _ends(ends: Interval | None) -> str:
@@ -476,17 +446,7 @@ def _noise_figure(submission: Submission, found: Recomputed) -> dict[str, Any] |
     axes = _Axes(0.8 * min(ends), 1.1 * max(ends), 1.1 * max([*tops, 1e-6]))
     claims, off_claims = axes.split(claimed.items())
     guesses, off_guesses = axes.split(predicted.items())
-    off = ", ".join(off_claims + off_guesses)
-    key = [("measured", "recomputed from your raw depths, ± 2 standard errors")]
-    figure = _law_curves(axes, submission, found, ends, key)
-    key += [("claimed", "your table")] * bool(claimed)
-    key += [("predicted", "your prediction")] * bool(predicted)
-    words = []
-    for z, std, se in measured:
-        said = f", claimed {claimed[z]:.3g} mm" if z in claimed else ""
-        said += f", predicted {predicted[z]:.3g} mm" if z in predicted else ""
-        words.append(f"{z:.2f} m: recomputed {std:.3g} ± {se:.2g} mm{said}")
-    return figure | {
+    return _law_curves(axes, submission, found, min(ends)) | {
         "x_ticks": [(axes.x(v), f"{v:.2g}") for v in _ticks(axes.low, axes.high, 6)],
         "y_ticks": [(axes.y(v), f"{v:.3g}") for v in _ticks(0, axes.top, 5)],
         "measured": [
@@ -496,43 +456,36 @@ def _noise_figure(submission: Submission, found: Recomputed) -> dict[str, Any] |
         ],
         "claimed": claims,
         "predicted": guesses,
-        "key": key,
-        "alt": f"Std of one pixel's depth over time at {'; '.join(words)}.",
-        "off": f" Off the scale and not drawn: {off}." if off else "",
+        "said": [(*row, claimed.get(row[0]), predicted.get(row[0])) for row in measured],
+        "has_table": bool(claimed),
+        "has_guesses": bool(predicted),
+        "off": ", ".join(off_claims + off_guesses),
     }
 
 
 def _law_curves(
-    axes: _Axes,
-    submission: Submission,
-    found: Recomputed,
-    ends: Sequence[float],
-    key: list[tuple[str, str]],
-) -> dict[str, str]:
+    axes: _Axes, submission: Submission, found: Recomputed, nearest: float
+) -> dict[str, Any]:
     """The curve of the fitted law with its band, and, where it shows, what rounding to counts makes
-    of it; what they mean goes into `key`."""
+    of it; `in_counts` is the count in mm where that shows at the nearest distance, too."""
     if found.law is None:
         return {}
-    step_mm = 1e3 * submission.camera.depth_scale_m
+    step_mm, z = 1e3 * submission.camera.depth_scale_m, np.linspace(axes.low, axes.high, 40)
 
     def rounded(std_mm: float) -> float:
         return math.sqrt(float(rounded_variance(std_mm, step_mm)))
 
-    def rounding_shows(z: float) -> bool:
-        least = 1e3 * float(found.law.std_m(z)[0]) if found.law else 0.0
-        return rounded(least) > 1.05 * least
-
-    z = np.linspace(axes.low, axes.high, 40)
     middle, low, high = ((1e3 * curve).tolist() for curve in found.law.std_m(z))
-    band = np.minimum(low + high[::-1], axes.top)
-    key.append(("law", f"law with your σ_d of {found.law.sigma_d_px:.3f} px, and its 95 % band"))
-    if rounding_shows(min(ends)):
-        key.append(("rounded", f"the same in depth counts of {step_mm:g} mm"))
-    shows = rounding_shows(axes.low)
+    shows, near = (
+        rounded(std) > 1.05 * std
+        for std in (1e3 * float(found.law.std_m(at)[0]) for at in (axes.low, nearest))
+    )
     return {
-        "band": axes.path([*z, *z[::-1]], band),
+        "band": axes.path([*z, *z[::-1]], np.minimum(low + high[::-1], axes.top)),
         "law": axes.path(z, middle),
         "rounded": axes.path(z, map(rounded, middle)) if shows else "",
+        "sigma_d": found.law.sigma_d_px,
+        "in_counts": step_mm if near else None,
     }
 
 
@@ -567,17 +520,18 @@ def class_page(lines: Sequence[ReportLine], changes: Sequence[tuple[str, ...]] =
     """
     done = [line for line in lines if line.points is not None]
     counts = [line for line in done if line.counts]
-    percents = [line.percent or 0.0 for line in counts]
     everybody = [line for line in lines if line.counts]
-    named = sorted(everybody, key=lambda line: (words_of(line.name or line.student), line.file))
+    given = [(line.total, line.of or 100) for line in everybody]
+    percents = [100 * total / of for total, of in given if total is not None]
+    named = sorted(everybody, key=_by_name)
     ask_first = "No points were taken for these. Ask first: there may be an innocent reason."
+    others = [line for line in lines if line.points is None and line.reason != "missing"]
     return _page(
         what="class",
         done=done,
         counts=counts,
         percents=percents,
         median=statistics.median(percents) if percents else 0.0,
-        flagged=sum(line.flagged for line in done),
         figure=_histogram(percents),
         topics=_topics(counts),
         left_out=_left_out(counts),
@@ -585,20 +539,18 @@ def class_page(lines: Sequence[ReportLine], changes: Sequence[tuple[str, ...]] =
             ("To look at", ask_first, _by_flag(done, False)),
             ("Notes", "Expected, and no reason to ask.", _by_flag(done, True)),
         ],
-        refused=[
-            (
-                line,
-                f"{line.name} is asked to hand it in again." if _told(line) and line.name else "",
-            )
-            for line in lines
-            if line.points is None and line.reason != "missing"
-        ],
+        refused=[(line, bool(_told(line) and line.name)) for line in others],
         missing=[line.name for line in lines if line.reason == "missing"],
         late=[line for line in everybody if line.late],
         changes=changes,
         named=named,
         ranked=sorted(named, key=lambda line: (line.total is not None, line.total or 0.0)),
     )
+
+
+def _by_name(line: ReportLine) -> tuple[list[str], str]:
+    """In which order people stand on a page."""
+    return words_of(line.name or line.student), line.file
 
 
 def _result(line: ReportLine) -> str:
@@ -625,7 +577,8 @@ def _topics(lines: Sequence[ReportLine]) -> list[tuple[str, str, int, Any]]:
             for said in mistakes:
                 who.setdefault(said, []).append(line)
         groups = sorted(who.items(), key=lambda pair: -len(pair[1]))
-        found.append((label, REPEAT.get(topic, ""), wrong, groups))
+        if groups:
+            found.append((label, REPEAT.get(topic, ""), wrong, groups))
     return sorted(found, key=lambda row: -row[2])
 
 
@@ -654,12 +607,9 @@ def paragraphs_page(lines: Sequence[ReportLine], named: bool = True) -> str:
 
     named: else by code and without links, for a second marker.
     """
-    some = [line for line in lines if line.points is not None and line.counts]
-    some.sort(key=lambda line: (words_of(line.name or line.student), line.file))
+    some = sorted((n for n in lines if n.points is not None and n.counts), key=_by_name)
     if not named:
-        some = sorted(
-            (replace(line, name=line.code, page="") for line in some), key=lambda line: line.name
-        )
+        some = sorted((replace(n, name=n.code, page="") for n in some), key=lambda n: n.name)
     said = [(line, _about(line)) for line in some if line.paragraph.strip()]
     silent = [line for line in some if not line.paragraph.strip()]
     return _page(what="paragraphs", said=said, silent=silent, named=named)
@@ -794,3 +744,9 @@ def _cell(text: str) -> str:
 def _points(value: float | None) -> str:
     """Points without zeros that say nothing."""
     return "" if value is None else f"{value:.2f}".rstrip("0").rstrip(".")
+
+
+PAGES = jinja2.Environment(loader=jinja2.FileSystemLoader(HERE), autoescape=True, trim_blocks=True)
+PAGES.filters |= {"points": _points, "result": _result, "counted": counted, "px": "{:.1f}".format}
+PAGES.globals |= PLOT | {"style": Markup((HERE / "report.css").read_text(encoding="utf-8"))}
+TEMPLATE = PAGES.get_template("report.html.jinja")  # of all pages; it escapes all that it shows
