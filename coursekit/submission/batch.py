@@ -46,9 +46,16 @@ from tqdm.auto import tqdm
 from coursekit import results
 from coursekit.checks import positive, want
 from coursekit.submission import report
-from coursekit.submission.flags import Roster, as_json, class_table, place_of, words_of
+from coursekit.submission.flags import (
+    Roster,
+    as_json,
+    class_table,
+    grouped,
+    place_of,
+    words_of,
+)
 from coursekit.submission.format import DOCUMENTS, MANIFEST, NO_TEXT, TURNING_SIGNS, is_junk, slug
-from coursekit.submission.recompute import LABELS, grading_rules
+from coursekit.submission.recompute import LABELS, WORDS, grading_rules
 from coursekit.words import counted
 
 TIMEOUT_S = 10.0
@@ -67,6 +74,8 @@ ONE_THREAD = {
     f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL", "NUMBA", "BLIS")
 } | {"VECLIB_MAXIMUM_THREADS": "1"}
 
+NOT_GRADED = "not graded (time, memory or a crash)"
+KINDS = {"graded": "graded", "refused": "refused", "failed": NOT_GRADED, "flagged": "flagged"}
 CANNOT_START = (
     "the processes that grade cannot be started, or end at once. Try --workers 1; if that fails "
     "too, more memory is needed, or the installation is broken (run `python3 course.py test`)"
@@ -104,18 +113,16 @@ class Bundle:
 
 @dataclass(frozen=True)
 class Summary:
-    """How a batch went: numbers of bundles, and the folder of the report.
+    """How a batch went, and the folder of the report.
 
-    kept: of those, how many were graded by an earlier run. left_out: files that are no bundle.
+    counts: of bundles that were "graded", "refused" or "failed", and of those "flagged". kept: of
+    those, how many were graded by an earlier run. left_out: files that are no bundle.
     missing: who of the roster handed in nothing. changes: of a regrade, whose points changed, from
     what, to what, and why. notes: on the tables.
     """
 
     out: Path
-    graded: int
-    refused: int
-    failed: int
-    flagged: int
+    counts: Counter[str]
     kept: int
     left_out: tuple[str, ...]
     seconds: float
@@ -124,13 +131,9 @@ class Summary:
     notes: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        n = self.graded + self.refused + self.failed
-        others = {
-            "refused": self.refused,
-            "not graded (time, memory or a crash)": self.failed,
-            "flagged": self.flagged,
-        }
-        parts = [f"{self.graded} graded", *(f"{k} {what}" for what, k in others.items() if k)]
+        n = sum(self.counts[kind] for kind in ("graded", "refused", "failed"))
+        said = [kind for kind in KINDS if self.counts[kind] or kind == "graded"]
+        parts = [f"{self.counts[kind]} {KINDS[kind]}" for kind in said]
         took = f" in {self.seconds:.0f} s" if self.kept < n else ""
         lines = [f"{counted(n, 'bundle')}{took}: {', '.join(parts)}."]
         if self.kept:
@@ -200,11 +203,12 @@ def grade_folder(
     roster = Roster(class_table(Path(choices.roster)) if choices.roster else ())
     _own_points(out / OWN_POINTS)
     _check_out(out, overwrite)
-    if not folder.is_file():
-        return _grade(folder, out, limits, progress, roster, choices)
+    zipped = folder.is_file()
     with tempfile.TemporaryDirectory() as scratch:
-        _unpack(folder, Path(scratch))
-        return _grade(Path(scratch), out, limits, progress, roster, choices, dated=True)
+        if zipped:
+            _unpack(folder, Path(scratch))
+        bundles = Path(scratch) if zipped else folder
+        return _grade(bundles, out, limits, progress, roster, choices, dated=zipped)
 
 
 def _grade(
@@ -245,19 +249,10 @@ def _grade(
             raise Stopped(f"{says} from there.") from None
         done, changes, notes = _finish(out, bundles, others, roster, choices)
     counts = Counter(_kind(line) for line in done)
-    return Summary(
-        out,
-        counts["graded"],
-        counts["refused"],
-        counts["failed"],
-        sum(line.flagged for line in done),
-        kept,
-        left_out,
-        time.monotonic() - started,
-        tuple(line.name for line in done if line.reason == "missing"),
-        tuple(changes),
-        notes,
-    )
+    counts["flagged"] = sum(line.flagged for line in done)
+    missing = tuple(line.name for line in done if line.reason == "missing")
+    seconds = time.monotonic() - started
+    return Summary(out, counts, kept, left_out, seconds, missing, tuple(changes), notes)
 
 
 @contextlib.contextmanager
@@ -342,10 +337,7 @@ def find_bundles(folder: Path, out: Path) -> tuple[list[Bundle], tuple[str, ...]
             "want the folder with what students handed in"
         )
     handed = {_whose(bundle.name) for bundle in found}
-    alone: dict[str, list[str]] = {}
-    for name in others:
-        if _whose(name) not in handed | {""}:
-            alone.setdefault(_whose(name), []).append(name)
+    alone = grouped((_whose(name), name) for name in others if _whose(name) not in handed | {""})
     for names in alone.values():
         says = f"There is no bundle, only {', '.join(names[:5])}. Ask for the .zip."
         lines.append((report.not_graded(names[0], "no_bundle", says), ""))
@@ -360,13 +352,11 @@ def _whose(name: str) -> str:
 
 def _holds_a_bundle(path: Path) -> bool:
     """Whether a file without the ending .zip is a zip with a manifest in it."""
-    try:
-        if path.is_symlink() or not path.is_file():
-            return False
-        with path.open("rb") as file:
-            return file.read(4) == b"PK\3\4" and MANIFEST.encode() in file.read(HASHED_BYTES)
-    except OSError:
-        return False
+    with contextlib.suppress(OSError):
+        if path.is_file() and not path.is_symlink():
+            with path.open("rb") as file:
+                return file.read(4) == b"PK\3\4" and MANIFEST.encode() in file.read(HASHED_BYTES)
+    return False
 
 
 def _unpack(archive: Path, into: Path) -> None:
@@ -470,7 +460,7 @@ def work_through(
                     yield running.pop(future), outcome
         for bundle in running.values():
             if bundle.key in tried:
-                yield bundle, _failed(bundle, "lost", "All processes ended with it, twice.")
+                yield bundle, _failed(bundle, "lost")
             else:
                 tried.add(bundle.key)
                 again.append(bundle)
@@ -507,20 +497,17 @@ def _outcome(future: Future[Graded], bundle: Bundle, limits: Limits) -> Graded:
         raise error
     ending = _ending(error.exitcode) if isinstance(error, ProcessExpired) else ""
     if isinstance(error, TimeoutError) or ending == "SIGPROF":
-        says = f"It took longer than {limits.timeout_s:g} s. Grade it with a longer --timeout."
-        return _failed(bundle, "timeout", says)
+        return _failed(bundle, "timeout", limit=limits.timeout_s)
     if ending:
-        says = f"It ended the process that graded it ({ending}). Look inside."
-        return _failed(bundle, "died", says)
+        return _failed(bundle, "died", ending=ending)
     if isinstance(error, MemoryError):
-        return report.out_of_memory(bundle.name), ""
-    says = f"The grader failed on it ({type(error).__name__}). Please report it with the file."
-    return _failed(bundle, "error", says)
+        return _failed(bundle, "memory")
+    return _failed(bundle, "error", error=type(error).__name__)
 
 
-def _failed(bundle: Bundle, reason: str, says: str) -> Graded:
+def _failed(bundle: Bundle, reason: str, **facts: Any) -> Graded:
     """The line of a bundle whose grading failed, and no page."""
-    return report.not_graded(bundle.name, reason, says), ""
+    return report.not_graded(bundle.name, reason, **facts), ""
 
 
 def _ending(code: int) -> str:
@@ -678,7 +665,7 @@ def _finish(
 ) -> tuple[list[report.ReportLine], list[tuple[str, ...]], tuple[str, ...]]:
     """Write what takes the whole class; returns the lines with what they share, changes and notes
     on the tables."""
-    gone = "What was kept of it is gone. Run the same command again."
+    gone = WORDS["failed"]["gone"]
     each = [_load(out, b) or report.not_graded(b.name, "lost", gone) for b in bundles]
     each += [line for line, _ in others]
     own = _own_points(out / OWN_POINTS)
@@ -808,5 +795,5 @@ def _dated(path: Path) -> str:
 def _kind(line: report.ReportLine) -> str:
     """What the summary counts a line as: graded, refused, failed or missing."""
     if line.points is not None or line.reason == "missing":
-        return "graded" if line.reason != "missing" else "missing"
+        return line.reason or "graded"
     return "failed" if line.reason in report.FAILED else "refused"

@@ -34,18 +34,20 @@ from coursekit.submission.flags import (
     Person,
     Roster,
     copies,
+    grouped,
     place_of,
     same_words,
+    seen,
     words_of,
 )
 from coursekit.submission.format import Plot, Refused, Submission, TableRow, read_bundle
-from coursekit.submission.recompute import HEADINGS, LABELS, MISTAKES, REPEAT, SEEN, Recomputed
+from coursekit.submission.recompute import HEADINGS, LABELS, MISTAKES, REPEAT, WORDS, Recomputed
 from coursekit.submission.rubric import Grade, Item, grade
 from coursekit.words import counted
 
 HEADER = (*HEADINGS["first"], *LABELS, *HEADINGS["last"])  # of grades.csv
 FAILED = ("timeout", "died", "memory", "error", "lost")  # reasons; tried anew by the next run
-NOTHING = "Nothing was handed in."
+NOTHING = WORDS["failed"]["missing"]
 AGAIN = "Your file could not be read: hand it in again."
 MOODLE_COLUMNS, CANVAS_COLUMNS, OWN_COLUMNS = (HEADINGS[k] for k in ("moodle", "canvas", "own"))
 FORMULA = tuple("=+-@\t\r\n＝＋－＠")  # what makes a spreadsheet calculate a cell
@@ -150,8 +152,10 @@ def graded(file: str, grade: Grade, submission: Submission) -> ReportLine:
     )
 
 
-def not_graded(file: str, reason: str, says: str) -> ReportLine:
-    """The line of a bundle that was refused, or whose grading failed."""
+def not_graded(file: str, reason: str, says: str = "", **facts: Any) -> ReportLine:
+    """The line of a bundle that was refused, or whose grading failed; says: else what words.toml
+    says of the reason, with the facts in it."""
+    says = says or WORDS["failed"][reason].format(**facts)
     return ReportLine(file, reason=reason, says=says)
 
 
@@ -168,13 +172,7 @@ def grade_file(path: str, name: str) -> tuple[ReportLine, str]:
     except Refused as refused:
         return not_graded(name, refused.reason, str(refused)), ""
     except MemoryError:
-        return out_of_memory(name), ""
-
-
-def out_of_memory(name: str) -> ReportLine:
-    """The line of a bundle that wants more memory than a process may have."""
-    says = "It takes more memory than a bundle may. Ask for it again, or look inside."
-    return not_graded(name, "memory", says)
+        return not_graded(name, "memory"), ""
 
 
 def across(
@@ -200,13 +198,9 @@ def across(
         if line.fingerprint is not None
     }
     said = {line.file: (who[line.file].key, line.paragraph) for line in done}
-    about: dict[str, list[Flag]] = {}
-    for copy in [*copies(prints), *same_words(said)]:
-        for key in copy.keys:
-            about.setdefault(key, []).append(_copy_flag(copy))
-    theirs: dict[str, list[ReportLine]] = {}
-    for line in lines:
-        theirs.setdefault(who[line.file].key, []).append(line)
+    shared = [*copies(prints), *same_words(said)]
+    about = grouped((key, _copy_flag(copy)) for copy in shared for key in copy.keys)
+    theirs = grouped((who[line.file].key, line) for line in lines)
     chosen = {
         key: _that_counts([line for line in some if line.points is not None] or some)
         for key, some in theirs.items()
@@ -219,21 +213,16 @@ def across(
         flags = [*line.flags, *about.get(line.file, ()), *more, *_clock(line)]
         flags += roster.other_name(one, line.student)
         if last is not line and line.points is not None:
-            says = (
-                f"An earlier bundle of {last.student}, {_points(line.points)} points; "
-                f"{last.file} counts, {_points(last.points)} points."
-            )
-            flags.append(Flag("earlier_bundle", says, note=True))
+            facts = {"student": last.student, "file": last.file}
+            facts |= {"points": _points(line.points), "better": _points(last.points)}
+            flags.append(seen("earlier_bundle", note=True, **facts))
         own_line = _of(line, one, own)
         found.append(
             replace(own_line, flags=tuple(flags), counts=last is line, late=late, fingerprint=None)
         )
-    there = {line.who for line in found}
-    for one in roster.people.values():
-        if one.key not in there:
-            nothing = not_graded("", "missing", NOTHING)
-            found.append(_of(nothing, one, own))
-    return found
+    nothing, there = not_graded("", "missing"), {line.who for line in found}
+    missing = [one for one in roster.people.values() if one.key not in there]
+    return [*found, *(_of(nothing, one, own) for one in missing)]
 
 
 def _of(line: ReportLine, one: Person, own: Mapping[str, Mapping[str, str]]) -> ReportLine:
@@ -260,8 +249,7 @@ def _that_counts(some: Sequence[ReportLine]) -> tuple[ReportLine, tuple[Flag, ..
         f"{line.file} ({_points(line.points)} points, packed {_date(line.made)})"
         for line in some[:6]
     )
-    says = SEEN["same_name"].format(typed=best.student, bundles=each)
-    return best, (Flag("same_name", says),)
+    return best, (seen("same_name", typed=best.student, bundles=each),)
 
 
 def _clock(line: ReportLine) -> Iterator[Flag]:
@@ -269,10 +257,8 @@ def _clock(line: ReportLine) -> Iterator[Flag]:
     now = datetime.now(UTC).isoformat(timespec="seconds")
     for what, moment in (("was handed in", line.handed_in), ("was graded", now)):
         if line.made and moment and _seconds(line.made) > _seconds(moment) + 86_400:
-            says = SEEN["wrong_clock"].format(
-                made=_date(line.made), after=f"it {what} ({_date(moment)})"
-            )
-            yield Flag("wrong_clock", says)
+            after = f"it {what} ({_date(moment)})"
+            yield seen("wrong_clock", made=_date(line.made), after=after)
             return
 
 
@@ -568,37 +554,36 @@ def _topics(lines: Sequence[ReportLine]) -> list[tuple[str, str, int, Any]]:
     """
     found = []
     for topic, label in LABELS.items():
-        who: dict[str, list[ReportLine]] = {}
-        wrong = 0
-        for line in lines:  # a mistake made at three distances is made by one student
-            items = [i for i in line.items if i.topic == topic and i.verdict != "missing"]
-            mistakes = dict.fromkeys(filter(None, map(_said, items)))
-            wrong += bool(mistakes)
-            for said in mistakes:
-                who.setdefault(said, []).append(line)
-        groups = sorted(who.items(), key=lambda pair: -len(pair[1]))
-        if groups:
-            found.append((label, REPEAT.get(topic, ""), wrong, groups))
+        said = [(line, _ways(line, topic)) for line in lines]
+        groups = grouped((way, line) for line, ways in said for way in ways)
+        ranked = sorted(groups.items(), key=lambda pair: -len(pair[1]))
+        if ranked:
+            found.append(
+                (label, REPEAT.get(topic, ""), sum(bool(ways) for _, ways in said), ranked)
+            )
     return sorted(found, key=lambda row: -row[2])
+
+
+def _ways(line: ReportLine, topic: str) -> list[str]:
+    """In which ways a topic is wrong; a mistake made at three distances is one."""
+    items = [i for i in line.items if i.topic == topic and i.verdict != "missing"]
+    return [*dict.fromkeys(filter(None, map(_said, items)))]
 
 
 def _left_out(lines: Sequence[ReportLine]) -> list[tuple[str, list[ReportLine]]]:
     """What students left out, with those who left out the same."""
-    who: dict[str, list[ReportLine]] = {}
-    for line in lines:
-        topics = dict.fromkeys(item.topic for item in line.items if item.verdict == "missing")
-        if topics:
-            who.setdefault(", ".join(LABELS[topic] for topic in topics), []).append(line)
+    topics = (
+        (dict.fromkeys(item.topic for item in line.items if item.verdict == "missing"), line)
+        for line in lines
+    )
+    who = grouped((", ".join(LABELS[t] for t in some), line) for some, line in topics if some)
     return sorted(who.items(), key=lambda pair: -len(pair[1]))
 
 
 def _by_flag(lines: Sequence[ReportLine], note: bool) -> list[Any]:
     """Those who share a flag share a row."""
-    who: dict[tuple[str, str], list[ReportLine]] = {}
-    for line in lines:
-        for flag in line.flags:
-            if flag.note == note:
-                who.setdefault((flag.code.replace("_", " "), flag.says), []).append(line)
+    flags = ((flag, line) for line in lines for flag in line.flags if flag.note == note)
+    who = grouped(((flag.code.replace("_", " "), flag.says), line) for flag, line in flags)
     return list(who.items())
 
 
