@@ -75,7 +75,7 @@ ONE_THREAD = {
 } | {"VECLIB_MAXIMUM_THREADS": "1"}
 
 NOT_GRADED = "not graded (time, memory or a crash)"
-KINDS = {"graded": "graded", "refused": "refused", "failed": NOT_GRADED, "flagged": "flagged"}
+SUMMED = {"graded": "graded", "refused": "refused", "failed": NOT_GRADED, "flagged": "flagged"}
 CANNOT_START = (
     "the processes that grade cannot be started, or end at once. Try --workers 1; if that fails "
     "too, more memory is needed, or the installation is broken (run `python3 course.py test`)"
@@ -132,8 +132,8 @@ class Summary:
 
     def __str__(self) -> str:
         n = sum(self.counts[kind] for kind in ("graded", "refused", "failed"))
-        said = [kind for kind in KINDS if self.counts[kind] or kind == "graded"]
-        parts = [f"{self.counts[kind]} {KINDS[kind]}" for kind in said]
+        said = [kind for kind in SUMMED if self.counts[kind] or kind == "graded"]
+        parts = [f"{self.counts[kind]} {SUMMED[kind]}" for kind in said]
         took = f" in {self.seconds:.0f} s" if self.kept < n else ""
         lines = [f"{counted(n, 'bundle')}{took}: {', '.join(parts)}."]
         if self.kept:

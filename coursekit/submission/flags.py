@@ -32,8 +32,8 @@ from coursekit.checks import want
 from coursekit.submission.format import CameraFacts, Stack, Submission
 from coursekit.submission.recompute import HEADINGS, SEEN, Recomputed, grading_rules
 
-Key = TypeVar("Key")
-Thing = TypeVar("Thing")
+_Key = TypeVar("_Key")
+_Thing = TypeVar("_Thing")
 LARGEST_WAVE = 6  # so many of them across a window; finer ones hold what was added
 N_WAVES = (
     27  # numbers in a spectrum: pairs of 0 to 6 waves down and across, in any order, but (0, 0)
@@ -66,7 +66,7 @@ class Flag:
     note: bool = False
 
 
-def seen(code: str, note: bool = False, **facts: Any) -> Flag:
+def flag_of(code: str, note: bool = False, **facts: Any) -> Flag:
     """The flag of this code; facts: what its sentence in words.toml has to be filled with."""
     return Flag(code, SEEN[code].format(**facts), note)
 
@@ -94,12 +94,12 @@ def _too_clean(camera: CameraFacts, found: Recomputed, limits: dict[str, float])
     for m in several:
         different, n = len({frame.tobytes() for frame in m.stack.counts}), m.stats.n_frames
         if different < n and not m.stats.frozen_fraction > 0.5:
-            yield seen("repeated_frames", z=m.distance_m, different=different, n=n)
+            yield flag_of("repeated_frames", z=m.distance_m, different=different, n=n)
     product = camera.fx * (camera.baseline_m or 0.05)
     known = [m for m in several if m.std is not None]
     sigma_d = [m.stats.pixel_std_unrounded_m * product / m.distance_m**2 for m in known]
     if sigma_d and max(sigma_d) < limits["least_sigma_d_px"]:
-        yield seen("too_clean", most=max(sigma_d), least=limits["least_sigma_d_px"])
+        yield flag_of("too_clean", most=max(sigma_d), least=limits["least_sigma_d_px"])
 
 
 def _flat(found: Recomputed, limits: dict[str, float]) -> Iterator[Flag]:
@@ -109,7 +109,7 @@ def _flat(found: Recomputed, limits: dict[str, float]) -> Iterator[Flag]:
         return
     most = free.exponent + 2 * math.sqrt(free.covariance[1, 1])
     if most < limits["flat_exponent"]:
-        yield seen("not_distance_dependent", exponent=free.exponent, most=most)
+        yield flag_of("not_distance_dependent", exponent=free.exponent, most=most)
 
 
 def _invented(found: Recomputed, limits: dict[str, float]) -> Iterator[Flag]:
@@ -132,15 +132,15 @@ def _invented(found: Recomputed, limits: dict[str, float]) -> Iterator[Flag]:
     pattern = max((look.pattern for _, look in looks), default=math.inf)
     uneven = max((look.uneven for _, look in looks if look.uneven is not None), default=math.inf)
     if likeness < limits["white"]:
-        yield seen("white_in_space", likeness=likeness)
+        yield flag_of("white_in_space", likeness=likeness)
     if pattern < limits["pattern"]:
-        yield seen("no_pattern", times=pattern)
+        yield flag_of("no_pattern", times=pattern)
     if uneven < limits["uneven"]:
-        yield seen("even_noise", part=uneven)
+        yield flag_of("even_noise", part=uneven)
     for (one, first), (two, second) in combinations(looks, 2):
         likeness = _correlation(first.stays, second.stays)
         if likeness > limits["same_pattern"]:
-            yield seen("same_pattern", one=one, two=two, likeness=likeness)
+            yield flag_of("same_pattern", one=one, two=two, likeness=likeness)
 
 
 class _Look(NamedTuple):
@@ -224,7 +224,7 @@ def _simulated(submission: Submission) -> Iterator[Flag]:
     if camera.source == "live" and any(_perfect_clock(s.times_s) for s in submission.stacks):
         reasons.append("its clock has no jitter")
     if reasons and camera.source != "simulated":
-        yield seen("simulated_as_live", source=camera.source, reasons="; ".join(reasons))
+        yield flag_of("simulated_as_live", source=camera.source, reasons="; ".join(reasons))
 
 
 @cache
@@ -254,7 +254,7 @@ def _times(submission: Submission, limits: dict[str, float]) -> Iterator[Flag]:
             reasons.append(f"{where} say {1 / float(np.median(steps)):.3g} frames a second")
     reasons += _times_together(submission)
     if reasons:
-        yield seen("impossible_times", reasons="; ".join(reasons))
+        yield flag_of("impossible_times", reasons="; ".join(reasons))
 
 
 def _times_together(submission: Submission) -> Iterator[str]:
@@ -281,7 +281,7 @@ def _one_stack_twice(prints: Sequence[StackPrint]) -> Iterator[Flag]:
         for two in prints[:i]:
             alike = _shared(one, [two])[0][0] or _shared(two, [one])[0][0]
             if one.digest == two.digest or alike:
-                yield seen("one_stack_twice", one=two.distance_m, two=one.distance_m)
+                yield flag_of("one_stack_twice", one=two.distance_m, two=one.distance_m)
 
 
 # --- fingerprints, and who shares what ------------------------------------------------------
@@ -481,9 +481,9 @@ def _same_values(prints: Mapping[str, Fingerprint]) -> Counter[tuple[str, str, f
     return shared
 
 
-def grouped(pairs: Iterable[tuple[Key, Thing]]) -> dict[Key, list[Thing]]:
+def grouped(pairs: Iterable[tuple[_Key, _Thing]]) -> dict[_Key, list[_Thing]]:
     """The things that have the same key, in order."""
-    found: dict[Key, list[Thing]] = {}
+    found: dict[_Key, list[_Thing]] = {}
     for key, thing in pairs:
         found.setdefault(key, []).append(thing)
     return found
@@ -651,10 +651,10 @@ class Roster:
             return
         other = self.find(typed)
         if other is not None and other.key != one.key:
-            yield seen("another_student", typed=typed, name=one.name)
+            yield flag_of("another_student", typed=typed, name=one.name)
         else:
             alike = bool({*words_of(typed)} & {*words_of(one.name)})
-            yield seen("other_name", alike, typed=typed, name=one.name)
+            yield flag_of("other_name", alike, typed=typed, name=one.name)
 
 
 def class_table(path: Path) -> list[dict[str, str]]:

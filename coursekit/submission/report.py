@@ -34,10 +34,10 @@ from coursekit.submission.flags import (
     Person,
     Roster,
     copies,
+    flag_of,
     grouped,
     place_of,
     same_words,
-    seen,
     words_of,
 )
 from coursekit.submission.format import Plot, Refused, Submission, TableRow, read_bundle
@@ -215,7 +215,7 @@ def across(
         if last is not line and line.points is not None:
             facts = {"student": last.student, "file": last.file}
             facts |= {"points": _points(line.points), "better": _points(last.points)}
-            flags.append(seen("earlier_bundle", note=True, **facts))
+            flags.append(flag_of("earlier_bundle", note=True, **facts))
         own_line = _of(line, one, own)
         found.append(
             replace(own_line, flags=tuple(flags), counts=last is line, late=late, fingerprint=None)
@@ -249,7 +249,7 @@ def _that_counts(some: Sequence[ReportLine]) -> tuple[ReportLine, tuple[Flag, ..
         f"{line.file} ({_points(line.points)} points, packed {_date(line.made)})"
         for line in some[:6]
     )
-    return best, (seen("same_name", typed=best.student, bundles=each),)
+    return best, (flag_of("same_name", typed=best.student, bundles=each),)
 
 
 def _clock(line: ReportLine) -> Iterator[Flag]:
@@ -258,7 +258,7 @@ def _clock(line: ReportLine) -> Iterator[Flag]:
     for what, moment in (("was handed in", line.handed_in), ("was graded", now)):
         if line.made and moment and _seconds(line.made) > _seconds(moment) + 86_400:
             after = f"it {what} ({_date(moment)})"
-            yield seen("wrong_clock", made=_date(line.made), after=after)
+            yield flag_of("wrong_clock", made=_date(line.made), after=after)
             return
 
 

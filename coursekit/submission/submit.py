@@ -29,7 +29,7 @@ from coursekit.words import counted
 MEASURED = "studio_1.measured"  # in results/
 LESSON_PREFIX = "depth_noise."  # of its checkpoints and exercises
 COLUMNS = [field.name for field in fields(bundle.TableRow)][1:]  # of one's own table
-CAMERA = ("name", "serial", "source", "baseline_m", "depth_scale_m")
+CAMERA_FACTS = ("name", "serial", "source", "baseline_m", "depth_scale_m")
 IN_MM = {"mm": 1.0, "m": 1e3}  # units of a std, and what one of them is in mm
 NOBODY = "nobody"  # stands in for a name while there is none
 Table = Mapping[float, Sequence[float | None]]
@@ -116,7 +116,7 @@ def measured(
     if fit.baseline_m is not None:  # else there is no disparity
         sigma_d, interval = fit.sigma_d_px, fit.sigma_d_interval_px
     stds = tuple(std for z in at if (std := _std_mm(z, quantities)) is not None)
-    facts = {name: getattr(camera, name) for name in CAMERA} | asdict(camera.depth)
+    facts = {name: getattr(camera, name) for name in CAMERA_FACTS} | asdict(camera.depth)
     figure = bundle.Plot(at, stds, predicted) if len(stds) == len(stacks) else None
     return bundle.Submission(
         student=NOBODY,
