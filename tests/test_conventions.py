@@ -1,7 +1,5 @@
 """geometry against librealsense, point by point and frame by frame."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

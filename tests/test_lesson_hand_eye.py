@@ -1,7 +1,5 @@
 """What notebook 04 teaches, against OpenCV and simulated sessions."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

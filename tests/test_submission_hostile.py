@@ -3,8 +3,6 @@
 COURSEKIT_NIGHTLY=1 takes 5,000 structured inputs and 200,000 mutated ones (a few minutes).
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

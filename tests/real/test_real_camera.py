@@ -1,7 +1,5 @@
 """A real D435's recording, made by somebody else, played as any camera of the course."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
