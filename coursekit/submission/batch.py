@@ -55,7 +55,7 @@ from coursekit.submission.flags import (
     words_of,
 )
 from coursekit.submission.format import DOCUMENTS, MANIFEST, NO_TEXT, TURNING_SIGNS, is_junk, slug
-from coursekit.submission.recompute import LABELS, WORDS, grading_rules
+from coursekit.submission.recompute import LABELS, grading_rules
 from coursekit.words import counted
 
 TIMEOUT_S = 10.0
@@ -304,7 +304,9 @@ def _walk(folder: Path, out: Path) -> Iterator[tuple[Path, str]]:
         ahead += reversed(below)
 
 
-def find_bundles(folder: Path, out: Path) -> tuple[list[Bundle], tuple[str, ...], list[Graded]]:
+def find_bundles(
+    folder: Path, out: Path
+) -> tuple[list[Bundle], tuple[str, ...], list[report.ReportLine]]:
     """The bundles in a folder and below it; the other files; and lines for what cannot be read.
 
     A bundle is a .zip, whatever a browser adds to that, one without an ending, or an unpacked one.
@@ -313,7 +315,7 @@ def find_bundles(folder: Path, out: Path) -> tuple[list[Bundle], tuple[str, ...]
     """
     found: list[Bundle] = []
     others: list[str] = []
-    lines: list[Graded] = []
+    lines: list[report.ReportLine] = []
     seen: Counter[str] = Counter()
     for path, why in _walk(folder, out.resolve()):
         raw = path.relative_to(folder).as_posix()
@@ -321,7 +323,7 @@ def find_bundles(folder: Path, out: Path) -> tuple[list[Bundle], tuple[str, ...]
         seen[name] += 1
         name = name if seen[name] == 1 else f"{name} ({seen[name]})"
         if why:
-            lines.append((report.not_graded(name, "unreadable", f"The folder {why}."), ""))
+            lines.append(report.not_graded(name, "unreadable", f"The folder {why}."))
         elif (
             (path.is_dir() and not path.is_symlink())
             or ".zip" in path.name.lower()
@@ -340,7 +342,7 @@ def find_bundles(folder: Path, out: Path) -> tuple[list[Bundle], tuple[str, ...]
     alone = grouped((_whose(name), name) for name in others if _whose(name) not in handed | {""})
     for names in alone.values():
         says = f"There is no bundle, only {', '.join(names[:5])}. Ask for the .zip."
-        lines.append((report.not_graded(names[0], "no_bundle", says), ""))
+        lines.append(report.not_graded(names[0], "no_bundle", says))
     return found, tuple(others), lines
 
 
@@ -661,15 +663,17 @@ def _store(out: Path, bundle: Bundle, outcome: Graded, dated: bool = False) -> N
 
 
 def _finish(
-    out: Path, bundles: list[Bundle], others: Sequence[Graded], roster: Roster, how: Choices
+    out: Path,
+    bundles: list[Bundle],
+    others: Sequence[report.ReportLine],
+    roster: Roster,
+    how: Choices,
 ) -> tuple[list[report.ReportLine], list[tuple[str, ...]], tuple[str, ...]]:
     """Write what takes the whole class; returns the lines with what they share, changes and notes
     on the tables."""
-    gone = WORDS["failed"]["gone"]
-    each = [_load(out, b) or report.not_graded(b.name, "lost", gone) for b in bundles]
-    each += [line for line, _ in others]
+    each = [_load(out, b) or report.not_graded(b.name, "lost", report.GONE) for b in bundles]
     own = _own_points(out / OWN_POINTS)
-    lines = report.across(each, roster, how.late_after, own)
+    lines = report.across([*each, *others], roster, how.late_after, own)
     pages = [b.page(line) for b, line in zip(bundles, lines, strict=False)]  # they come first
     for i, page in enumerate(pages):
         if lines[i].points is not None:
@@ -677,12 +681,13 @@ def _finish(
     state = {line.who: [line.name or line.student, *_state(line)] for line in lines if line.counts}
     changes = list(_changes(_json(out / ROWS / CLASS), state))
     table = report.grades_csv(lines, how.separator)
+    imports, notes = report.exports(lines, how.separator, how.assignment)
     texts = {
         PARAGRAPHS: report.paragraphs_page(lines),
         SECOND: report.paragraphs_page(lines, named=False),
         PAGE: report.class_page(lines, changes),
         CSV: table,
-        **(imports := report.exports(lines, how.separator, how.assignment)),
+        **imports,
         f"{ROWS}/{CLASS}": json.dumps({"csv": _digest(table), "state": state}),
     }
     before = _json(out / ROWS / CLASS).get("csv")
@@ -705,13 +710,7 @@ def _finish(
     for path in (out / ROWS).iterdir():
         if re.fullmatch(r"[0-9a-f]{64}", path.stem) and path.stem not in keys:
             path.unlink()
-    column, known = report.canvas_column(lines, how.assignment)
-    says = f"canvas.csv: the points are in a column “{column}”, which the roster does not have once"
-    return (
-        lines,
-        changes,
-        (f"{says}; --assignment names another.",) * ("canvas.csv" in imports and not known),
-    )
+    return lines, changes, notes
 
 
 def _write_pages(out: Path, bundles: list[Bundle], lines: Sequence[report.ReportLine]) -> None:

@@ -19,10 +19,9 @@ import numpy as np
 from coursekit.arrays import Floats
 from coursekit.checks import number, want, whole
 from coursekit.stereo import NoiseFit, WindowStats, fit_noise, windows
-from coursekit.submission.format import Stack, Submission
+from coursekit.submission.format import WORDS, Stack, Submission
 
 RULES = Path(__file__).with_name("rubric.toml")
-WORDS = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding="utf-8"))
 LABELS: dict[str, str] = WORDS["labels"]  # of what is asked for, by topic
 MISTAKES: dict[str, str] = WORDS["mistakes"]
 WHY: dict[str, str] = WORDS["why"]  # a number that a mistake explains is wrong, by its code

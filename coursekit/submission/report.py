@@ -40,14 +40,14 @@ from coursekit.submission.flags import (
     same_words,
     words_of,
 )
-from coursekit.submission.format import Plot, Refused, Submission, TableRow, read_bundle
-from coursekit.submission.recompute import HEADINGS, LABELS, MISTAKES, REPEAT, WORDS, Recomputed
+from coursekit.submission.format import WORDS, Plot, Refused, Submission, TableRow, read_bundle
+from coursekit.submission.recompute import HEADINGS, LABELS, MISTAKES, REPEAT, SAYS, Recomputed
 from coursekit.submission.rubric import Grade, Item, grade
 from coursekit.words import counted
 
 HEADER = (*HEADINGS["first"], *LABELS, *HEADINGS["last"])  # of grades.csv
 FAILED = ("timeout", "died", "memory", "error", "lost")  # reasons; tried anew by the next run
-NOTHING = WORDS["failed"]["missing"]
+NOTHING, GONE = WORDS["failed"]["missing"], WORDS["failed"]["gone"]
 AGAIN = "Your file could not be read: hand it in again."
 MOODLE_COLUMNS, CANVAS_COLUMNS, OWN_COLUMNS = (HEADINGS[k] for k in ("moodle", "canvas", "own"))
 FORMULA = tuple("=+-@\t\r\n＝＋－＠")  # what makes a spreadsheet calculate a cell
@@ -660,8 +660,9 @@ def canvas_column(lines: Sequence[ReportLine], assignment: str = "") -> tuple[st
 
 def exports(
     lines: Sequence[ReportLine], separator: str = ",", assignment: str = ""
-) -> dict[str, str]:
-    """Tables that Moodle and Canvas import, by the file's name; lines: after `across`.
+) -> tuple[dict[str, str], tuple[str, ...]]:
+    """Tables that Moodle and Canvas import, by the file's name, and a note if the roster does not
+    have the column of the points; lines: after `across`.
 
     Moodle's is its offline grading worksheet, found by `Identifier`; Canvas' its gradebook, found
     by `ID`, with the row of the points possible. Both have whoever has points or a word for them;
@@ -685,11 +686,12 @@ def exports(
             canvas.append((name, number, *ids, grade_of))
     if any(row[3] or row[6] != NOTHING for row in moodle):
         tables["moodle.csv"] = _csv([MOODLE_COLUMNS, *moodle], separator)
-    if any(row[-1] for row in canvas):
-        columns = (*CANVAS_COLUMNS[:-1], canvas_column(lines, assignment)[0])
-        possible = ("    Points Possible", "", "", "", "", "100")
-        tables["canvas.csv"] = _csv([columns, possible, *canvas], separator)
-    return tables
+    if not any(row[-1] for row in canvas):
+        return tables, ()
+    column, known = canvas_column(lines, assignment)
+    possible = ("    Points Possible", "", "", "", "", "100")
+    tables["canvas.csv"] = _csv([(*CANVAS_COLUMNS[:-1], column), possible, *canvas], separator)
+    return tables, () if known else (SAYS["no_column"].format(column),)
 
 
 def own_table(lines: Sequence[ReportLine], separator: str = ",") -> str:
