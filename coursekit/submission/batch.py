@@ -56,7 +56,7 @@ from coursekit.submission.flags import (
 )
 from coursekit.submission.format import DOCUMENTS, MANIFEST, NO_TEXT, TURNING_SIGNS, is_junk, slug
 from coursekit.submission.recompute import LABELS, grading_rules
-from coursekit.words import counted
+from coursekit.words import counted, say
 
 TIMEOUT_S = 10.0
 MEMORY_BYTES = 512 * 2**20  # above what a warm process has
@@ -76,11 +76,6 @@ ONE_THREAD = {
 
 NOT_GRADED = "not graded (time, memory or a crash)"
 SUMMED = {"graded": "graded", "refused": "refused", "failed": NOT_GRADED, "flagged": "flagged"}
-CANNOT_START = (
-    "the processes that grade cannot be started, or end at once. Try --workers 1; if that fails "
-    "too, more memory is needed, or the installation is broken (run `python3 course.py test`)"
-)
-
 Graded = tuple[report.ReportLine, str]  # a line in the class, and most of the student's page
 Work = Callable[[str, str], Graded]  # of the file's path and its name
 
@@ -245,8 +240,7 @@ def _grade(
                         raise KeyboardInterrupt
         except KeyboardInterrupt:
             many = counted(len(bundles), "bundle")
-            says = f"stopped after {finished} of {many}, which are kept. The same command goes on"
-            raise Stopped(f"{says} from there.") from None
+            raise Stopped(say("submission.stopped", done=finished, many=many)) from None
         done, changes, notes = _finish(out, bundles, others, roster, choices)
     counts = Counter(_kind(line) for line in done)
     counts["flagged"] = sum(line.flagged for line in done)
@@ -323,7 +317,7 @@ def find_bundles(
         seen[name] += 1
         name = name if seen[name] == 1 else f"{name} ({seen[name]})"
         if why:
-            lines.append(report.not_graded(name, "unreadable", f"The folder {why}."))
+            lines.append(report.not_graded(name, "unreadable", why=why))
         elif (
             (path.is_dir() and not path.is_symlink())
             or ".zip" in path.name.lower()
@@ -334,15 +328,11 @@ def find_bundles(
             others.append(name)
     if not found:
         there = f", only {counted(len(others), 'other file')}" if others else " or below it"
-        raise ValueError(
-            f"{folder}: there is no bundle (.zip) in it{there}; "
-            "want the folder with what students handed in"
-        )
+        raise ValueError(say("submission.no_bundle", folder=folder, there=there))
     handed = {_whose(bundle.name) for bundle in found}
     alone = grouped((_whose(name), name) for name in others if _whose(name) not in handed | {""})
     for names in alone.values():
-        says = f"There is no bundle, only {', '.join(names[:5])}. Ask for the .zip."
-        lines.append(report.not_graded(names[0], "no_bundle", says))
+        lines.append(report.not_graded(names[0], "no_bundle", files=", ".join(names[:5])))
     return found, tuple(others), lines
 
 
@@ -382,8 +372,7 @@ def _unpack(archive: Path, into: Path) -> None:
                     then = datetime(*member.date_time).timestamp()
                     os.utime(target, (then, then))
     except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, OSError) as error:
-        says = f"{archive.name}: cannot be unpacked ({error}); download it again"
-        raise ValueError(says) from None
+        raise ValueError(say("submission.not_unpacked", file=archive.name, error=error)) from None
 
 
 def _key(path: Path, name: str) -> str:
@@ -538,7 +527,7 @@ def _pool(limits: Limits) -> Iterator[ProcessPool]:
                 pool.active  # noqa: B018 - a property that starts it
             pool.schedule(_ready).result(PATIENCE_S)
         except (BrokenProcessPool, OSError, RuntimeError) as error:  # TimeoutError is an OSError
-            raise ChildProcessError(CANNOT_START) from error
+            raise ChildProcessError(say("submission.cannot_start")) from error
         yield pool
     finally:
         pool.stop()
@@ -601,19 +590,14 @@ def limit_memory(more_bytes: int) -> None:
 def _check_out(out: Path, overwrite: bool) -> None:
     """ValueError unless the folder is empty, or a report: then whatever else is in it stays."""
     if out.is_symlink() or (out.exists() and not out.is_dir()):
-        raise ValueError(f"out: {out} is no folder; want a new or empty one")
+        raise ValueError(say("submission.out_no_folder", out=out))
     if not out.exists():
         return
     others = [entry.name for entry in out.iterdir() if not is_junk(entry.name)]
     if others and not (out / ROWS).is_dir():
-        raise ValueError(
-            f"out: {out} holds {min(others)}, and is no report; want a new or empty folder"
-        )
+        raise ValueError(say("submission.out_no_report", out=out, file=min(others)))
     if (out / CSV).exists() and not overwrite:
-        raise ValueError(
-            f"out: {out} holds a finished report already: choose another folder, or overwrite it "
-            "(--overwrite; only what is new is graded)"
-        )
+        raise ValueError(say("submission.out_finished", out=out))
 
 
 @contextlib.contextmanager
@@ -740,9 +724,8 @@ def _own_points(path: Path) -> dict[str, dict[str, str]]:
             try:
                 report.number_of(row.get(column, ""))
             except ValueError:
-                raise ValueError(
-                    f"{path.name}: {row.get('student')}: {column}: got {row[column]!r}, want points"
-                ) from None
+                facts = {"student": row.get("student"), "column": column, "got": row[column]}
+                raise ValueError(say("submission.no_points", file=path.name, **facts)) from None
         found[row.get("who", "").removeprefix("'")] = row
     return found
 

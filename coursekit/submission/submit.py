@@ -24,7 +24,7 @@ from coursekit.lessons import questions
 from coursekit.stereo import NoiseFit
 from coursekit.submission import format as bundle
 from coursekit.submission.rubric import shortcomings
-from coursekit.words import counted
+from coursekit.words import counted, say
 
 MEASURED = "studio_1.measured"  # in results/
 LESSON_PREFIX = "depth_noise."  # of its checkpoints and exercises
@@ -33,11 +33,6 @@ CAMERA_FACTS = ("name", "serial", "source", "baseline_m", "depth_scale_m")
 IN_MM = {"mm": 1.0, "m": 1e3}  # units of a std, and what one of them is in mm
 NOBODY = "nobody"  # stands in for a name while there is none
 Table = Mapping[float, Sequence[float | None]]
-
-MEASURE_FIRST = (
-    "The studio exercise is not measured yet: run the studio cells of notebook 02 (with a camera, "
-    "a set of recordings or the simulated one), up to the one that keeps the measurement."
-)
 
 
 class CannotHandIn(ValueError):
@@ -175,7 +170,7 @@ def submit(
         frames = int(frames)
     kept = load_measured()
     if kept is None:
-        return Handed(None, MEASURE_FIRST)
+        return Handed(None, say("submission.measure_first"))
     claims, plot = replace(kept.claims, mismatches=mismatches), kept.plot
     if table is not None:
         claims = replace(claims, rows=_own_rows([s.distance_m for s in kept.stacks], table))
@@ -194,18 +189,15 @@ def submit(
     data = bundle.bundle_bytes(whole)  # Refused for what no bundle can hold
     path = (Path(folder) if folder else results.folder()) / bundle_name(name)
     if name and path.exists() and not overwrite:
-        there = f"{relative(path)} is there already and stays as it is."
-        return Handed(None, f"{there} To replace it: `overwrite=True` (or --overwrite).")
+        return Handed(None, say("submission.there_already", file=relative(path)))
     says = shortcomings(whole)
     if not name:
-        headline = "Nothing is written yet: a bundle needs your name (`student`)."
-        headline += " This is what the grader would say:" if says else ""
-        return Handed(None, headline, says)
+        would = " This is what the grader would say:" if says else ""
+        return Handed(None, say("submission.no_name", would=would), says)
     results.write_bytes(path, data)
-    measured_with = f"{counted(len(whole.stacks), 'distance')} with {whole.camera.name}"
-    headline = f"Wrote {relative(path)}, {measured_with}: hand in this one file. "
-    headline += "What the grader will say is missing or weak:" if says else ""
-    return Handed(path, headline + "The grader misses nothing in it." * (not says), says)
+    facts = {"file": relative(path), "at": counted(len(whole.stacks), "distance")}
+    weak = "submission.wrote_weak" if says else "submission.wrote"
+    return Handed(path, say(weak, camera=whole.camera.name, **facts), says)
 
 
 def bundle_name(student: str) -> str:
