@@ -305,9 +305,8 @@ def student_page(line: ReportLine, body: str) -> str:
 
     line: after `across`. body: of `page_body`, or "" where the bundle was not graded.
     """
-    lost = [item for item in line.items if item.points < item.of]
-    facts = {"told": _told(line), "decided": _decided(line), "body": Markup(body)}
-    return _page(what="student", bundle=line, lost=len(lost), **facts)
+    lost = sum(item.points < item.of for item in line.items)
+    return _page(what="student", bundle=line, lost=lost, body=Markup(body))
 
 
 def _decided(line: ReportLine) -> str:
@@ -487,18 +486,6 @@ def _ticks(low: float, high: float, about: int) -> list[float]:
 # --- the instructor's pages -----------------------------------------------------------------------
 
 
-def _histogram(percents: Sequence[float]) -> dict[str, Any]:
-    """How many students got which part of the points, in tens of percent."""
-    bins = np.histogram(np.clip(percents, 0, 100), 10, (0, 100))[0].tolist()
-    words = ", ".join(f"{n} from {10 * i} to {10 * i + 10} %" for i, n in enumerate(bins) if n)
-    return {
-        "bins": bins,
-        "most": max([*bins, 1]),
-        "wide": (PLOT["W"] - PLOT["LEFT"] - PLOT["RIGHT"]) / 10,
-        "alt": f"Students by points: {words}." if words else "No graded bundle.",
-    }
-
-
 def class_page(lines: Sequence[ReportLine], changes: Sequence[tuple[str, ...]] = ()) -> str:
     """Distribution, misconceptions, flags, refused bundles, and a link to every student's page.
 
@@ -510,24 +497,18 @@ def class_page(lines: Sequence[ReportLine], changes: Sequence[tuple[str, ...]] =
     given = [(line.total, line.of or 100) for line in everybody]
     percents = [100 * total / of for total, of in given if total is not None]
     named = sorted(everybody, key=_by_name)
-    ask_first = "No points were taken for these. Ask first: there may be an innocent reason."
-    others = [line for line in lines if line.points is None and line.reason != "missing"]
     return _page(
         what="class",
+        lines=lines,
         done=done,
         counts=counts,
         percents=percents,
         median=statistics.median(percents) if percents else 0.0,
-        figure=_histogram(percents),
+        bins=np.histogram(np.clip(percents, 0, 100), 10, (0, 100))[0].tolist(),
         topics=_topics(counts),
         left_out=_left_out(counts),
-        flags=[
-            ("To look at", ask_first, _by_flag(done, False)),
-            ("Notes", "Expected, and no reason to ask.", _by_flag(done, True)),
-        ],
-        refused=[(line, bool(_told(line) and line.name)) for line in others],
-        missing=[line.name for line in lines if line.reason == "missing"],
-        late=[line for line in everybody if line.late],
+        flags=_by_flag(done, False),
+        notes=_by_flag(done, True),
         changes=changes,
         named=named,
         ranked=sorted(named, key=lambda line: (line.total is not None, line.total or 0.0)),
@@ -595,18 +576,9 @@ def paragraphs_page(lines: Sequence[ReportLine], named: bool = True) -> str:
     some = sorted((n for n in lines if n.points is not None and n.counts), key=_by_name)
     if not named:
         some = sorted((replace(n, name=n.code, page="") for n in some), key=lambda n: n.name)
-    said = [(line, _about(line)) for line in some if line.paragraph.strip()]
+    said = [line for line in some if line.paragraph.strip()]
     silent = [line for line in some if not line.paragraph.strip()]
     return _page(what="paragraphs", said=said, silent=silent, named=named)
-
-
-def _about(line: ReportLine) -> str:
-    """What stands under a name on the page of paragraphs: its length, and the verdict."""
-    facts = [counted(len(line.paragraph.split()), "word")]
-    facts += [f"which error dominates: {i.verdict}" for i in line.items if i.topic == "verdict"]
-    if any(flag.code == "same_words" for flag in line.flags):
-        facts.append("shares its words with others, see the class page")
-    return "; ".join(facts)
 
 
 def _said(item: Item) -> str:
@@ -734,6 +706,7 @@ def _points(value: float | None) -> str:
 
 
 PAGES = jinja2.Environment(loader=jinja2.FileSystemLoader(HERE), autoescape=True, trim_blocks=True)
-PAGES.filters |= {"points": _points, "result": _result, "counted": counted, "px": "{:.1f}".format}
+PAGES.filters |= {"points": _points, "result": _result, "told": _told, "decided": _decided}
+PAGES.filters |= {"counted": counted, "px": "{:.1f}".format}
 PAGES.globals |= PLOT | {"style": Markup((HERE / "report.css").read_text(encoding="utf-8"))}
 TEMPLATE = PAGES.get_template("report.html.jinja")  # of all pages; it escapes all that it shows

@@ -527,16 +527,13 @@ def _sigma_d(asked: _Question, submission: Submission, found: Recomputed) -> Ite
         product = camera.fx * (camera.baseline_m or 0.0)
         known = [m for m in found.at if m.std is not None]
 
-        def mean(stds_m: Iterable[float], power: int) -> float:
-            pairs = zip(stds_m, known, strict=True)
-            return float(np.mean([std * product / m.distance_m**power for std, m in pairs]))
+        def mean(std: str, power: int) -> float:
+            each = [getattr(m.stats, std) * product / m.distance_m**power for m in known]
+            return float(np.mean(each))
 
-        yield _Mistake("not_squared", mean((m.stats.pixel_std_m for m in known), 1))
-        for key, stds in (
-            ("spatial", [m.stats.spatial_std_m for m in known]),
-            ("of_the_mean", [m.stats.mean_std_m for m in known]),
-        ):
-            yield _Mistake(key, mean(stds, 2), 0.02 * mean(stds, 2))
+        yield _Mistake("not_squared", mean("pixel_std_m", 1))
+        for key, std in (("spatial", "spatial_std_m"), ("of_the_mean", "mean_std_m")):
+            yield _Mistake(key, mean(std, 2), 0.02 * mean(std, 2))
 
     return _judge(asked, claim, value, tolerance, mistakes)
 
