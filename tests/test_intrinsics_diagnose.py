@@ -80,8 +80,8 @@ def test_a_cause_is_named(label: str) -> None:
 
 
 def test_healthy_sessions_get_no_finding() -> None:
-    """At most 4 of 200 (nightly); of 8 none: a rate of 25 % passes with 10 %."""
-    count, most = (200, 4) if NIGHTLY else (8, 0)
+    """At most 4 of 200 (nightly); of 4 none: a rate of 25 % passes with 32 %."""
+    count, most = (200, 4) if NIGHTLY else (4, 0)
     found: Counter[tuple[str, ...]] = Counter()
     for seed in range(FIRST_SEED + 1000, FIRST_SEED + 1000 + count):
         # every other pair of seeds, so that each kind of board has both
@@ -215,7 +215,8 @@ def test_the_size_of_a_cause_is_the_restricted_maximum_likelihood() -> None:
     best = minimize_scalar(deviance, bounds=(-20, 5), method="bounded")
     V = np.eye(len(z)) + np.exp(best.x) * K @ K.T
     sigma = np.sqrt(z @ np.linalg.solve(V, z) / len(z))
-    size, gain = model.plain.explains(hypothesis).best_size()
+    test = model.plain.explains(hypothesis)
+    size, gain = test.size, test.gain
     assert size == pytest.approx(np.exp(best.x / 2) * sigma, rel=0.1)  # the grid's step is 13 %
     assert gain == pytest.approx(deviance(-60.0) - best.fun, abs=0.2)
 
@@ -277,7 +278,10 @@ def fisheye_views(focal: float, seed: int) -> Detections:
     return Detections(views)
 
 
-@pytest.mark.parametrize(("focal", "seed"), [(310.0, 3), (340.0, 4), (280.0, 5)])
+FISHEYES = [(310.0, 3), (340.0, 4), (280.0, 5)]
+
+
+@pytest.mark.parametrize(("focal", "seed"), FISHEYES if NIGHTLY else FISHEYES[2:])
 def test_a_fisheye_is_a_wrong_lens_and_nothing_else(focal: float, seed: int) -> None:
     findings = diagnose(fisheye_views(focal, seed), CHECKERBOARD)
     assert findings.names == ("lens_model",)
