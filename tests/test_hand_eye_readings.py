@@ -148,7 +148,7 @@ def test_random_rotations_get_no_name() -> None:
         assert "no reading that was tried" in finding.says
 
 
-@pytest.mark.parametrize("factor", [1.25, 1.5, 2.0])
+@pytest.mark.parametrize("factor", [1.25, 1.5, 2.0] if NIGHTLY else [1.25, 2.0])
 def test_intrinsics_of_another_image_size(factor: float) -> None:
     given = session(FIRST_SEED, 15, detections=True)
     lens = given.intrinsics
@@ -164,18 +164,18 @@ def test_intrinsics_of_another_image_size(factor: float) -> None:
         diagnose(replace(given, intrinsics=smaller))
 
 
-@pytest.mark.parametrize("factor", [0.9, 1.1, 1.3])
-def test_intrinsics_of_another_camera(factor: float) -> None:
+def test_intrinsics_of_another_camera() -> None:
     """Its focal length contradicts the images'."""
     given = ordinary_arm_session(900_060, scatter_tails=False)[0]
     lens = given.intrinsics
     assert lens is not None
     assert "foreign_lens" not in diagnose(given).names
-    wrong = replace(lens, fx=factor * lens.fx, fy=factor * lens.fy)
-    finding = diagnose(replace(given, intrinsics=wrong))[0]
-    assert finding.name == "foreign_lens"
-    own = float(finding.evidence.split("make it ")[1].split()[0])
-    assert own == pytest.approx(lens.fx, rel=0.03)
+    for factor in (0.9, 1.1, 1.3) if NIGHTLY else (0.9, 1.3):
+        wrong = replace(lens, fx=factor * lens.fx, fy=factor * lens.fy)
+        finding = diagnose(replace(given, intrinsics=wrong))[0]
+        assert finding.name == "foreign_lens"
+        own = float(finding.evidence.split("make it ")[1].split()[0])
+        assert own == pytest.approx(lens.fx, rel=0.03)
 
 
 @pytest.mark.parametrize("scatter_m", [0.0, 1e-5])

@@ -127,22 +127,12 @@ def test_no_printed_line_is_longer_than_a_page() -> None:
 
 
 def test_the_numbers_of_the_checkpoints() -> None:
-    """Computed here another way: by disparities, and by search for the limit."""
+    """Computed here another way: by disparities. Others show their working: test_lessons.py."""
     step = 0.0006 * 447 * 0.05 / 0.4**2  # px that make 0.6 mm at 0.4 m
     d = 447 * 0.05 / 0.8
     noise = 447 * 0.05 * (1 / (d - step / 2) - 1 / (d + step / 2))
     assert CHECKPOINTS["depth_noise.twice_as_far"].value == pytest.approx(1000 * noise, rel=1e-4)
 
-    law = DEPTH_NOISE.model()
-    ratio = law(0.4, 447, 0.018, 0.08) / law(0.4, 447, 0.050, 0.08)
-    assert CHECKPOINTS["depth_noise.short_baseline"].value == pytest.approx(ratio)
-    assert CHECKPOINTS["depth_noise.short_baseline"].value == pytest.approx(2.78, abs=0.005)
-    assert 1000 * law(0.4, 447, 0.018, 0.08) == pytest.approx(1.59, abs=0.005)
-
-    limit = CHECKPOINTS["depth_noise.minimum_range"].value
-    left, right = (431.1 * X / limit for X in (0.0, -0.05017))
-    assert left - right == pytest.approx(126)
-    assert limit == pytest.approx(0.172, abs=0.0005)
     slips = [126 * 0.05017 / 431.1, 126 / 431.1 / 0.05017, 431.1 * 0.05017, 0.05017, 431.1 / 126]
     slips.append(447 * 0.05 / 126)
     classics = [c.value for c in CHECKPOINTS["depth_noise.minimum_range"].classics]

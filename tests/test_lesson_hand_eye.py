@@ -77,13 +77,6 @@ def test_three_sessions_are_told_by_what_they_show() -> None:
         assert spread > 50 if name == "Q" else spread < 6
 
 
-def test_the_lever_is_what_a_rotation_does() -> None:
-    turned = Rotation.from_euler("y", 0.3, degrees=True).apply([0, 0, 0.4])
-    assert CHECKPOINTS["hand_eye.lever"].value == pytest.approx(
-        1000 * np.linalg.norm(turned - [0, 0, 0.4]), 1e-4
-    )
-
-
 def test_more_poses_shrink_the_interval_and_not_the_error() -> None:
     """Over six arms: four times the poses, half the sigma, and no less error to speak of."""
     few, many = [], []

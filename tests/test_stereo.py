@@ -44,12 +44,10 @@ def about_95_percent(hits, of: int) -> bool:
 # --- the law ---
 
 
-def test_depth_from_disparity_and_its_slope_by_numerical_derivative():
-    z, step = np.array([0.3, 0.6, 2.0]), 1e-4
+def test_depth_from_disparity():
+    """Its slope: claim D5."""
+    z = np.array([0.3, 0.6, 2.0])
     np.testing.assert_allclose(stereo.depth_from_disparity(FB / z, FX, BASELINE), z)
-    up, down = (stereo.depth_from_disparity(FB / z + s, FX, BASELINE) for s in (step, -step))
-    slope = stereo.depth_slope(z, FX, BASELINE)
-    np.testing.assert_allclose(slope, (up - down) / (2 * step), rtol=1e-8)
     assert np.isnan(stereo.depth_from_disparity([0.0, -1.0, np.nan, np.inf], FX, BASELINE)).all()
 
 

@@ -166,7 +166,7 @@ def test_halves_differ_by_their_stated_sigmas_with_the_boards_shape(sessions, na
     """The rms over parameters and splits is 0.7 to 1.5; where all corners count alone, 2 to 7."""
     views, board = sessions[name]
     apart = []
-    for seed in range(6 if NIGHTLY else 3):
+    for seed in range(6):
         order = np.random.default_rng(seed).permutation(len(views))
         first, second = (
             intrinsics.fit_shape(intrinsics.calibrate([views[i] for i in order[part::2]], board))
