@@ -39,13 +39,13 @@ from coursekit.boards import Board, Detection, Detections, detect_all
 from coursekit.boards.board import Skipped, why_unused
 from coursekit.boards.detector import SESSION, natural
 from coursekit.causes import DiagnosisTexts
-from coursekit.checks import array, choice, instance, settle, transform, want
+from coursekit.checks import array, choice, settle, transform, want
 from coursekit.formats import poses as pose_files
 from coursekit.formats.poses import JOINTS, PLACE, THREE, TURN, VELOCITIES, PoseRow
 from coursekit.geometry import Intrinsics, cross_matrix, pose_difference
 from coursekit.hand_eye import poses, refinement, views
 from coursekit.hand_eye.closed_form import CLOSED_FORMS, FEWEST_POSES, closed_form
-from coursekit.results import write_bytes
+from coursekit.results import read_json, write_bytes
 from coursekit.words import Estimate, say, wrapped
 
 SENTENCES = DiagnosisTexts.of("hand_eye")
@@ -262,7 +262,7 @@ class HandEyeSession:
             arm, seen, mount_ = pose_files.read_samples(place, mount)
             return cls("eye_in_hand" if mount_ == "eye_in_hand" else "eye_to_hand", arm, seen)
         want(place.is_dir(), "folder", os.fspath(folder), "a folder that exists")
-        card = _card(place)
+        card = read_json(place / SESSION) if (place / SESSION).is_file() else {}
         mount = mount or _from_card(card, "mount")
         board = board or _board(_from_card(card, "board"))
         intrinsics = intrinsics or Intrinsics.from_dict(_from_card(card, "intrinsics"))
@@ -320,18 +320,6 @@ class HandEyeSession:
 
 
 # --- reading a folder ---
-
-
-def _card(folder: Path) -> dict[str, Any]:
-    """What session.json says, {} where there is none."""
-    path = folder / SESSION
-    if not path.is_file():
-        return {}
-    try:
-        card = json.loads(path.read_text("utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"folder: {SESSION} is no JSON ({error})") from error
-    return instance(SESSION, card, dict)
 
 
 def _from_card(card: dict[str, Any], key: str) -> Any:
