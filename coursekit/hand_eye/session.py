@@ -20,7 +20,6 @@ asked for, by the joint refinement. The result says how well X is known and what
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -45,7 +44,7 @@ from coursekit.formats.poses import JOINTS, PLACE, THREE, TURN, VELOCITIES, Pose
 from coursekit.geometry import Intrinsics, cross_matrix, pose_difference
 from coursekit.hand_eye import poses, refinement, views
 from coursekit.hand_eye.closed_form import CLOSED_FORMS, FEWEST_POSES, closed_form
-from coursekit.results import read_json, write_bytes
+from coursekit.results import read_json, write_bytes, write_json
 from coursekit.words import Estimate, say, wrapped
 
 SENTENCES = DiagnosisTexts.of("hand_eye")
@@ -306,7 +305,7 @@ class HandEyeSession:
         write_bytes(place / POSES, self._csv().encode())
         card: dict[str, object] = {"mount": self.mount, "board": asdict(self.board)}
         card |= {"intrinsics": self.intrinsics.to_dict(), **(about or {})}
-        write_bytes(place / SESSION, (json.dumps(card, indent=1) + "\n").encode())
+        write_json(place / SESSION, card)
 
     def _csv(self) -> str:
         turns = Rotation.from_matrix(self.T_base_gripper[:, :3, :3]).as_quat(canonical=True)
