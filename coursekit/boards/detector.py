@@ -162,18 +162,18 @@ def detect_all(
       not used: image 1: the picture is blank: nearly all of it has grey levels from 0 to 0
     """
     sources = _sources(images)
-    shown = progress and len(sources) >= 10
     views: list[Detection] = []
     skipped: list[Skipped] = []
     try:
-        for name, source in counting(sources, len(sources), "image", shown):
+        for name, source in counting(
+            sources, len(sources), "image", progress and len(sources) >= 10
+        ):
             try:
                 views.append(detect(_read(source), board, name))
             except BoardNotFound as reason:
                 skipped.append(Skipped(name, str(reason), reason.kind))
     except KeyboardInterrupt:
-        done = len(views) + len(skipped)
-        print(f"Stopped after {done} of {len(sources)} images; they are kept.")
+        print(f"Stopped after {len(views) + len(skipped)} of {len(sources)} images; they are kept.")
     return _of_one_size(views, skipped, [name for name, _ in sources])
 
 
