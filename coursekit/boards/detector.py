@@ -162,12 +162,11 @@ def detect_all(
       not used: image 1: the picture is blank: nearly all of it has grey levels from 0 to 0
     """
     sources = _sources(images)
+    shown = progress and len(sources) >= 10
     views: list[Detection] = []
     skipped: list[Skipped] = []
     try:
-        for name, source in counting(
-            sources, len(sources), "image", progress and len(sources) >= 10
-        ):
+        for name, source in counting(sources, len(sources), "image", shown):
             try:
                 views.append(detect(_read(source), board, name))
             except BoardNotFound as reason:
