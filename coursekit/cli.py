@@ -29,12 +29,8 @@ from coursekit.words import Estimate, Findings, say, wrapped
 SHOWN = 1  # reason, the commonest, for which images were not used
 NOT_TRUSTED = 3  # the exit code; what was found is written nevertheless
 
-OPTIONS = {"path": "--out", "n": "--frames", "which": "--camera", "distance_m": "--distance"}
-OPTIONS |= {f"{name}_m": f"--{name}-mm (here in m)" for name in ("square", "marker")}
-OPTIONS |= {"detections": "photographs", "images": "photographs", "intrinsics": "--lens"}
-OPTIONS |= {name: f"--{name}" for name in ("squares", "paper", "dictionary", "workers", "timeout")}
 COMMANDS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
-INSTEAD = COMMANDS.pop("instead")
+INSTEAD, OPTIONS = COMMANDS.pop("instead"), COMMANDS.pop("arguments")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -55,9 +55,8 @@ class Intrinsics:
         model = SAME_MODEL.get(self.model, self.model)
         known = ", ".join(DISTORTION_MODELS)
         want(model in DISTORTION_MODELS, "model", model, f"one of {known}; {NO_OTHER}")
-        checks.settle(
-            self, model=model, coeffs=tuple(_coefficients("coeffs", self.coeffs).tolist())
-        )
+        coeffs = tuple(_coefficients("coeffs", self.coeffs).tolist())
+        checks.settle(self, model=model, coeffs=coeffs)
 
     @property
     def K(self) -> Floats:

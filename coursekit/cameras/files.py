@@ -136,10 +136,8 @@ class RosBag(Camera):
     # --- frames --------------------------------------------------------------------------------
 
     def stream(self) -> Generator[Frame, None, None]:
-        others: dict[str, list[_Shot]] = {
-            name: [] for name in self._names.values() if name != "depth"
-        }
-        waiting: list[_Shot] = []
+        others: dict[str, list[_Shot]] = {name: [] for name in self._names.values()}
+        waiting = others.pop("depth")
         if self._closed:
             raise CameraError(say("cameras.closed", what=self._what))
         with self._reader() as reader:
@@ -181,10 +179,8 @@ class RosBag(Camera):
         if depth.shape != self.depth.size[::-1]:
             raise ValueError(f"a depth image of {depth.shape}, camera_info says {self.depth.size}")
         eyes = (images["left"], images["right"]) if {"left", "right"} <= images.keys() else None
-        figures = self.depth, self.color, self.T_color_depth
-        return Frame(
-            depth, images.get("color"), self.depth_scale_m, shot.time_s, shot.number, *figures, eyes
-        )
+        facts = shot.time_s, shot.number, self.depth, self.color, self.T_color_depth
+        return Frame(depth, images.get("color"), self.depth_scale_m, *facts, eyes)
 
     def lock(self) -> str:
         return say("cameras.as_recorded")

@@ -77,7 +77,5 @@ def start_problem(what: str, error: RuntimeError) -> str:
 
 def _realsense_on_usb() -> bool:
     """Whether the operating system (Linux only) sees a RealSense on USB."""
-    names = (
-        path.read_text(errors="replace", encoding="utf-8") for path in USB_DEVICES.glob("*/product")
-    )
-    return any("RealSense" in name for name in names)
+    products = USB_DEVICES.glob("*/product")
+    return any("RealSense" in path.read_text("utf-8", "replace") for path in products)

@@ -103,11 +103,9 @@ class RealSense(Camera):
         self.name = device_info(rs, device, "name") or "RealSense"
         self.serial = device_info(rs, device, "serial_number")
         self.depth_scale_m = shortest_decimal(sensor.get_depth_scale())
-        self.baseline_m = None
-        if sensor.supports(rs.option.stereo_baseline):
-            self.baseline_m = (
-                shortest_decimal(sensor.get_option(rs.option.stereo_baseline)) / 1000.0
-            )
+        option = rs.option.stereo_baseline
+        known = sensor.supports(option)
+        self.baseline_m = shortest_decimal(sensor.get_option(option)) / 1000.0 if known else None
         profiles = {p.stream_type(): p for p in self._profile.get_streams()}
         depth = profiles[rs.stream.depth].as_video_stream_profile()
         self.depth = Intrinsics.from_realsense(depth.get_intrinsics())
@@ -168,10 +166,8 @@ class RealSense(Camera):
         recording.check_distance(distance_m)
         device = specified(self.name)
         glass_m = device.nominal.glass_m if device else 0.0
-        what, distance_mm = (
-            ROOM_TEXTS["cameras"]["placing"].get(name, f"Put the {name}"),
-            1000 * (distance_m - glass_m),
-        )
+        what = ROOM_TEXTS["cameras"]["placing"].get(name, f"Put the {name}")
+        distance_mm = 1000 * (distance_m - glass_m)
         where = {"distance_mm": distance_mm, "distance_m": distance_m, "glass_mm": 1000 * glass_m}
         print(say("cameras.place", what=what, **where))
         input("Press Enter when it stands there")
@@ -206,9 +202,8 @@ class RealSense(Camera):
         self._skip(WARM_UP_FRAMES)
         if refused or not np.isclose(self.depth_scale_m, depth_scale_m, rtol=1e-3):
             keeps = say("cameras.keeps_unit", what=self._what, unit_mm=1000 * self.depth_scale_m)
-            raise CameraError(
-                keeps + (f" (librealsense says: {refused})" if refused else "")
-            ) from refused
+            said = f" (librealsense says: {refused})" if refused else ""
+            raise CameraError(keeps + said) from refused
         return f"depth unit set to {1000 * self.depth_scale_m:g} mm"
 
     # --- exposure ------------------------------------------------------------------------------
@@ -252,16 +247,14 @@ class RealSense(Camera):
     def _depth_exposure(self, sensor: Any) -> tuple[float, float]:
         """Exposure (us) and gain of the newest depth image, which automatic exposure chose."""
         depth = self._next_frameset().get_depth_frame()
+        values, option = self._rs.frame_metadata_value, self._rs.option
 
         def chosen(value: Any, setting: Any) -> float:
             known = depth.supports_frame_metadata(value)
             return depth.get_frame_metadata(value) if known else sensor.get_option(setting)
 
-        values, option = self._rs.frame_metadata_value, self._rs.option
-        return (
-            chosen(values.actual_exposure, option.exposure),
-            chosen(values.gain_level, option.gain),
-        )
+        exposure_us = chosen(values.actual_exposure, option.exposure)
+        return exposure_us, chosen(values.gain_level, option.gain)
 
 
 class _Running:

@@ -70,9 +70,8 @@ def _rig(ax: Any, setup: Setup, q: Floats) -> dict[str, float]:
     wide, high = setup.intrinsics.size
     pixels = np.array([(0, 0), (wide, 0), (wide, high), (0, high)], float)
     far = deproject(pixels, np.full(4, VIEW_M), setup.intrinsics.K)
-    view = transform_points(camera, np.vstack([far, np.zeros(3)]))[
-        [0, 1, 2, 3, 0, 4, 1, 4, 2, 4, 3]
-    ]
+    pyramid = transform_points(camera, np.vstack([far, np.zeros(3)]))
+    view = pyramid[[0, 1, 2, 3, 0, 4, 1, 4, 2, 4, 3]]
     ax.plot(*view.T, color=COLORS["color"], lw=1.2)
     arrows = {
         "T": (base, gripper, "model"),
