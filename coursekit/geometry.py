@@ -162,8 +162,7 @@ class Intrinsics:
         known = cls.__dataclass_fields__.keys()
         given = instance("fields", fields, dict).keys()
         missing, unknown = sorted(known - {"model", "coeffs"} - given), sorted(given - known)
-        if missing or unknown:
-            raise ValueError(f"fields: missing {missing}, unknown {unknown}")
+        checks.refuse(missing or unknown, f"fields: missing {missing}, unknown {unknown}")
         return cls(**fields)
 
     @classmethod

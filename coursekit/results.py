@@ -22,7 +22,7 @@ import numpy as np
 
 from coursekit import checks
 from coursekit.arrays import ArrayLike, Floats
-from coursekit.checks import want
+from coursekit.checks import refuse, want
 from coursekit.formats import lens as lens_files
 from coursekit.formats import numbers
 from coursekit.formats import poses as pose_files
@@ -247,8 +247,7 @@ def read(path: Path) -> Result:
     """A result in another folder; ValueError that names the file where it is damaged."""
     content = read_json(path)
     try:
-        if content.pop("format") not in (1, FORMAT):
-            raise ValueError("written by another version of the course")
+        refuse(content.pop("format") not in (1, FORMAT), "written by another version of the course")
         quantities = {k: Quantity(**v) for k, v in content.pop("quantities").items()}
         covariances = {k: Covariance(**v) for k, v in content.pop("covariances", {}).items()}
         checks.choice("source", content["source"], get_args(Source))

@@ -481,8 +481,7 @@ def _proposals(board: Board, lens: Intrinsics) -> tuple[_View, ...]:
                 view = _aimed(board, lens, facing, near, aim * lens.size)
                 if view is not None:
                     views.append(view)
-    if not views:
-        raise ValueError(f"board: no view of {wide:g} x {high:g} m fits into {lens.size} px")
+    checks.refuse(not views, f"board: no view of {wide:g} x {high:g} m fits into {lens.size} px")
     return tuple(views)
 
 

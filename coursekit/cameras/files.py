@@ -20,7 +20,7 @@ from coursekit.arrays import AnyArray, Floats, NDArray
 from coursekit.boards.detector import natural
 from coursekit.cameras import recording
 from coursekit.cameras.camera import Camera, camera_line
-from coursekit.cameras.frames import FRAMES_PER_S, NO_DEPTH, CameraError, Description, Frame
+from coursekit.cameras.frames import FRAMES_PER_S, NO_DEPTH, CameraError, Description, Frame, need
 from coursekit.cameras.realsense import shortest_decimal
 from coursekit.geometry import Intrinsics, invert_transform, make_transform
 from coursekit.words import counted, say
@@ -138,8 +138,7 @@ class RosBag(Camera):
     def stream(self) -> Generator[Frame, None, None]:
         others: dict[str, list[_Shot]] = {name: [] for name in self._names.values()}
         waiting = others.pop("depth")
-        if self._closed:
-            raise CameraError(say("cameras.closed", what=self._what))
+        need(not self._closed, "closed", what=self._what)
         with self._reader() as reader:
             for name, shot in self._shots(reader):
                 (waiting if name == "depth" else others[name]).append(shot)

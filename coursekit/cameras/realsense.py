@@ -16,7 +16,7 @@ from coursekit import specifications
 from coursekit.arrays import Image
 from coursekit.cameras import recording
 from coursekit.cameras.camera import Camera, camera_line
-from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Frame
+from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Frame, need
 from coursekit.cameras.librealsense import device_info, load_librealsense, start_problem
 from coursekit.geometry import Intrinsics, make_transform
 from coursekit.words import ROOM_TEXTS, say
@@ -67,8 +67,7 @@ class RealSense(Camera):
     def _start(self) -> None:
         """Start streaming."""
         with self._running.turn:
-            if self._running.left:
-                raise CameraError(say("cameras.closed_meanwhile", what=self._what))
+            need(not self._running.left, "closed_meanwhile", what=self._what)
             try:
                 pipeline = self._rs.pipeline()
                 self._profile = pipeline.start(self._config())
@@ -86,8 +85,7 @@ class RealSense(Camera):
         return config
 
     def _check_open(self) -> None:
-        if self._running.pipeline is None:
-            raise CameraError(say("cameras.closed", what=self._what))
+        need(self._running.pipeline, "closed", what=self._what)
 
     def _depth_sensor(self) -> Any:
         return self._profile.get_device().first_depth_sensor()
@@ -141,8 +139,7 @@ class RealSense(Camera):
             except RuntimeError as error:
                 stopped = f"{self._what} stopped giving frames ({error})"
                 raise CameraError(f"{stopped}: {say('cameras.unplugged')}") from error
-            if arrived is None:
-                raise CameraError(say("cameras.closed_meanwhile", what=self._what))
+            need(arrived is not None, "closed_meanwhile", what=self._what)
             if arrived:
                 return images
         silent = f"no frame came from {self._what} for {MOST_POLLS * POLL_MS / 1000:g} s"

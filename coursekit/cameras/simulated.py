@@ -15,7 +15,7 @@ from coursekit import checks, results, specifications
 from coursekit.arrays import ArrayLike, Floats, Image
 from coursekit.boards import Board
 from coursekit.cameras.camera import Camera, HiddenTruth
-from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Frame
+from coursekit.cameras.frames import FRAMES_PER_S, Frame, need
 from coursekit.cameras.recording import check_depth_scale, check_distance
 from coursekit.geometry import Intrinsics, invert_transform
 from coursekit.simulation import Rig, RigView, Scene, artefact_scene, render, tabletop, wall_scene
@@ -197,8 +197,7 @@ class SimulatedCamera(Camera):
         return np.repeat(grey[..., None], 3, axis=2)
 
     def _check_open(self) -> None:
-        if self._closed:
-            raise CameraError(say("cameras.closed", what=f"the {self.name}"))
+        need(not self._closed, "closed", what=f"the {self.name}")
 
     def _start_afresh(self) -> None:
         """Start the named stream of random numbers, and the drift at a moment that it names."""
