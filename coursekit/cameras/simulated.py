@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import unicodedata
 import zlib
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -23,11 +23,7 @@ from coursekit.simulation.board_images import board_scene, check_pose, render_bo
 from coursekit.specifications import Unit
 from coursekit.words import say
 
-SCENES: dict[str, Callable[[float], Scene]] = {
-    "60 mm block": tabletop,
-    "wall": wall_scene,
-    "artefacts": artefact_scene,
-}
+SCENES = {"60 mm block": tabletop, "wall": wall_scene, "artefacts": artefact_scene}
 
 # How far a unit is from what it reports. The vendor allows 2 % of depth error at 2 m; with these a
 # D435 is 2-5 mm off at 0.45 m, as people find (data/published_depth_noise.json).
