@@ -27,7 +27,6 @@ import textwrap
 import time
 import tomllib
 import webbrowser
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib import metadata
@@ -69,11 +68,11 @@ class CheckUp:
     def __str__(self) -> str:
         head = f"{self.verdict:8} {self.check:12} "
         blank = " " * len(head)
-        text = textwrap.fill(self.says, LINE_WIDTH, initial_indent=head, subsequent_indent=blank)
-        if not self.remedy:
-            return text
-        return f"{text}\n" + textwrap.fill(
-            self.remedy, LINE_WIDTH, initial_indent=f"{blank}-> ", subsequent_indent=f"{blank}   "
+        parts = ((self.says, head, blank), (self.remedy, f"{blank}-> ", f"{blank}   "))
+        return "\n".join(
+            textwrap.fill(text, LINE_WIDTH, initial_indent=first, subsequent_indent=later)
+            for text, first, later in parts
+            if text
         )
 
 
@@ -96,21 +95,21 @@ def run(camera: str = "auto", as_json: bool = False) -> int:
     camera: what `open_camera` takes: "auto", "simulated", a serial number or a recording. as_json:
     one object for programs instead, when all are made.
     """
-    if as_json:
-        lines = list(checks(camera))
-        print(json.dumps({"coursekit": edition(), "checks": list(map(asdict, lines))}, indent=1))
-        return int(any(line.verdict == "problem" for line in lines))
     if isinstance(sys.stdout, io.TextIOWrapper):  # a pipe on Windows cannot show every letter
         sys.stdout.reconfigure(errors="replace")
-    verdicts = Counter[Condition]()
+    lines = []
     for line in checks(camera):
-        print(line, flush=True)
-        verdicts[line.verdict] += 1
-    if problems := verdicts["problem"]:
+        lines.append(line)
+        if not as_json:
+            print(line, flush=True)
+    problems = sum(line.verdict == "problem" for line in lines)
+    if as_json:
+        print(json.dumps({"coursekit": edition(), "checks": list(map(asdict, lines))}, indent=1))
+    elif problems:
         print(f"\n{problems} problem{'s' * (problems > 1)}: do what stands there, and ask again.")
-        return 1
-    print("\nNothing is in the way. `python3 course.py lab` opens the notebooks.")
-    return 0
+    else:
+        print("\nNothing is in the way. `python3 course.py lab` opens the notebooks.")
+    return int(problems > 0)
 
 
 def checks(camera: str = "auto") -> Iterator[CheckUp]:

@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -39,18 +39,6 @@ BASE, GRIPPER = "base_link", "ee_gripper_link"
 OPTICAL_TURN = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
 Source = Literal["live", "recorded", "simulated", "reference"]
 ErrorKind = Literal["bias", "noise"]
-
-
-class MeasuringCamera(Protocol):
-    """What a result is measured with: a camera, or what stands in for one."""
-
-    @property
-    def source(self) -> Source:
-        """Whether it is live, recorded, simulated or a reference."""
-
-    @property
-    def name(self) -> str:
-        """Its name for people, such as "Intel RealSense D435"."""
 
 
 @dataclass(frozen=True)
@@ -205,7 +193,7 @@ def folder() -> Path:
 
 def save(
     lesson: str,
-    camera: MeasuringCamera,
+    camera: Any,
     quantities: Mapping[str, Quantity],
     covariances: Mapping[str, Covariance] | None = None,
     lens: Intrinsics | None = None,
@@ -214,6 +202,7 @@ def save(
 ) -> Path:
     """Write `results/<lesson>.json` in one step (a reader sees the old file or the new one).
 
+    camera: what measured, or an `Origin` or hand-over in its place: its name and source are kept.
     covariances: of those quantities that were estimated together, by a name for the group. lens,
     placement, eye_to_hand: as in `Result`; the camera's serial number goes along where it has one.
     Returns the path. Raises ValueError for what is no quantity and no covariance, and for a
