@@ -602,18 +602,10 @@ def _check_out(out: Path, overwrite: bool) -> None:
 
 @contextlib.contextmanager
 def _alone(out: Path) -> Iterator[None]:
-    """One grader at a time in a report. The system frees the lock when its holder ends."""
-    with (out / ROWS / "lock").open("a+b") as file:
+    """One grader at a time in a report."""
+    with contextlib.ExitStack() as held:
         try:
-            if sys.platform == "win32":
-                import msvcrt
-
-                file.seek(0)
-                msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
-            else:
-                import fcntl
-
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            held.enter_context(results.locked(out / ROWS / "lock", wait=False))
         except OSError:
             raise ValueError(f"out: another `coursekit grade` is writing to {out}") from None
         yield
