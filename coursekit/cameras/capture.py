@@ -118,9 +118,8 @@ def capture(
             if not album.views:
                 raise
         except CameraError as error:
-            kept = say(
-                "cameras.views_kept", error=error, count=len(album.views), folder=album.folder
-            )
+            count, folder = len(album.views), album.folder
+            kept = say("cameras.views_kept", error=error, count=count, folder=folder)
             raise CameraError(kept, error.frames) from error
     print(_summary(camera, album, views, before))
     return Detections(album.views, album.skipped)
@@ -138,10 +137,8 @@ def _summary(camera: Camera, album: Album, views: int, before: int) -> str:
     if have == before:
         return say("cameras.none_taken", before=before, **about)
     count = f"{have} views" if have >= views else f"{have} of {views} views"
-    moved = ": there is no board to hold, so the simulated camera was moved"
-    return say(
-        "cameras.taken", count=count, how=moved * isinstance(camera, SimulatedCamera), **about
-    )
+    how = say("cameras.moved") if isinstance(camera, SimulatedCamera) else ""
+    return say("cameras.taken", count=count, how=how, **about)
 
 
 # --- where views come from ---
@@ -484,8 +481,7 @@ def _proposals(board: Board, lens: Intrinsics) -> tuple[_View, ...]:
                 view = _aimed(board, lens, facing, near, aim * lens.size)
                 if view is not None:
                     views.append(view)
-    if not views:
-        raise ValueError(f"board: no view of {wide:g} x {high:g} m fits into {lens.size} px")
+    checks.refuse(not views, f"board: no view of {wide:g} x {high:g} m fits into {lens.size} px")
     return tuple(views)
 
 

@@ -24,6 +24,7 @@ from coursekit.plots.style import (
     single,
 )
 from coursekit.simulation.arm_poses import Setup
+from coursekit.words import say
 
 VIEW_M = 0.16  # how far the camera's pyramid is drawn
 SPACE_M = ((-0.30, 0.66), (-0.36, 0.36), (0.0, 0.84))  # x, y, z of the base that is shown
@@ -70,9 +71,8 @@ def _rig(ax: Any, setup: Setup, q: Floats) -> dict[str, float]:
     wide, high = setup.intrinsics.size
     pixels = np.array([(0, 0), (wide, 0), (wide, high), (0, high)], float)
     far = deproject(pixels, np.full(4, VIEW_M), setup.intrinsics.K)
-    view = transform_points(camera, np.vstack([far, np.zeros(3)]))[
-        [0, 1, 2, 3, 0, 4, 1, 4, 2, 4, 3]
-    ]
+    pyramid = transform_points(camera, np.vstack([far, np.zeros(3)]))
+    view = pyramid[[0, 1, 2, 3, 0, 4, 1, 4, 2, 4, 3]]
     ax.plot(*view.T, color=COLORS["color"], lw=1.2)
     arrows = {
         "T": (base, gripper, "model"),
@@ -138,11 +138,8 @@ def agreement(sessions: Mapping[str, HandEyeSession]) -> LessonFigure:
         titles = (f"{name}: turned by", "moved along the axis by", "the board in the base")
         for ax, title in zip(row, titles, strict=True):
             ax.set_title(title)
-        texts.append(
-            f"{name}: turns agree within {np.abs(arm[0] - seen[0]).max():.1f} deg, the camera goes "
-            f"{arm[1] @ seen[1] / (arm[1] @ arm[1]):.3f} times as far, the board spreads by "
-            f"{fit.spread_board_mm:.1f} mm"
-        )
+        apart, part = np.abs(arm[0] - seen[0]).max(), arm[1] @ seen[1] / (arm[1] @ arm[1])
+        texts.append(say("plots.agrees", name=name, apart=apart, part=part, fit=fit))
     fig.legend(*axes[2].get_legend_handles_labels(), loc="outside lower right", ncols=3)
     return fig.saying("agreement", each="; ".join(texts))
 
@@ -189,10 +186,8 @@ def more_poses(
         ax.set(xscale="log", yscale="log", xlabel="poses (number)")
         plain_ticks(ax.xaxis, counts, widen=True)
         ax.set_title(name)
-        texts.append(
-            f"{name}: error {error[0]:.2f} to {error[-1]:.2f} mm, stated {half[0]:.2f} to "
-            f"{half[-1]:.2f} mm"
-        )
+        (first, *_, last) = zip(error, half, strict=True)
+        texts.append(say("plots.error_and_half", name=name, first=first, last=last))
     plain_ticks(axes[0].yaxis, (0.1, 0.3, 1, 3, 10), widen=True)
     axes[0].set_ylabel("translation of X (mm)")
     axes[0].legend()
