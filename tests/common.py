@@ -8,9 +8,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
+from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
 from coursekit.boards import Board
@@ -38,6 +40,12 @@ def derivative(function, step, n):
     """The numerical derivative of a function of n numbers at zero, a column for each of them."""
     steps = step * np.eye(n)
     return np.stack([(function(e) - function(-e)) / (2 * step) for e in steps], axis=-1)
+
+
+def by_opencv(points, T, lens):
+    """Where OpenCV projects points (N, 3) at a pose (4, 4) through a lens, (N, 2) px."""
+    rotation = Rotation.from_matrix(T[:3, :3]).as_rotvec()
+    return cv2.projectPoints(points, rotation, T[:3, 3], lens.K, lens.dist)[0][:, 0]
 
 
 def most(share, of):

@@ -1,10 +1,12 @@
 """What is made once a run for the tests of several modules."""
 
+import os
 import signal
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -13,6 +15,13 @@ from fake_realsense import plugged_in, real_library
 from coursekit import specifications
 from coursekit.cameras import simulated
 from coursekit.cameras.simulated import SimulatedCamera
+
+
+@pytest.fixture(scope="session")
+def real_data():
+    if not os.environ.get("COURSEKIT_REAL_DATA"):
+        pytest.skip("COURSEKIT_REAL_DATA is not set: it names the folder of real data")
+    return Path(os.environ["COURSEKIT_REAL_DATA"])
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,5 @@
 """The rows of data/claims.csv, and which test recomputes which of them."""
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Callable

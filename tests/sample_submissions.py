@@ -5,8 +5,6 @@ pattern that stays, a drift that all pixels share, holes, and depths rounded to 
 claimed of its depths is computed here with NumPy where that is not the course's own estimate.
 """
 
-from __future__ import annotations
-
 import io
 import zipfile
 from collections.abc import Callable

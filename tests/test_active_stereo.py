@@ -26,6 +26,9 @@ F, B = UNIT.depth.fx, UNIT.baseline_m
 D435 = Rig(UNIT.depth, B)
 NOISELESS = replace(D435, electrons_per_grey=1e9, read_noise_e=0.0)
 MIDDLE = np.s_[120:360, 212:636]
+MIDDLE_ONLY = replace(
+    UNIT.depth, width=424, height=240, cx=UNIT.depth.cx - 212, cy=UNIT.depth.cy - 120
+)
 PROJECTOR_M = np.array([rig_module.PROJECTOR_AT * B, 0, 0])  # from the left eye
 
 
@@ -34,8 +37,12 @@ def plate(name: str, size: tuple, center: tuple, albedo: float, specular: float 
     return Box(name, np.array(size), T, (albedo,) * 3, specular=specular)
 
 
+def truth_m(view) -> np.ndarray:
+    return render(view.scene, view.rig.left).depth_m
+
+
 def true_disparity(view) -> np.ndarray:
-    return F * B / view.truth_m
+    return F * B / truth_m(view)
 
 
 def disparities(view, n: int, seed: int, rows: slice = slice(None)) -> np.ndarray:
@@ -102,8 +109,9 @@ def test_brightness_follows_lambert_and_the_inverse_square():
         view = on_wall(rig, distance, tilt)
         left = view.images(np.random.default_rng(0))[0] - rig_module.BLACK_GREY
         normal = np.array([np.sin(np.radians(tilt)), 0, -np.cos(np.radians(tilt))])
+        depth_m = truth_m(view)
         for u, v in ((424, 240), (120, 240), (728, 240), (424, 90), (150, 400)):
-            z = view.truth_m[v, u]
+            z = depth_m[v, u]
             point = np.array([(u - UNIT.depth.cx) / F, (v - UNIT.depth.cy) / F, 1.0]) * z
             to_lamp = PROJECTOR_M - point
             r = np.linalg.norm(to_lamp)
@@ -187,7 +195,8 @@ def test_fixed_pattern_stays_and_belongs_to_the_unit():
 def test_the_same_seed_gives_the_same_bytes_whatever_the_thread_count():
     def shoot() -> list[bytes]:
         rig_module._light.cache_clear()
-        view = replace(D435, drift_px=0.02, disparity_offset_px=0.1).look_at(artefact_scene())
+        small = replace(D435, left=MIDDLE_ONLY, drift_px=0.02, disparity_offset_px=0.1)
+        view = small.look_at(artefact_scene())
         rng = np.random.default_rng(5)
         frames = [view.frame(rng, time_s=k / 30) for k in range(2)]
         return [x.tobytes() for f in frames for x in (f.left, f.right, view.depth(f, 1e-4))]
@@ -206,19 +215,6 @@ def test_the_same_seed_gives_the_same_bytes_whatever_the_thread_count():
 
 
 # Hidden truth
-
-
-def test_baseline_error_and_yaw_bias_the_disparity():
-    distance, error, offset = 0.6, 0.004, 0.15
-    rig = replace(D435, baseline_error=error, disparity_offset_px=offset)
-    d = disparities(on_wall(rig, distance, 7.0), 3, 0)
-    view = on_wall(D435, distance, 7.0)
-    x_right = (np.arange(848) - true_disparity(view) - UNIT.depth.cx) / F
-    predicted = true_disparity(view) * (1 + error) + offset * (1 + x_right**2)  # a yaw is not even
-    for columns in (slice(100, 250), slice(350, 500), slice(600, 750)):
-        part = np.s_[:, 150:330, columns]
-        off = (d - predicted)[part][d[part] > 0]
-        assert abs(np.median(off)) < 0.012
 
 
 def test_drift_is_a_stationary_process_with_the_stated_time():
@@ -305,38 +301,19 @@ def test_z16_rounds_to_counts_and_refuses_what_it_cannot_hold():
         assert counts[0, 0] == counts[0, 1] == 0
 
 
-def test_pixel_locking_beside_opencvs_matchers():
-    """Mean error against the sub-pixel part of the true disparity, the same pairs for all."""
-
-    def padded(matcher):
-        matcher.setUniquenessRatio(12)
-        matcher.setDisp12MaxDiff(1)
-
-        def matched(*pair):
-            wide = [cv2.copyMakeBorder(x, 0, 0, 128, 0, cv2.BORDER_CONSTANT) for x in pair]
-            return matcher.compute(*wide)[:, 128:].astype(np.float32) / 16
-
-        return matched
-
-    block, semi_global = cv2.StereoBM_create(128, 11), cv2.StereoSGBM_create(0, 128, 5, 200, 800)
-    matchers = {"match": match, "BM": padded(block), "SGBM": padded(semi_global)}
-    total = {name: np.zeros(16) for name in matchers}
-    count = {name: np.zeros(16) for name in matchers}
+def test_errors_hardly_depend_on_the_sub_pixel_part_of_the_disparity():
+    """Pixel locking: the mean error of each sixteenth of a pixel."""
+    total, count = np.zeros((2, 16))
     for seed, distance in enumerate((0.5, 0.85, 1.0, 1.4)):
         view = on_wall(replace(D435, seed=seed), distance)
         rows = slice(160, 320)
-        pair = [eye[rows] for eye in view.images(np.random.default_rng(seed))]
         true = true_disparity(view)[rows]
-        phase = (true % 1 * 16).astype(int)
-        for name, matcher in matchers.items():
-            error = matcher(*pair) - true
-            good = np.abs(error) < 1
-            total[name] += np.bincount(phase[good], error[good], 16)
-            count[name] += np.bincount(phase[good], minlength=16)
-    locking = {name: float(np.ptp(total[name] / count[name])) for name in matchers}
-    assert locking["match"] <= 0.03
-    assert locking["SGBM"] > 0.1
-    assert locking["BM"] < 0.06
+        error = match(*(eye[rows] for eye in view.images(np.random.default_rng(seed)))) - true
+        good = np.abs(error) < 1
+        phase = (true % 1 * 16).astype(int)[good]
+        total += np.bincount(phase, error[good], 16)
+        count += np.bincount(phase, minlength=16)
+    assert np.ptp(total / count) <= 0.03
 
 
 # What comes out
@@ -417,7 +394,7 @@ def test_flying_pixels_are_a_few_per_cent_of_the_edge(near, behind, seed):
     """Valid pixels within 8 px of the block's outline that are on neither surface (5 sigma_d)."""
     wall, block = wall_scene(near + behind, 0.0)[0], tabletop(near)[2]
     view = replace(D435, seed=seed).look_at((wall, block))
-    mask = (view.truth_m < near + 0.001).astype(np.uint8)
+    mask = (truth_m(view) < near + 0.001).astype(np.uint8)
     square = np.ones((17, 17), np.uint8)
     band = (cv2.dilate(mask, square) - cv2.erode(mask, square)) > 0
     d = disparities(view, 3, seed)[:, band]
@@ -426,19 +403,6 @@ def test_flying_pixels_are_a_few_per_cent_of_the_edge(near, behind, seed):
     share = flying.sum() / valid.sum()
     assert 0.01 <= share <= 0.10
     assert 0.1 < (~valid).mean() < 0.4
-
-
-@pytest.mark.parametrize("distance", [0.45, 1.0])
-def test_dark_surfaces_are_holes(distance):
-    size, sides = (0.25 * distance, 0.25 * distance, 0.002), {0.3: 0.05, -0.3: 0.4}
-    cards = [
-        plate(f"card {albedo}", size, (side * distance, 0, distance - 0.001), albedo)
-        for side, albedo in sides.items()
-    ]
-    d = disparities(D435.look_at((*wall_scene(distance, 0.0), *cards)), 3, 0, slice(190, 295))
-    right, left = (round(UNIT.depth.cx + side * F) for side in sides)
-    assert (d[:, 10:95, right - 42 : right + 43] == 0).mean() >= 0.9
-    assert (d[:, 10:95, left - 42 : left + 43] == 0).mean() <= 0.05
 
 
 def test_the_artefact_scene_shows_each_artefact():

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from coursekit.boards import Board
 from coursekit.boards.board import BORDER_PX
-from coursekit.geometry import project, transform_points
+from coursekit.geometry import make_transform, project, transform_points
 from coursekit.hand_eye import MOUNTS
 from coursekit.simulation import arm_poses as poses
 from coursekit.simulation import default_setup
@@ -81,8 +81,8 @@ def test_the_search_finds_a_stored_set_again() -> None:
 
 
 def test_the_default_places_are_what_they_say() -> None:
-    T = poses.board_on_table(BOARD, (0.4, 0.1), turn_rad=0.3)
-    assert transform_points(T, BOARD.points.mean(axis=0)) == pytest.approx([0.4, 0.1, 0.0])
+    T = poses.board_on_table(BOARD)
+    assert transform_points(T, BOARD.points.mean(axis=0)) == pytest.approx([0.4, 0.0, 0.0])
     assert T[:3, 2] == pytest.approx([0, 0, -1])  # into the table
     T = poses.over_the_shoulder()
     assert T[:3, 0][2] == pytest.approx(0.0)  # level
@@ -94,7 +94,7 @@ def test_the_default_places_are_what_they_say() -> None:
 
 
 SETUP, RNG = default_setup("eye_in_hand"), np.random.default_rng(0)
-AWAY = replace(SETUP, Y=poses.board_on_table(SETUP.board, (2.0, 0.0)))
+AWAY = replace(SETUP, Y=make_transform(SETUP.Y[:3, :3], (2.0, 0.0, 0.0)))
 
 test_what_cannot_be_is_refused = refusals(
     ("mount: got 'wrist'", lambda: replace(SETUP, mount="wrist")),

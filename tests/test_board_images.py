@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from common import CHARUCO, CHECKERBOARD, NIGHTLY, each, named, refusals
+from common import CHARUCO, CHECKERBOARD, NIGHTLY, by_opencv, each, named, refusals
 from scipy.ndimage import gaussian_filter, shift
 from scipy.spatial.transform import Rotation
 
@@ -54,16 +54,10 @@ def noisy(seed, board=CHARUCO, view=TILTED, **effects):
     return render_board(board, pose(board, view), LENS, np.random.default_rng(seed), **effects)
 
 
-def opencv_pixels(points, T, lens):
-    turn, _ = cv2.Rodrigues(T[:3, :3])
-    pixels, _ = cv2.projectPoints(points, turn, T[:3, 3], lens.K, np.array(lens.coeffs))
-    return pixels[:, 0]
-
-
 def errors(image, board, T, lens):
     """Found minus projected corners, (N, 2) px."""
     found = detect(image, board)
-    return found.pixels - opencv_pixels(board.points, T, lens)[found.ids]
+    return found.pixels - by_opencv(board.points, T, lens)[found.ids]
 
 
 # --- geometry ---
@@ -127,8 +121,8 @@ def test_a_bowed_board_is_seen_bowed():
     board, bow_m = CHECKERS, 0.004
     T = pose(board, TILTED)
     found = detect(render_board(board, T, LENS, None, bow_m=bow_m), board)
-    flat = opencv_pixels(board.points, T, LENS)
-    expected = opencv_pixels(bowed(board, bow_m), T, LENS)
+    flat = by_opencv(board.points, T, LENS)
+    expected = by_opencv(bowed(board, bow_m), T, LENS)
     assert np.linalg.norm(expected - flat, axis=1).max() > 2.0
     error = found.pixels - expected[found.ids]
     assert np.sqrt((error**2).mean()) < 0.03
@@ -176,12 +170,12 @@ def test_a_rolling_shutter_moves_corners_as_predicted_for_each_row():
     velocity, readout_s = np.array([0.12, -0.08, 0.05]), 0.020
     how = {"velocity": (*velocity, 0, 0, 0), "readout_ms": 1e3 * readout_s, "exposure_ms": 0.1}
     found = detect(render_board(board, T, LENS, None, **how), board)
-    moved = opencv_pixels(board.points, T, LENS)
+    moved = by_opencv(board.points, T, LENS)
     for _ in range(10):  # a corner is seen when the row that it is in is read
         when_s = readout_s * ((moved[:, 1] + 0.5) / LENS.height - 0.5)
         moving = transform_points(T, board.points) + when_s[:, None] * velocity
         moved = project(moving, LENS.K, LENS.dist)
-    assert np.ptp((moved - opencv_pixels(board.points, T, LENS))[:, 0]) > 0.5
+    assert np.ptp((moved - by_opencv(board.points, T, LENS))[:, 0]) > 0.5
     error = found.pixels - moved[found.ids]
     assert np.sqrt((error**2).mean()) < 0.025
     points = transform_points(T, board.points)
@@ -195,7 +189,7 @@ def test_a_rolling_shutter_moves_corners_as_predicted_for_each_row():
 
 def test_variance_grows_linearly_with_the_mean():
     """Photons: variance = gain (mean - black) + (gain read)^2 + 1/12 for rounding."""
-    images = np.stack([noisy(seed) for seed in range(40)]).astype(float)
+    images = np.stack([noisy(seed) for seed in range(40 if NIGHTLY else 16)]).astype(float)
     clean = still(CHARUCO)
     at = [(clean >= level) & (clean < level + 10) for level in range(20, 150, 10)]
     at = [some for some in at if some.sum() > 500]
@@ -231,7 +225,7 @@ def test_corners_are_found_with_a_noise_of_about_a_twentieth_of_a_pixel(board):
     """Nothing adds noise to corners: it comes from photons, through the detector."""
     noise, bias = [], []
     for view in (((0, 0, 3), 0.45), TILTED, ((20, 25, 10), 0.55)):
-        projected = opencv_pixels(board.points, pose(board, view), LENS)
+        projected = by_opencv(board.points, pose(board, view), LENS)
         off = np.full((4, *projected.shape), np.nan)
         for seed in range(4):
             found = detect(noisy(seed, board, view), board)
@@ -271,7 +265,7 @@ def test_a_cheap_cameras_jpeg_adds_to_the_corners_noise_and_shifts_none(quality)
         picture = render_board(CHECKERS, T, LENS, rng, uneven=0.3)
         assert np.abs(as_taken(picture).astype(int) - picture).max() <= 3
         found = detect(as_taken(picture, quality, sharpen=1.0, mosaic=True), CHECKERS)
-        errors.append(found.pixels - opencv_pixels(CHECKERS.points, T, LENS)[found.ids])
+        errors.append(found.pixels - by_opencv(CHECKERS.points, T, LENS)[found.ids])
     errors = np.concatenate(errors)
     assert 0.02 < errors.std() < 0.15
     assert np.abs(errors.mean(axis=0)).max() < 3 * errors.std() / np.sqrt(len(errors))

@@ -10,7 +10,7 @@ import cv2
 import matplotlib as mpl
 import numpy as np
 import pytest
-from common import CHARUCO, CHECKERBOARD, NIGHTLY, each, named, refusals
+from common import CHARUCO, CHECKERBOARD, EXPECTED, NIGHTLY, each, named, refusals
 
 import coursekit.boards.detector
 from coursekit.boards import Board, BoardNotFound, detect, detect_all, save_sheet
@@ -291,16 +291,7 @@ def test_says_which_checkerboard_it_sees():
     assert "a checkerboard of 10x7 squares, without markers: use Board('checkerboard'" in said
 
 
-@pytest.mark.parametrize(
-    ("asked", "said"),
-    [
-        ({"squares": (6, 9)}, "27 markers of DICT_5X5_250 as on a board of 9x6 squares"),
-        ({"squares": (8, 6)}, "use squares=(9, 6)"),
-        ({"dictionary": "DICT_6X6_250"}, "use dictionary='DICT_5X5_250'"),
-        ({"dictionary": "DICT_APRILTAG_36H11"}, "27 markers of DICT_5X5_250"),
-        ({"old_origin": True}, "use old_origin=False"),
-    ],
-)
+@pytest.mark.parametrize(("asked", "said"), EXPECTED["other_charuco_boards"])
 def test_says_which_charuco_board_it_sees(asked, said):
     assert said in not_found(shot(CHARUCO), replace(CHARUCO, **asked))
 
@@ -541,14 +532,3 @@ test_what_cannot_be_is_refused = refusals(
     *each("360 x 270 mm does not fit on A4: take A2, or .* 20 mm", printed, "board", LARGE),
     *each("take a print shop, or squares of at most 9.9 mm", printed, "board", HUGE),
 )
-
-
-def test_it_is_corner_sub_pix_where_nothing_is_different():
-    """Seen squarely, on the smoothed image, with 0.4 of a square for its window."""
-    T = pose(CHECKERBOARD, tilt_deg=0.0, roll_deg=0.0, z_m=0.5, shift_m=(0.0013, 0.0007))
-    image = photograph(view(CHECKERBOARD, T)[0])  # 30 px a square
-    seen = detect(image, CHECKERBOARD)
-    smooth = cv2.GaussianBlur(image.astype(np.float32), (7, 7), 1.0)
-    theirs = np.rint(seen.pixels).astype(np.float32).reshape(-1, 1, 2)
-    cv2.cornerSubPix(smooth, theirs, (12, 12), (-1, -1), (3, 100, 1e-4))
-    np.testing.assert_allclose(seen.pixels, theirs.reshape(-1, 2), atol=0.01)

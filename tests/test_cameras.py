@@ -1,10 +1,8 @@
 """The same tests for the simulated camera and a recording of it, then what is special to each."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from common import NIGHTLY
+from common import EXPECTED, NIGHTLY
 from fake_realsense import ending_after
 from scipy.spatial.transform import Rotation
 
@@ -131,18 +129,7 @@ def test_closing_twice_is_fine_and_a_closed_camera_says_so(camera):
         camera.frame()
 
 
-SAID = {
-    "simulated": (
-        "Locked infrared exposure at ",
-        "Simulated D435, seed 7: no real camera in use.\nPlug in a RealSense and run this cell "
-        'again, or name a recording: ck.open_camera("file.bag")',
-    ),
-    "recorded": (
-        "cannot be changed",
-        "Simulated D435 (recording tabletop.db3): depth 848x480, colour 640x480, "
-        "baseline 50.2 mm, depth unit 1 mm",
-    ),
-}
+SAID = EXPECTED["cameras_said"]
 
 
 def test_description_and_what_lock_did(camera):
@@ -220,13 +207,7 @@ def test_the_truth_is_near_what_is_reported_and_each_unit_has_its_own():
     assert 0.06 < np.std([truth.disparity_offset_px for truth in truths]) < 0.14
     bias_mm = [1000 * expected_m(SimulatedCamera(seed=seed), 0.45) - 450 for seed in range(40)]
     assert np.mean((np.abs(bias_mm) > 1.5) & (np.abs(bias_mm) < 5.5)) > 0.8
-    assert repr(truths[7]) == (
-        "true baseline 50.558 mm, reported 50.171 mm: depth scale error -0.77 %\n"
-        "disparity offset -0.198 px, drifting by 0.008 px with a correlation time of 3 s\n"
-        "true colour lens fx 614.69, fy 614.87, cx 321.37, cy 238.27 px, "
-        "k1 +0.0278, k2 -0.0228, p1 -0.0008, p2 -0.0001\n"
-        "        reported fx 613.20, fy 613.42, cx 319.94, cy 239.18 px, no distortion"
-    )
+    assert repr(truths[7]) == EXPECTED["unit_7"]
 
 
 def test_the_colour_image_is_seen_through_the_true_lens():

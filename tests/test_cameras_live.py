@@ -1,7 +1,5 @@
 """A live RealSense, played by a fake of the vendor's module: no test machine has one."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from common import EXPECTED
@@ -152,14 +150,7 @@ def test_infrared_only_if_asked(plug_in):
     assert (left.dtype, left.shape, left[0, 0], right[0, 0]) == (np.uint8, (480, 848), 50, 100)
 
 
-@pytest.mark.parametrize(
-    ("name", "instruction"),
-    [
-        ("60 mm block", "Put the 60 mm block on the table, its front face square to the camera, "),
-        ("wall", "Point the camera at a bland wall that fills the image, turned by about 7 degr"),
-        ("mug", "Put the mug "),
-    ],
-)
+@pytest.mark.parametrize(("name", "instruction"), EXPECTED["placing"])
 def test_placing_tells_the_person_and_waits(plug_in, monkeypatch, capsys, name, instruction):
     rs = plug_in()
     asked = []

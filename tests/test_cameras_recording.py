@@ -1,7 +1,5 @@
 """Recordings: what is written is what is read, and every bad file ends in words of advice."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import shutil
@@ -15,6 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from common import EXPECTED
 from fake_realsense import ending_after, real_library
 from scipy.spatial.transform import Rotation
 
@@ -224,16 +223,7 @@ def test_a_failed_overwrite_keeps_the_old_file(rs, tmp_path):
     assert depth_frame_numbers(path) == [7, 14, 21]
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("a.bag", r"want a name that ends in \.db3"),
-        ("a", r"want a name that ends in \.db3"),
-        ("a.DB3", r"want a name that ends in \.db3"),
-        ("nowhere/a.db3", "there is no folder .*nowhere: make it first"),
-        ("folder.db3", "is a folder"),
-    ],
-)
+@pytest.mark.parametrize(("name", "message"), EXPECTED["bad_recording_paths"])
 def test_refuses_a_bad_path(tmp_path, name, message):
     (tmp_path / "folder.db3").mkdir()
     with pytest.raises(ValueError, match=f"^path: .*{message}"):

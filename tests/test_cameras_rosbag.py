@@ -229,7 +229,7 @@ def test_damaged_messages_are_an_error_of_the_camera(tmp_path):
         path.write_bytes(data[:at] + bytes(rng.integers(0, 256, 3000, np.uint8)) + data[at:])
         with pytest.raises(CameraError, match=r"b\.bag is damaged"):
             open_camera(path)
-    for _ in range(60):
+    for _ in range(24):
         changed = bytearray(data)
         for at in rng.integers(len(data) // 2, len(data), 40) if rng.random() < 0.5 else range(300):
             changed[at if at > 15 else 200] = rng.integers(256)
@@ -238,4 +238,4 @@ def test_damaged_messages_are_an_error_of_the_camera(tmp_path):
             open_camera(path).frames(N, progress=False)
         except CameraError:
             failed += 1
-    assert failed > 20
+    assert failed > 8

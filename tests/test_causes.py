@@ -1,7 +1,5 @@
 """The search for causes that both diagnoses use, on models small enough to check by hand."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

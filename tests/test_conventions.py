@@ -1,8 +1,5 @@
 """geometry against librealsense, point by point and frame by frame."""
 
-from __future__ import annotations
-
-import os
 from pathlib import Path
 
 import numpy as np
@@ -144,7 +141,6 @@ def test_align_is_librealsenses_on_a_simulated_recording(tabletop, monkeypatch) 
 
 
 @pytest.mark.real
-@pytest.mark.skipif("COURSEKIT_REAL_DATA" not in os.environ, reason="COURSEKIT_REAL_DATA not set")
-def test_align_is_librealsenses_on_a_real_d435(monkeypatch) -> None:
-    folder = Path(os.environ["COURSEKIT_REAL_DATA"]) / "realsense_d435"
-    check_against_the_vendor(folder / "single_depth_color_640x480.bag", monkeypatch)
+def test_align_is_librealsenses_on_a_real_d435(real_data, monkeypatch) -> None:
+    bag = real_data / "realsense_d435" / "single_depth_color_640x480.bag"
+    check_against_the_vendor(bag, monkeypatch)

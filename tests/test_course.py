@@ -14,6 +14,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from common import EXPECTED
 
 ROOT = Path(__file__).resolve().parents[1]
 REQUIREMENTS = ("requirements.txt", "requirements-test.txt", "requirements-camera.txt")
@@ -167,19 +168,8 @@ def test_test_adds_its_tools_runs_every_check_and_names_those_that_failed(projec
     code, output = run(project, "test", "-k", "some")
     assert "requirements-test.txt" in calls(project)
     assert code == 1
-    assert output[output.index("--") :].splitlines() == [
-        "-- ruff check",
-        "ruff check",
-        "-- ruff format",
-        "ruff format --check",
-        "-- mypy",
-        "mypy",
-        "-- stored outputs of the notebooks",
-        "checked the notebooks",
-        "-- pytest",
-        "pytest -n 2 --dist loadscope --no-loadscope-reorder -k some",
-        "Failed: mypy",
-    ]
+    said = output[output.index("--") :].splitlines()
+    assert said == EXPECTED["said_by_course_test"].splitlines()
     (project / "mypy.py").write_text("", encoding="utf-8")
     code, output = run(project, "test")
     said = "pytest -n 2 --dist loadscope --no-loadscope-reorder"

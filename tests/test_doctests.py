@@ -1,7 +1,5 @@
 """Examples in docstrings: all of them run, and functions that the notebooks use have one."""
 
-from __future__ import annotations
-
 import ast
 import doctest
 import importlib

@@ -1,7 +1,5 @@
 """`coursekit doctor`: each fault has its line and its remedy, and none stops the rest."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import re
@@ -15,6 +13,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from common import EXPECTED
 from fake_realsense import SERIAL
 
 from coursekit import doctor, results
@@ -97,15 +96,7 @@ def test_python(monkeypatch, owner, attribute, value, verdict, says):
     assert ("Python 3.13" in found.remedy or "a hub" in found.remedy) == (verdict != "ok")
 
 
-@pytest.mark.parametrize(
-    ("brings", "version", "verdict"),
-    [
-        (["opencv-python-headless"], "", "ok"),
-        (["opencv-python-headless", "opencv-python"], "", "problem"),
-        (["opencv-python-headless"], "5.0.0", "problem"),
-        ([], "", "problem"),
-    ],
-)
+@pytest.mark.parametrize(("brings", "version", "verdict"), EXPECTED["brings_opencv"])
 def test_one_package_brings_opencv(monkeypatch, brings, version, verdict):
     if version:
         monkeypatch.setattr("cv2.__version__", version)
@@ -133,15 +124,7 @@ tomlish==9 ; python_full_version >= '3.0'
 """
 
 
-@pytest.mark.parametrize(
-    ("name", "version", "verdict", "says", "remedy"),
-    [
-        ("numpy", "2.4.0", "ok", "all 2 as pinned in requirements.txt", ""),
-        ("tomlish", "", "problem", "not installed: tomlish", "pip install -r requirements.txt"),
-        ("numpy", "2.5.1", "note", "numpy 2.5.1 (tested with 2.4.0)", ""),
-        ("numpy", "1.26.0", "problem", "do not suit the course: numpy 1.26.0 (want >=2.3)", ""),
-    ],
-)
+@pytest.mark.parametrize(("name", "version", "verdict", "says", "remedy"), EXPECTED["packages"])
 def test_packages(monkeypatch, tmp_path, name, version, verdict, says, remedy):
     """A requirements file with two packages, and one for another system."""
     (tmp_path / "requirements.txt").write_text(PINS, encoding="utf-8")
@@ -352,14 +335,7 @@ def test_a_camera_in_order(quick, plug_in, monkeypatch):
     assert rs.stops == 1  # and it is let go
 
 
-@pytest.mark.parametrize(
-    ("told", "check", "verdict", "remedy"),
-    [
-        ({"usb_type_descriptor": "2.1"}, "USB link", "problem", "USB 3 port"),
-        ({"firmware_version": "5.9.13.0"}, "Firmware", "note", "RealSense Viewer"),
-        ({"firmware_version": "5.17.0.10"}, "Firmware", "ok", ""),
-    ],
-)
+@pytest.mark.parametrize(("told", "check", "verdict", "remedy"), EXPECTED["link_and_firmware"])
 def test_link_and_firmware(quick, plug_in, told, check, verdict, remedy):
     plug_in().told.update(told)
     expect(line(examine(), check), verdict, remedy=remedy)

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from common import case, nightly, refusals
+from common import EXPECTED, case, nightly, refusals
 from scipy.spatial.transform import Rotation
 from simulated_hand_eye import arm_session
 
@@ -550,15 +550,7 @@ def test_samples_of_other_calibrators(tmp_path, mount) -> None:
         HandEyeSession.from_folder(stated, other)
 
 
-@pytest.mark.parametrize(
-    ("was", "now", "message"),
-    [
-        ("object_wrt_sensor", "object", "want .?tracking or optical or object_wrt_sensor"),
-        ("1.0]", "1.0, 2.0]", "17 numbers"),
-        ("1.0]", "2.0]", "the last row"),
-        ("0.0, 1.0]", ".nan, 1.0]", "finite"),
-    ],
-)
+@pytest.mark.parametrize(("was", "now", "message"), EXPECTED["bad_samples"])
 def test_samples_that_are_none(tmp_path, was, now, message) -> None:
     text = moveit(np.stack([np.eye(4)] * 3), np.stack([np.eye(4)] * 3))
     assert was in text

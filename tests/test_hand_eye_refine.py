@@ -3,8 +3,6 @@
 COURSEKIT_NIGHTLY=1 repeats the statistics over 1,000 sessions in place of 5.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

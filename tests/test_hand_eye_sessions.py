@@ -1,16 +1,13 @@
 """Simulated hand-eye sessions against their own truth, and sessions in folders."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
-from common import mutants
+from common import by_opencv, mutants
 from simulated_hand_eye import holds
 
 from coursekit.arm import ArmErrors, widowx
@@ -36,8 +33,7 @@ def seen_by_opencv(truth, view: int) -> np.ndarray:
     """All corners (N, 2) of a view by another implementation of the projection."""
     T, lens = truth.T_camera_board[view], truth.setup.intrinsics
     points = truth.setup.board.points * truth.mistakes.square_scale
-    pixels, _ = cv2.projectPoints(points, cv2.Rodrigues(T[:3, :3])[0], T[:3, 3], lens.K, lens.dist)
-    return pixels[:, 0]
+    return by_opencv(points, T, lens)
 
 
 # --- what is simulated ---

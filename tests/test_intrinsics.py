@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from common import each, refusals
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 from scipy.stats import t as student
 from simulated_corners import CHARUCO, CHECKERBOARD, LENS, dense_jacobian, fit
@@ -171,19 +172,20 @@ def test_jacobian_is_the_numerical_derivative_of_opencvs_projection(result):
     assert rows.stop == len(shared) == 2 * result.corners
 
 
-def test_joint_covariance_is_the_inverse_of_the_whole_normal_matrix(result):
-    """The Schur complements against one dense inverse of the whole, 177 x 177."""
+def test_covariances_are_from_the_inverse_of_the_whole_normal_matrix(result):
+    """The Schur complements and the poses' mean against one dense inverse, 177 x 177."""
     whole = dense_jacobian(result)
     scale = np.linalg.norm(whole, axis=0)
     _, triangle = np.linalg.qr(whole / scale)
     inverse = np.linalg.inv(triangle)
-    wanted = inverse @ inverse.T / np.outer(scale, scale)
+    views = len(result.T_camera_board)
+    mean = block_diag(np.eye(9), np.tile(np.eye(6) / views, views))
+    wanted = mean @ (inverse @ inverse.T / np.outer(scale, scale)) @ mean.T
     sigma = np.sqrt(np.diag(wanted))
-    joint = result.equations.covariance(result.equations.shared_covariance, 1.0)
+    joint = result.equations.mean_motion_covariance(result.equations.shared_covariance, 1.0)
     np.testing.assert_allclose(
         joint / np.outer(sigma, sigma), wanted / np.outer(sigma, sigma), atol=1e-7
     )
-    np.testing.assert_allclose(result.joint_covariance[:9, :9], result.covariance, rtol=1e-9)
     k1, k2 = np.sqrt(np.diag(result.covariance))[4:6]
     assert result.covariance[4, 5] / (k1 * k2) < -0.9  # they pull against each other
 

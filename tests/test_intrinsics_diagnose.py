@@ -4,8 +4,6 @@ Thresholds were set on sessions with the seeds 0 to 999; the tests use seeds fro
 nothing was tuned on those. COURSEKIT_NIGHTLY=1 runs 100 sessions a cause and 200 healthy ones.
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from dataclasses import replace
@@ -31,7 +29,7 @@ from coursekit.intrinsics.derivatives import (
 )
 from coursekit.intrinsics.diagnosis import blur_lengths_px, depth_scale, diagnose, stored_power
 from coursekit.intrinsics.fit import calibrate
-from coursekit.simulation.corner_sessions import Effects, Truth, corner_session, ordinary
+from coursekit.simulation.corner_sessions import Effects, Truth, corner_session
 from tools import make_data
 
 FIRST_SEED = 100_000
@@ -70,19 +68,20 @@ def session(seed: int, effects: Effects) -> tuple[Detections, Truth, Board]:
 def test_a_cause_is_named(label: str) -> None:
     """At least 95 of 100 named, at most 5 with a wrong name besides (nightly).
 
-    Of 2, all: what names 50 % passes that with a probability of 25 %.
+    By day one, of either board in turn: what names 75 % of all passes the nine with 8 %.
     """
     name, effects = CLASSES[label]
     found: Counter[tuple[str, ...]] = Counter()
-    for seed in range(FIRST_SEED, FIRST_SEED + (100 if NIGHTLY else 2)):
+    first = FIRST_SEED if NIGHTLY else FIRST_SEED + [*CLASSES].index(label)
+    for seed in range(first, first + (100 if NIGHTLY else 1)):
         detections, _, board = session(seed, effects)
         found[diagnose(detections, board).names] += 1
     check_named(found, name, label)
 
 
 def test_healthy_sessions_get_no_finding() -> None:
-    """At most 4 of 200 (nightly); of 8 none: a rate of 25 % passes with 10 %."""
-    count, most = (200, 4) if NIGHTLY else (8, 0)
+    """At most 4 of 200 (nightly); of 4 none: a rate of 25 % passes with 32 %."""
+    count, most = (200, 4) if NIGHTLY else (4, 0)
     found: Counter[tuple[str, ...]] = Counter()
     for seed in range(FIRST_SEED + 1000, FIRST_SEED + 1000 + count):
         # every other pair of seeds, so that each kind of board has both
@@ -119,7 +118,7 @@ def test_two_causes_are_both_named_and_measured() -> None:
     findings = diagnose(detections, CHECKERBOARD)
     assert set(findings.names) == {"bowed_board", "spoiled_view"}
     spoiled, bowed = findings
-    assert f"view {truth.spoiled_view:02d}:" in spoiled.evidence
+    assert f"view {truth.draw.spoiled_view:02d}:" in spoiled.evidence
     found = searched(detections)
     assert {step.test.cause for step in found.accepted} == {"bowed_board", "spoiled_view"}
     sag, sigma = causes.sag(found.model)
@@ -134,14 +133,14 @@ def test_the_sizes_of_focus_drift_and_shutter_motion_come_out() -> None:
     )
     model = searched(drifting).model
     assert tuple(model.sizes) == (causes.FOCUS,)
-    assert model.sizes[causes.FOCUS] == pytest.approx(truth.focal_scale.std(), rel=0.25)
+    assert model.sizes[causes.FOCUS] == pytest.approx(truth.draw.focal_scale.std(), rel=0.25)
     moving, truth = corner_session(
         CHECKERBOARD, LENS, FIRST_SEED + 1, effects=Effects(readout_s=0.02, speed_m_s=0.1)
     )
     model = searched(moving).model
     assert tuple(model.sizes) == (causes.SHUTTER,)
     assert np.sqrt(3) * model.sizes[causes.SHUTTER] == pytest.approx(0.002, rel=0.25)
-    estimated, true = model.values[causes.SHUTTER][:, :2], 0.02 * truth.velocity_m_s[:, :2]
+    estimated, true = model.values[causes.SHUTTER][:, :2], 0.02 * truth.draw.velocity_m_s[:, :2]
     assert np.corrcoef(estimated.ravel(), true.ravel())[0, 1] > 0.7
 
 
@@ -198,15 +197,6 @@ def test_the_fisheye_is_opencvs_with_its_derivatives() -> None:
         np.testing.assert_allclose((ahead - back) / 2e-6, by_parameter[:, :, k], atol=1e-3)
 
 
-@pytest.mark.parametrize("seed", [FIRST_SEED, FIRST_SEED + 1])
-def test_a_lens_of_the_model_is_not_beaten_by_a_fisheye(seed: int) -> None:
-    """With a bow, a drifting focus or a shutter on top; lenses with tangential coefficients."""
-    for effects in (Effects(bow_m=1e-3), Effects(focus_drift=0.02), ordinary(seed)):
-        detections, _, board = session(seed, effects)
-        start = causes.refit(Calibration.of(calibrate(detections, board)))
-        assert causes.as_fisheye(start)[1] > 0.01
-
-
 def test_the_size_of_a_cause_is_the_restricted_maximum_likelihood() -> None:
     """Against the likelihood written out with a dense covariance."""
     model = small(FIRST_SEED + 6, Effects(focus_drift=0.02))
@@ -232,7 +222,7 @@ def test_the_size_of_a_cause_is_the_restricted_maximum_likelihood() -> None:
 
 def test_p_values_of_healthy_sessions_are_uniform() -> None:
     """Kolmogorov-Smirnov at 1 %, over all causes; views that differ in noise make no difference."""
-    count = 200 if NIGHTLY else 12
+    count = 200 if NIGHTLY else 8
     p_values: dict[str, list[float]] = {cause: [] for cause in causes.PHYSICAL}
     for seed in range(FIRST_SEED + 3000, FIRST_SEED + 3000 + count):
         detections, _, board = session(seed, Effects(noise_spread=0.2))
@@ -287,7 +277,10 @@ def fisheye_views(focal: float, seed: int) -> Detections:
     return Detections(views)
 
 
-@pytest.mark.parametrize(("focal", "seed"), [(310.0, 3), (340.0, 4), (280.0, 5)])
+FISHEYES = [(310.0, 3), (340.0, 4), (280.0, 5)]
+
+
+@pytest.mark.parametrize(("focal", "seed"), FISHEYES if NIGHTLY else FISHEYES[2:])
 def test_a_fisheye_is_a_wrong_lens_and_nothing_else(focal: float, seed: int) -> None:
     findings = diagnose(fisheye_views(focal, seed), CHECKERBOARD)
     assert findings.names == ("lens_model",)
@@ -406,7 +399,7 @@ def test_the_depth_scale_has_an_honest_sigma() -> None:
         )
         scale = depth_scale(calibrate(detections, CHARUCO), list(truth.depth_m))
         assert scale is not None
-        off.append((scale.factor - 1.02) / scale.sigma)
+        off.append((scale[0] - 1.02) / scale[1])
     assert np.mean(np.square(off)) < 1.9  # chi2(20)/20 exceeds 1.9 in 1 % of all cases
     assert np.mean(np.square(off)) > 0.1
 

@@ -107,7 +107,7 @@ def folding(coefficients, seed: int) -> Detections:
     return Detections(views)
 
 
-@pytest.mark.parametrize("case", FOLDS)
+@pytest.mark.parametrize("case", FOLDS if NIGHTLY else [*FOLDS][:2])
 def test_where_a_lens_folds_it_has_no_figures_and_all_that_is_said_is_a_number(case) -> None:
     views = folding(*FOLDS[case])
     result = intrinsics.calibrate(views, CHECKERBOARD)
@@ -221,14 +221,13 @@ def test_comparison_of_a_shared_focal_length() -> None:
 @pytest.mark.parametrize("board", [CHARUCO, CHECKERBOARD], ids=lambda board: board.kind)
 def test_a_bow_is_found_and_its_damage_undone(board: Board) -> None:
     """What it does while nobody looks for it is claim I1, by the same fits."""
-    count = 100 if NIGHTLY else 10
+    count = 100 if NIGHTLY else 6
     fitted, sag_held, fx_held = [], 0, 0
     for seed in range(9000, 9000 + count):
         bow = intrinsics.fit_bow(fit(board, seed, effects=Effects(bow_m=0.001)))
         assert bow.result.converged
         assert bow.p_value < 1e-6
-        low, high = bow.interval_m()
-        sag_held += low <= 0.001 <= high
+        sag_held += abs(bow.sag_m - 0.001) <= bow.result.quantile() * bow.sigma_m
         low, high = bow.result.interval("fx")
         fx_held += low <= LENS.fx <= high
         fitted.append(bow.result)

@@ -1,8 +1,8 @@
 """Intervals and projection uncertainty against simulated sessions whose truth is known.
 
-COURSEKIT_NIGHTLY=1 takes 1,000 sessions, and then asks for 93 to 97 %; 30 are allowed three sigmas
-of a count. The fits of many sessions
-start at the true lens: where a fit starts does not change where it ends (test_intrinsics.py).
+COURSEKIT_NIGHTLY=1 takes 1,000 sessions, and then asks for 93 to 97 %; 20 are allowed three sigmas
+of a count. The fits of many sessions start at the true lens: where a fit starts does not change
+where it ends (test_intrinsics.py).
 """
 
 import math
@@ -18,8 +18,8 @@ from coursekit.geometry import deproject, invert_transform, project, transform_p
 from coursekit.intrinsics.fit import evaluate, image_grid
 from coursekit.simulation.corner_sessions import corner_session
 
-SESSIONS = 1000 if NIGHTLY else 30
-WITHIN = (0.93, 0.97) if NIGHTLY else (0.83, 1.0)
+SESSIONS = 1000 if NIGHTLY else 20
+WITHIN = (0.93, 0.97) if NIGHTLY else (0.80, 1.0)
 TRUTH = {"fx": 612.0, "fy": 610.0, "cx": 322.0, "cy": 238.0, "k1": 0.08}
 PIXELS = np.array([[320.0, 240.0], [20, 20], [620, 460], [600, 100], [150, 400]])
 RANGES_M = (0.45, 2.0)

@@ -1,7 +1,5 @@
 """Lesson 02: its exercises name every mistake, and its checkpoints' numbers and texts are right."""
 
-from __future__ import annotations
-
 import math
 import re
 from statistics import median
@@ -92,29 +90,18 @@ def test_an_example_of_the_verdict() -> None:
     assert f"xpected {median(depths):.5f}, yours NaN m." in verdict.lines[0]
 
 
-def nan_for_zero_in_place(depth_m, u, v, half=2, min_valid=5):
-    answer = pixel_by_pixel(depth_m, u, v, half, min_valid)
-    depth_m[depth_m == 0] = np.nan
-    return answer
-
-
 right = ROBUST_DEPTH.model()
 
 
 @pytest.mark.parametrize(
     ("function", "kind", "says"),
     [
-        (lambda *args: None, "not attempted", "returns None"),
         (lambda *args: None if np.isnan(right(*args)) else right(*args), "wrong", "`return`"),
         (lambda *args: [right(*args)], "wrong", "shape (1,), and one number is wanted"),
         (lambda *args: np.array(right(*args)), "right", "All 22 cases agree"),
-        (lambda *args: "0.45", "wrong", "a str"),
-        (lambda *args: math.nan, "wrong", "runs away"),
-        (nan_for_zero_in_place, "wrong", "changes the array it is given. The numbers are right"),
-        (lambda image, u, v: 0.45, "raised", "positional arguments"),
     ],
 )
-def test_odd_functions(function, kind: str, says: str) -> None:
+def test_odd_functions_of_one_number(function, kind: str, says: str) -> None:
     verdict = ROBUST_DEPTH.judge(function)
     assert verdict.kind == kind
     assert says in repr(verdict)
@@ -140,22 +127,12 @@ def test_no_printed_line_is_longer_than_a_page() -> None:
 
 
 def test_the_numbers_of_the_checkpoints() -> None:
-    """Computed here another way: by disparities, and by search for the limit."""
+    """Computed here another way: by disparities. Others show their working: test_lessons.py."""
     step = 0.0006 * 447 * 0.05 / 0.4**2  # px that make 0.6 mm at 0.4 m
     d = 447 * 0.05 / 0.8
     noise = 447 * 0.05 * (1 / (d - step / 2) - 1 / (d + step / 2))
     assert CHECKPOINTS["depth_noise.twice_as_far"].value == pytest.approx(1000 * noise, rel=1e-4)
 
-    law = DEPTH_NOISE.model()
-    ratio = law(0.4, 447, 0.018, 0.08) / law(0.4, 447, 0.050, 0.08)
-    assert CHECKPOINTS["depth_noise.short_baseline"].value == pytest.approx(ratio)
-    assert CHECKPOINTS["depth_noise.short_baseline"].value == pytest.approx(2.78, abs=0.005)
-    assert 1000 * law(0.4, 447, 0.018, 0.08) == pytest.approx(1.59, abs=0.005)
-
-    limit = CHECKPOINTS["depth_noise.minimum_range"].value
-    left, right = (431.1 * X / limit for X in (0.0, -0.05017))
-    assert left - right == pytest.approx(126)
-    assert limit == pytest.approx(0.172, abs=0.0005)
     slips = [126 * 0.05017 / 431.1, 126 / 431.1 / 0.05017, 431.1 * 0.05017, 0.05017, 431.1 / 126]
     slips.append(447 * 0.05 / 126)
     classics = [c.value for c in CHECKPOINTS["depth_noise.minimum_range"].classics]

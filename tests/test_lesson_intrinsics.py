@@ -1,7 +1,5 @@
 """What notebook 03 teaches, against OpenCV, ranks of Jacobians and simulated sessions."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Placing and lighting things before a camera, recorded sets, and that a session comes back."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -276,15 +274,7 @@ def test_ctrl_c_keeps_the_scenes_so_far(tmp_path, capsys, monkeypatch):
         assert len(played.frames(3)) == 3
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"n": 0}, "^n: got 0"),
-        ({"distances_m": [0.3, -1]}, "^distance_m: got -1"),
-        ({"name": "mug"}, "^name: got 'mug'"),
-        ({"folder": "nowhere/set"}, "^folder: .* cannot be made"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "message"), EXPECTED["bad_sets"])
 def test_a_bad_set_is_refused(tmp_path, arguments, message):
     wanted = {"folder": "set", "name": BLOCK, "distances_m": [0.3], "n": 2} | arguments
     wanted["folder"] = tmp_path / wanted["folder"]

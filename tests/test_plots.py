@@ -1,13 +1,12 @@
 """Figures by their data, labels and words, not by their pixels."""
 
-from __future__ import annotations
-
 import base64
 import html
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from common import by_opencv
 from matplotlib.colors import to_rgb
 from matplotlib.patches import Ellipse
 
@@ -18,13 +17,7 @@ from coursekit.hand_eye import error_study
 from coursekit.intrinsics import calibrate, compare, stored_power
 from coursekit.plots import depth_noise, error_budget, hand_eye, intrinsics, pinhole
 from coursekit.plots.style import label
-from coursekit.simulation import (
-    Effects,
-    corner_session,
-    default_setup,
-    tabletop,
-    unknown_sessions,
-)
+from coursekit.simulation import Effects, corner_session, default_setup, tabletop, unknown_sessions
 
 D435 = specifications.device("D435").unit
 LENSES = {n: specifications.lens(n).intrinsics for n in ("opencv_left", "d405_color")}
@@ -98,12 +91,10 @@ def test_similar_triangles_shows_f_x_over_z() -> None:
 
 
 def test_displacement_is_opencvs(figures) -> None:
-    import cv2
-
     lens = LENSES["opencv_left"]
     _, size = pinhole.displacement_px(lens)
     ray = np.linalg.solve(lens.K, [0, 0, 1])
-    bent = cv2.projectPoints(ray[None], np.zeros(3), np.zeros(3), lens.K, lens.dist)[0].ravel()
+    bent = by_opencv(ray[None], np.eye(4), lens).ravel()
     assert size[0, 0] == pytest.approx(np.hypot(*bent), abs=1e-9)
     edge, corner = pinhole.edge_and_corner(size)
     assert (round(edge, 1), round(corner, 1)) == (33.7, 51.6)
@@ -260,14 +251,12 @@ def intrinsics_figures() -> dict[str, plots.LessonFigure]:
 
 
 def test_outlines_are_opencvs() -> None:
-    import cv2
-
     found, _ = corner_session(BOARD, D435.color, seed=1, views=10)
     result = calibrate(found, BOARD)
     T, lens = result.T_camera_board[3], result.intrinsics
     rim = BOARD.points[[0, 7, 39, 32]]
-    seen = cv2.projectPoints(rim, cv2.Rodrigues(T[:3, :3])[0], T[:3, 3], lens.K, lens.dist)[0]
-    assert intrinsics.outlines(result)[3] == pytest.approx(seen[:, 0], abs=1e-6)
+    seen = by_opencv(rim, T, lens)
+    assert intrinsics.outlines(result)[3] == pytest.approx(seen, abs=1e-6)
 
 
 def test_maps_of_two_sessions_share_their_scale(figures) -> None:

@@ -3,8 +3,6 @@
 Also what a hub needs (`.binder`), because nothing here can build its image.
 """
 
-from __future__ import annotations
-
 import ast
 import json
 import os
@@ -180,22 +178,6 @@ def test_the_search_for_a_fault_finds_what_it_should(is_fault: Callable[[Any], b
             assert is_fault(ast.parse(code, mode="eval").body) is fault, code
 
 
-GUARDED = {
-    "coursekit/attribution/ledger.py": {"fcntl", "msvcrt"},
-    "coursekit/submission/batch.py": {
-        "fcntl",
-        "msvcrt",
-        "resource",
-        "os.sysconf",
-        "signal.pthread_sigmask",
-    },
-    "course.py": {"fcntl", "msvcrt", "os.geteuid"},
-    "tests/test_course.py": {"signal.SIGKILL"},
-    "tests/test_submission_batch.py": {"os.killpg"},
-    "tests/test_submission_hostile.py": {"os.mkfifo"},
-}
-
-
 def names_of_one_system(path: Path) -> set[str]:
     """The modules and functions in a file that not every system has."""
     names = set()
@@ -212,7 +194,7 @@ def names_of_one_system(path: Path) -> set[str]:
 def test_what_one_system_has_is_used_where_somebody_saw_to_the_others() -> None:
     """In these places a question about the system is asked before; a new one wants one, too."""
     used = {path.relative_to(ROOT).as_posix(): names_of_one_system(path) for path in sources(*ALL)}
-    assert {name: names for name, names in used.items() if names} == GUARDED
+    assert {name: sorted(names) for name, names in used.items() if names} == EXPECTED["guarded"]
 
 
 # --- the files of the repository ---

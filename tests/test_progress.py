@@ -1,7 +1,5 @@
 """`ck.progress()`: what was answered, what is kept, what to do next."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

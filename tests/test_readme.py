@@ -1,7 +1,5 @@
 """What the README says: its commands exist, its links lead somewhere, its numbers hold."""
 
-from __future__ import annotations
-
 import csv
 import importlib.util
 import re

@@ -3,8 +3,6 @@
 The map is the table in the docstring of `coursekit/__init__.py`; the README shows the same text.
 """
 
-from __future__ import annotations
-
 import ast
 import importlib
 import io

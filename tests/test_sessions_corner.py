@@ -2,30 +2,17 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
-from common import named, refusals
+from common import by_opencv, named, refusals
 from scipy.optimize import brentq
-from scipy.spatial.transform import Rotation
 from simulated_corners import CHARUCO, CHECKERBOARD, LENS
 
 from coursekit.boards import Board
 from coursekit.geometry import Intrinsics, project
-from coursekit.simulation.corner_sessions import (
-    Effects,
-    bowed,
-    corner_session,
-    rolling_shutter,
-)
+from coursekit.simulation.corner_sessions import Effects, bowed, corner_session, rolling_shutter
 
 BOWED, LARGER = bowed(CHECKERBOARD, 1e-3), 1.03 * CHECKERBOARD.points
-
-
-def opencv(points: np.ndarray, T: np.ndarray, lens: Intrinsics = LENS) -> np.ndarray:
-    rotation = Rotation.from_matrix(T[:3, :3]).as_rotvec()
-    pixels, _ = cv2.projectPoints(points, rotation, T[:3, 3], lens.K, np.array(lens.coeffs))
-    return pixels[:, 0]
 
 
 def tilts_deg(truth) -> np.ndarray:
@@ -44,11 +31,11 @@ def tilts_deg(truth) -> np.ndarray:
 )
 def test_a_session_is_opencvs_projection_of_its_points(board, effects, points) -> None:
     session, truth = corner_session(board, LENS, seed=6, noise_px=0.0, effects=effects)
-    drift, most = np.abs(truth.focal_scale - 1).max(), effects.focus_drift
+    drift, most = np.abs(truth.draw.focal_scale - 1).max(), effects.focus_drift
     assert 0.75 * most <= drift <= most
-    for view, T, scale in zip(session, truth.T_camera_board, truth.focal_scale, strict=True):
+    for view, T, scale in zip(session, truth.T_camera_board, truth.draw.focal_scale, strict=True):
         lens = replace(LENS, fx=LENS.fx * scale, fy=LENS.fy * scale)
-        assert np.abs(view.pixels - opencv(points[view.ids], T, lens)).max() < 1e-9
+        assert np.abs(view.pixels - by_opencv(points[view.ids], T, lens)).max() < 1e-9
 
 
 @pytest.mark.parametrize("board", [CHARUCO, CHECKERBOARD])
@@ -88,7 +75,7 @@ def test_the_noise_has_the_size_asked_for_and_the_same_seed_the_same_bytes() -> 
     assert not (first[0].pixels == other[0].pixels).any()
     # 3024 coordinates: the std is known to 1.3 %, four of those
     assert abs(noise.std() / 0.08 - 1) < 0.052
-    assert truth.effects == Effects()
+    assert truth.draw.effects == Effects()
 
 
 def test_an_effect_leaves_poses_and_noise_of_the_seed_as_they_are() -> None:
@@ -97,8 +84,8 @@ def test_an_effect_leaves_poses_and_noise_of_the_seed_as_they_are() -> None:
     assert (truth.T_camera_board == same.T_camera_board).all()
     pairs = zip(healthy, spoiled, strict=True)
     off = [np.linalg.norm(a.pixels - b.pixels, axis=1) for a, b in pairs]
-    assert same.spoiled_view is not None
-    assert np.allclose(off.pop(same.spoiled_view), 3.0)
+    assert same.draw.spoiled_view is not None
+    assert np.allclose(off.pop(same.draw.spoiled_view), 3.0)
     assert max(o.max() for o in off) == 0.0
 
 
@@ -116,17 +103,17 @@ def test_a_rolling_shutter_sees_each_corner_at_the_time_of_its_row() -> None:
     """Brute force: the root of v(t) = row(t), by bisection, with OpenCV's projection."""
     effects = Effects(readout_s=0.02, speed_m_s=0.1)
     session, truth = corner_session(CHECKERBOARD, LENS, seed=8, noise_px=0.0, effects=effects)
-    assert np.allclose(np.linalg.norm(truth.velocity_m_s, axis=1), 0.1)
+    assert np.allclose(np.linalg.norm(truth.draw.velocity_m_s, axis=1), 0.1)
     moved = 0.0
     for i in (0, 9, 21):
-        T, velocity = truth.T_camera_board[i], truth.velocity_m_s[i]
-        still = opencv(CHECKERBOARD.points, T)
+        T, velocity = truth.T_camera_board[i], truth.draw.velocity_m_s[i]
+        still = by_opencv(CHECKERBOARD.points, T, LENS)
         moved = max(moved, np.abs(session[i].pixels - still).max())
         for corner in (0, 13, 53):
             point = CHECKERBOARD.points[corner] @ T[:3, :3].T + T[:3, 3]
 
             def at(time: float, point: np.ndarray = point, v: np.ndarray = velocity) -> np.ndarray:
-                return opencv((point + time * v)[None], np.eye(4))[0]
+                return by_opencv((point + time * v)[None], np.eye(4), LENS)[0]
 
             def late(time: float, at=at) -> float:
                 return time - ((at(time)[1] + 0.5) / 480 - 0.5) * 0.02

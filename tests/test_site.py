@@ -286,17 +286,7 @@ def test_every_checkpoint_keeps_its_explanation_closed(pages):
     assert not any(details.has_attr("open") for details in closed)
 
 
-@pytest.mark.parametrize(
-    ("output", "html"),
-    [
-        ({"data": {"text/plain": ""}}, ""),
-        ({"data": {"text/html": ""}}, ""),
-        ({"data": {"text/html": '<details class="alt"><summary>The figure in words'}}, ""),
-        ({"data": {"text/plain": "a < b"}}, '<pre class="output" tabindex="0">a &lt; b</pre>\n'),
-        ({"text": ["a", " & b\n"]}, '<pre class="output" tabindex="0">a &amp; b</pre>\n'),
-        ({"data": {"text/html": "<b>x</b>", "text/plain": "x"}}, "<b>x</b>"),
-    ],
-)
+@pytest.mark.parametrize(("output", "html"), EXPECTED["stored_outputs"])
 def test_what_is_empty_is_left_out_and_text_is_escaped(output, html):
     said = build_site.output_html(a_page(), {}, {"output_type": "display_data", **output})
     assert html in said

@@ -1,10 +1,8 @@
 """The tables of cameras and lenses: every figure that ships, and what a wrong name says."""
 
-import os
 import re
 import tomllib
 from dataclasses import fields
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,8 +15,6 @@ from coursekit.stereo import depth_noise
 
 TABLES = [DATA / "devices.toml", DATA / "lenses.toml"]
 DEVICES, LENSES = (tomllib.loads(path.read_text("utf-8")) for path in TABLES)
-REAL = os.environ.get("COURSEKIT_REAL_DATA")
-needs_real = pytest.mark.skipif(not REAL, reason="COURSEKIT_REAL_DATA is not set")
 
 
 @pytest.mark.parametrize(
@@ -68,9 +64,8 @@ def test_the_d405_sees_colour_with_its_left_imager():
 
 
 @pytest.mark.real
-@needs_real
-def test_d435_unit_is_the_recorded_one():
-    recorded = read_json(Path(REAL) / "realsense_d435/intrinsics.json")
+def test_d435_unit_is_the_recorded_one(real_data):
+    recorded = read_json(real_data / "realsense_d435/intrinsics.json")
     unit = device("D435").unit
     for mine, theirs in (("fx", "fx"), ("fy", "fy"), ("cx", "ppx"), ("cy", "ppy")):
         assert getattr(unit.color, mine) == recorded["color"][theirs]
@@ -81,9 +76,8 @@ def test_d435_unit_is_the_recorded_one():
 
 
 @pytest.mark.real
-@needs_real
-def test_opencv_left_is_the_published_calibration():
-    path = Path(REAL) / "opencv_chessboard/left_intrinsics_published.txt"
+def test_opencv_left_is_the_published_calibration(real_data):
+    path = real_data / "opencv_chessboard/left_intrinsics_published.txt"
     numbers = [float(n) for n in re.findall(r"-?\d+\.\d+", path.read_text(encoding="utf-8"))][:8]
     left = lens("opencv_left").intrinsics
     assert numbers == [left.fx, left.cx, left.cy, *left.coeffs]

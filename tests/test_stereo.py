@@ -1,7 +1,7 @@
 """Stereo statistics against Monte Carlo, closed forms, SciPy and rendered scenes.
 
 The coverage of every 95 % interval is counted over many simulated sessions: with
-COURSEKIT_NIGHTLY=1 over 1,000, otherwise over 80. One sigma of such a count is 0.7 % (2.4 %), and
+COURSEKIT_NIGHTLY=1 over 1,000, otherwise over 50. One sigma of such a count is 0.7 % (3.1 %), and
 three of those to either side are allowed (`about_95_percent`).
 """
 
@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from common import NIGHTLY, each, named, refusals
 from scipy.ndimage import gaussian_filter
-from scipy.optimize import curve_fit
 from scipy.spatial.transform import Rotation
 
 from coursekit import stereo
@@ -28,9 +27,9 @@ FX, BASELINE = UNIT.depth.fx, UNIT.baseline_m
 FB = FX * BASELINE
 NEAR = np.array([0.30, 0.45, 0.60])
 FAR = np.array([0.30, 0.45, 0.60, 1.0, 1.5, 2.0])
-SESSIONS = 1000 if NIGHTLY else 80
+SESSIONS = 1000 if NIGHTLY else 50
 WINDOWS = 200 if NIGHTLY else 20
-SERIES = 300 if NIGHTLY else 60
+SERIES = 300 if NIGHTLY else 40
 
 
 def covers(interval: tuple[float, float], truth: float) -> bool:
@@ -45,12 +44,10 @@ def about_95_percent(hits, of: int) -> bool:
 # --- the law ---
 
 
-def test_depth_from_disparity_and_its_slope_by_numerical_derivative():
-    z, step = np.array([0.3, 0.6, 2.0]), 1e-4
+def test_depth_from_disparity():
+    """Its slope: claim D5."""
+    z = np.array([0.3, 0.6, 2.0])
     np.testing.assert_allclose(stereo.depth_from_disparity(FB / z, FX, BASELINE), z)
-    up, down = (stereo.depth_from_disparity(FB / z + s, FX, BASELINE) for s in (step, -step))
-    slope = stereo.depth_slope(z, FX, BASELINE)
-    np.testing.assert_allclose(slope, (up - down) / (2 * step), rtol=1e-8)
     assert np.isnan(stereo.depth_from_disparity([0.0, -1.0, np.nan, np.inf], FX, BASELINE)).all()
 
 
@@ -773,22 +770,3 @@ test_what_cannot_be_is_refused = refusals(
     *each("^depth: got", face, "depth", np.zeros((3, 48, 84), np.uint16)),
     *named(face, depth_scale_m=[None], intrinsics=[None], width_m=[-1.0], near=[(5000, 5000)]),
 )
-
-
-def test_noise_fit_agrees_with_scipy_s_curve_fit():
-    rng = np.random.default_rng(21)
-    dof = 4000
-    stds = stds_of(rng, FAR, dof)
-    fit = stereo.fit_noise(FAR, stds, dof, FX, BASELINE)
-
-    def law(z, sigma_d, power):
-        return fit.reference_m**2 * sigma_d / FB * (z / fit.reference_m) ** power
-
-    how = {"sigma": stds / math.sqrt(2 * dof), "absolute_sigma": True}
-    (sigma_d, power), covariance = curve_fit(law, FAR, stds, (0.1, 1.5), **how)
-    error = np.sqrt(np.diag(covariance))
-    assert fit.sigma_d_px == pytest.approx(sigma_d, abs=0.1 * error[0])
-    assert fit.exponent == pytest.approx(power, abs=0.1 * error[1])
-    width = fit.exponent_interval[1] - fit.exponent_interval[0]
-    assert width == pytest.approx(2 * 1.96 * error[1], rel=0.02)
-    assert fit.reference_m == pytest.approx(np.exp(np.log(FAR).mean()))

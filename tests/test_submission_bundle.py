@@ -1,7 +1,5 @@
 """Bundles: what goes in comes out, the same bytes every time, whatever version wrote the arrays."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

@@ -1,7 +1,5 @@
 """The pages and the table: complete, escaped, and readable without the figures."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

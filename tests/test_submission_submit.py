@@ -1,7 +1,5 @@
 """Handing in: what is kept, what is said before packing, what is written and what never is."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, replace
 from pathlib import Path
 

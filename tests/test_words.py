@@ -1,7 +1,5 @@
 """What a reader of findings sees."""
 
-from __future__ import annotations
-
 import ast
 import string
 from pathlib import Path

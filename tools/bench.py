@@ -198,7 +198,7 @@ def bench_intrinsics() -> list[Row]:
 
     def with_uncertainty() -> object:
         result = ours()
-        return result.joint_covariance, result.uncertainty_map(0.45, (30, 40))
+        return result.covariance, result.uncertainty_map(0.45, (30, 40))
 
     whole = in_turn(30, with_uncertainty, ours)
     seconds = np.median(whole[0]) - np.median(whole[1])

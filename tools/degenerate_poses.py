@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from coursekit.arrays import ArrayLike, Bools, Floats
 from coursekit.geometry import deproject, project
-from coursekit.hand_eye.poses import MOUNTS
+from coursekit.hand_eye.poses import MOUNTS, base_gripper
 from coursekit.simulation.arm_poses import DEGENERATE, Setup, random_poses
 from coursekit.simulation.arm_sessions import default_setup
 
@@ -141,7 +141,7 @@ def _aimed(
     pixels = around + np.asarray(aside) * lens.size
     wanted = deproject(pixels, first[2] * np.asarray(nearness), lens.K, lens.dist)
     T[:, :3, 3] = wanted - T[:, :3, :3] @ setup.board.middle
-    return setup.T_base_gripper(T)
+    return base_gripper(T, setup.X, setup.Y, setup.mount)
 
 
 def _starts(setup: Setup, rng: np.random.Generator) -> Floats:

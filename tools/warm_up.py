@@ -33,7 +33,6 @@ def compile_all() -> None:
     eye = Intrinsics(64, 48, 40.0, 40.0, 31.5, 23.5)
     view = simulation.Rig(eye, 0.05).look_at(simulation.tabletop())
     view.depth(view.frame(np.random.default_rng(0)))
-    view.truth_m  # noqa: B018 - a property that renders
     pose = make_transform(np.eye(3), (-0.05, -0.05, 0.4))
     render_board(Board("checkerboard", (5, 4), 0.025), pose, eye, np.random.default_rng(0))
 

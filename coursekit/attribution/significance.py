@@ -219,28 +219,21 @@ class PlaceTest:
     """p_value: of "the place does not matter". places, trials: that were repeated, and in them.
 
     means_m (places, 3): the mean miss of each. part_m: rms length of what differs between places,
-    less what chance would give, m. S (3, 3): the covariance within places, m^2, and axes: how many
-    it really fills, 1 to 3. p_follows: of "the means of the places do not follow the pose", by the
-    regression on them alone; None where p_value is not below the level, or the places too few.
+    less what chance would give, m; scatter_m: that of repeats in one place. S (3, 3): the
+    covariance within places, m^2, and axes: how many it really fills, 1 to 3. p_follows: of "the
+    means of the places do not follow the pose", by the regression on them alone; None where p_value
+    is not below the level, or the places too few.
     """
 
     p_value: float
+    places: int
     trials: int
     means_m: Floats
     part_m: float
+    scatter_m: float
     S: Floats
     axes: float
     p_follows: float | None
-
-    @property
-    def places(self) -> int:
-        """That were repeated."""
-        return len(self.means_m)
-
-    @property
-    def scatter_m(self) -> float:
-        """Of repeats in one place, rms length, m."""
-        return float(np.sqrt(np.trace(self.S)))
 
 
 def place_test(misses: Floats, T_base_gripper: Floats, level: float) -> PlaceTest | None:
@@ -269,10 +262,10 @@ def place_test(misses: Floats, T_base_gripper: Floats, level: float) -> PlaceTes
         p_value = float(f.sf(between / (places - 1) / total, above, below))
     else:
         p_value = 0.0 if between > n * ROUNDING_M**2 else 1.0
-    part = max(between - (places - 1) * total, 0.0) / n
+    part, scatter = np.sqrt([max(between - (places - 1) * total, 0.0) / n, total]).tolist()
     regression = pose_test(means, columns) if p_value < level else None
     follows = None if regression is None else regression.p_value
-    return PlaceTest(p_value, n, means, float(np.sqrt(part)), S, axes, follows)
+    return PlaceTest(p_value, places, n, means, part, scatter, S, axes, follows)
 
 
 def find_places(T_base_gripper: Floats) -> Integers:

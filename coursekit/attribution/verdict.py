@@ -309,19 +309,14 @@ class Attribution:
         if pose is not None:
             shares = [f"{name} {share:.0%}" for name, share in pose.shares.items()]
             alone = f"; of the scatter, alone: {', '.join(shares)}" if shares else ""
-            lines.append(
-                f"pose does not matter: {_p(pose.p_value)}; the part that follows it "
-                f"{1e3 * pose.part_m:.1f} mm rms{alone}"
-            )
+            facts = {"p": _p(pose.p_value), "part": 1e3 * pose.part_m, "alone": alone}
+            lines.append(say("attribution.pose", **facts))
         else:
             lines.append(say("attribution.no_poses"))
         if place is not None:
             both = f"; with the line above {_p(seen.p_pose)}" if pose is not None else ""
-            lines.append(
-                f"{place.places} places repeated, {place.trials} trials: place does not matter: "
-                f"{_p(place.p_value)}{both}; places differ by {1e3 * place.part_m:.1f} mm rms, "
-                f"repeats in one by {1e3 * place.scatter_m:.1f} mm"
-            )
+            facts = {"part": 1e3 * place.part_m, "scatter": 1e3 * place.scatter_m, "both": both}
+            lines.append(say("attribution.place", place=place, p=_p(place.p_value), **facts))
         if seen.p_pose is not None:
             lines[-1] += f"{find}{seen.pose_cause.power(self.matters_m, seen.n):.0%}"
         return lines

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from coursekit.boards.board import (
-    DICTIONARIES,
     Board,
     BoardNotFound,
     Detection,

@@ -23,7 +23,7 @@ from coursekit import geometry
 from coursekit.arrays import Bools, Floats, Grey, NDArray, frozen
 from coursekit.checks import array, choice, instance, number, settle, want, whole
 from coursekit.geometry import Intrinsics
-from coursekit.words import Listed, counted, say
+from coursekit.words import ROOM_TEXTS, Listed, counted, say
 
 BoardKind = Literal["checkerboard", "charuco"]
 FEWEST_SQUARES = {"checkerboard": 4, "charuco": 3}  # OpenCV finds none with fewer corners than 3x3
@@ -304,7 +304,8 @@ class Detection:
         return None if self.blur is None else float(np.sqrt(np.linalg.eigvalsh(self.blur)[-1]))
 
     def __repr__(self) -> str:
-        text = f"{self.name or 'detection'}: {len(self)} corners in {_times(self.size)}"
+        size = "{}x{}".format(*self.size)
+        text = f"{self.name or 'detection'}: {len(self)} corners in {size}"
         if self.noise_px is not None:
             text += f", noise {self.noise_px:.3f} px"
         if self.blur_px is not None:
@@ -356,14 +357,11 @@ class Detections(Listed[Detection]):
         """(width, height) of all images, px; ValueError when there is none or they differ."""
         if not self:
             raise ValueError("detections: there are none, so there is no image size")
-        first = self[0]
+        first = self[0].size
         for index, view in enumerate(self):
-            if view.size != first.size:
-                raise ValueError(
-                    f"detections: view {index} ({view.name}) is {_times(view.size)} px, the first "
-                    f"{_times(first.size)}: one calibration is for one size"
-                )
-        return first.size
+            if view.size != first:
+                raise ValueError(say("boards.sizes_differ", index=index, view=view, first=first))
+        return first
 
     def pick(self, which: Iterable[int]) -> Detections:
         """The views with these numbers, in this order."""
@@ -453,10 +451,6 @@ def _faults(
         yield "has all its corners on one line, which fixes no pose"
 
 
-def _times(size: tuple[int, int]) -> str:
-    return f"{size[0]}x{size[1]}"
-
-
 # --- what a camera sees of a board ---
 
 BORDER_PX = 6.0  # a corner nearer to the image's border has no room for its refinement window
@@ -525,16 +519,7 @@ def slide_into_view(
 
 # --- a board on paper, to true scale, with a bar to check the print by ---
 
-PAPERS_MM = {  # short and long side
-    "A4": (210.0, 297.0),
-    "A3": (297.0, 420.0),
-    "A2": (420.0, 594.0),
-    "A1": (594.0, 841.0),
-    "A0": (841.0, 1189.0),
-    "Letter": (215.9, 279.4),
-    "Legal": (215.9, 355.6),
-    "Tabloid": (279.4, 431.8),
-}
+PAPERS_MM: dict[str, list[float]] = ROOM_TEXTS["boards"]["papers_mm"]  # short and long side
 MARGIN_MM = 6.0  # printers leave about 5 mm blank
 FOOT_MM = 18.0  # bar and text below the board
 BAR_MM = 100.0
@@ -592,7 +577,7 @@ def caption(board: Board) -> str:
     return text
 
 
-def _page(board: Board, paper: str) -> tuple[float, float]:
+def _page(board: Board, paper: str) -> list[float]:
     """(width, height) of the sheet in mm, upright or lying; ValueError for too big a board."""
     names = {name.lower(): name for name in PAPERS_MM}
     want(str(paper).lower() in names, "paper", paper, f"one of {', '.join(PAPERS_MM)}")
@@ -607,14 +592,14 @@ def _page(board: Board, paper: str) -> tuple[float, float]:
     raise ValueError(say("boards.too_big", width=width, height=height, **instead))
 
 
-def _fitting(board: Board, paper: str) -> list[tuple[float, float]]:
+def _fitting(board: Board, paper: str) -> list[list[float]]:
     """The ways to turn a paper, (width, height) in mm, upright first, that hold the board."""
     sides = PAPERS_MM[paper]
     least = 1000 * board.square_m * (1 - 1e-9)
     return [page for page in (sides, sides[::-1]) if _largest_square_mm(board, page) >= least]
 
 
-def _largest_square_mm(board: Board, page: tuple[float, float]) -> float:
+def _largest_square_mm(board: Board, page: list[float]) -> float:
     """The largest square for this many of them on a page, mm; 0 where the bar has no room."""
     if page[0] < BAR_MM + 2 * MARGIN_MM:
         return 0.0
@@ -622,7 +607,7 @@ def _largest_square_mm(board: Board, page: tuple[float, float]) -> float:
     return min((page[0] - 2 * MARGIN_MM) / columns, (page[1] - 2 * MARGIN_MM - FOOT_MM) / rows)
 
 
-def _draw(board: Board, page_mm: tuple[float, float]) -> Any:
+def _draw(board: Board, page_mm: list[float]) -> Any:
     """The sheet as a Matplotlib figure whose axes are millimetres, y down from the top."""
     from matplotlib.figure import Figure
     from matplotlib.patches import PathPatch

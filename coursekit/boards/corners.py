@@ -145,10 +145,8 @@ def noise_levels(grey: Grey) -> tuple[Floats, Floats]:
     bins = np.digitize(level, edges)
     groups = [bins == k for k in range(1, BINS + 1) if (bins == k).sum() >= FEWEST_BLOCKS]
     groups = groups or [np.ones(len(level), bool)]
-    return (
-        np.array([level[group].mean() for group in groups], np.float64),
-        np.array([_noise_variance(variance[group]) for group in groups]),
-    )
+    levels = np.array([level[group].mean() for group in groups], np.float64)
+    return levels, np.array([_noise_variance(variance[group]) for group in groups])
 
 
 def _is_flat(level: Patch, most: float) -> Bools:

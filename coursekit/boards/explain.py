@@ -28,7 +28,6 @@ BLURRED_PX = 5.0  # the sharpest edges of a picture that shows a board are steep
 FAMILIES = tuple(  # the largest dictionary of each; the smaller ones are their beginnings
     name for name in DICTIONARIES if not name.endswith(("_50", "_100", "_250"))
 )
-FAMILY_LENGTHS = (50, 100, 250, 1000)
 WAYS: dict[str, Callable[[Grey], Grey]] = {  # to look for markers, and what they then are
     "": lambda grey: grey,
     "mirrored": lambda grey: np.ascontiguousarray(grey[:, ::-1]),
@@ -75,7 +74,9 @@ def explain(grey: Grey, board: Board, corners: int) -> str:
         raise OtherBoard(say("boards.not_asked_for", asked=asked, reason=reason))
     if corners:
         return say("boards.few_corners", corners=corners, asked=asked)
-    return _nothing(small, board)
+    if (width_px := _edges_px(small)) > BLURRED_PX:
+        return say("boards.blurred", width_px=width_px)
+    return say(f"boards.no_{board.kind}", board=board)
 
 
 def _what_else(grey: Grey, board: Board) -> str:
@@ -94,14 +95,6 @@ def _edges_px(grey: Grey) -> float:
     smooth = cv2.GaussianBlur(grey.astype(np.float32), (5, 5), 1.0)
     steepest = np.quantile(np.hypot(*np.gradient(smooth)), 0.999)
     return float(np.subtract(*np.quantile(smooth, [0.99, 0.01])) / max(steepest, 1e-3))
-
-
-def _nothing(grey: Grey, board: Board) -> str:
-    """No board of any kind: the advice that fits the picture."""
-    width_px = _edges_px(grey)
-    if width_px > BLURRED_PX:
-        return say("boards.blurred", width_px=width_px)
-    return say(f"boards.no_{board.kind}", board=board)
 
 
 # --- checkerboards of another size, circles ---
@@ -235,15 +228,14 @@ def _is_grid(markers: _Markers) -> bool:
 
 
 def _short_name(markers: _Markers, board: Board) -> str:
-    """The board's dictionary if it holds the markers, else the shortest of their family."""
+    """The board's dictionary if it holds the markers, else one of their family: _250 or _1000."""
     family, _, length = markers.dictionary.rpartition("_")
     if markers.dictionary == board.dictionary or length != "1000":
         return markers.dictionary
     own_family, _, own_length = board.dictionary.rpartition("_")
     if own_family == family and int(own_length) > markers.ids.max():
         return board.dictionary
-    shortest = min(n for n in FAMILY_LENGTHS if n > markers.ids.max())
-    return f"{family}_{max(shortest, 250)}"
+    return f"{family}_{250 if markers.ids.max() < 250 else 1000}"
 
 
 def _plans(board: Board, dictionary: str, ids: NDArray[np.intp]) -> Iterator[Board]:

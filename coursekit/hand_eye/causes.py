@@ -25,10 +25,10 @@ from itertools import product
 import numpy as np
 from scipy.linalg import block_diag
 
-from coursekit.arm import Arm, ArmErrors, fk_covariance, pose_difference
+from coursekit.arm import Arm, fk_covariance
 from coursekit.arrays import Floats, NDArray
-from coursekit.causes import CauseSearch, Hypothesis, Tested, likelihood_ratios, search
-from coursekit.geometry import make_transform, turned
+from coursekit.causes import Hypothesis, Tested, likelihood_ratios
+from coursekit.geometry import make_transform, pose_difference, turned
 from coursekit.hand_eye import poses
 from coursekit.hand_eye.closed_form import motions, rotation_by_axes, translation_half
 from coursekit.hand_eye.session import HandEyeSession
@@ -45,7 +45,7 @@ SLIP, OUTLIER, STEADY = "slipping_board", "outlier_pose", "slow_drift"
 SMOOTH = (SCALE, LATE, ARM_ERROR)  # one number that acts on all pairs
 # At most 2 % of healthy sessions may get a finding, and five kinds of test at this level make
 # 0.05 %; the rest is for arms whose errors are not quite normal.
-_CHANCE_LEVEL = 1e-4
+PAIRS_LEVEL = 1e-4
 # What careful people have, and no finding: squares measured with a ruler, a driver's own delay, a
 # board that settles, a pose in which the arm still swings, a zero that a jig sets.
 NORMAL_SIZE = {
@@ -132,13 +132,11 @@ class PosePairs:
             self, T_base_gripper=self.T_camera_board, T_camera_board=M, mount="eye_to_hand"
         )
 
-    def shifted(self, by: int) -> PosePairs:
-        """Each image with the arm pose `by` places further on; the ends fall off."""
-        n = len(self)
-        images = np.arange(max(0, -by), min(n, n - by))
-        moved = self.keep(np.isin(np.arange(n), images))
-        rows = images + by
-        return replace(moved, T_base_gripper=self.T_base_gripper[rows], row=self.row[rows])
+    def paired(self, rows: NDArray[np.intp]) -> PosePairs:
+        """Each image with the arm pose rows (n,), without those whose row does not exist."""
+        there = (rows >= 0) & (rows < len(self))
+        T, row = self.T_base_gripper[rows[there]], self.row[rows[there]]
+        return replace(self.keep(there), T_base_gripper=T, row=row)
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,29 +234,19 @@ def _closed_form(pairs: PosePairs) -> tuple[Floats, Floats]:
 
 
 @dataclass(frozen=True, eq=False)
-class Arms:
-    """What is known of the arm besides its poses: for all pairs of the session.
-
-    arm: whose joint angles they are; errors: what is normal for it, `ArmErrors` unless given.
-    q (n, 6): joint angles, rad, None where unknown. velocity (n, 6): the gripper's twist rate when
-    the image was taken, rad/s and m/s, None where unknown.
-    """
-
-    arm: Arm
-    errors: ArmErrors | None = None
-    q: Floats | None = None
-    velocity: Floats | None = None
-
-
-@dataclass(frozen=True, eq=False)
 class MendedPairs:
     """Pairs with the causes found so far put right, and their fit.
 
-    scale: of the board; delay_s: of the arm poses; offsets (6,): of the joints, rad. smooth: cause
-    and place of those that are fitted along from now on. odd: how many pairs were left out.
+    arm: whose joint angles they are; `ArmErrors` is normal for it. Of all pairs of the session,
+    None where unknown: q (n, 6), the joint angles, rad, and velocity (n, 6), the gripper's twist
+    rate when the image was taken, rad/s and m/s. scale: of the board; delay_s: of the arm poses;
+    offsets (6,): of the joints, rad. smooth: cause and place of those that are fitted along from
+    now on. odd: how many pairs were left out.
     """
 
-    arms: Arms
+    arm: Arm
+    q: Floats | None
+    velocity: Floats | None
     fit: Fit
     scale: float = 1.0
     delay_s: float = 0.0
@@ -287,21 +275,21 @@ class MendedPairs:
         """Whether the effect is larger than what careful people have."""
         normal, n = NORMAL_SIZE[test.cause], len(self.fit.pairs)
         if test.cause in SMOOTH:
-            if test.cause == SCALE and self.arms.q is None:
+            if test.cause == SCALE and self.q is None:
                 normal = SCALE_WITHOUT_JOINTS
             return bool(abs(test.coefficients[0]) > normal)
         if test.cause == OUTLIER and self.odd >= (n + self.odd) // MOST_OUTLIERS:
             return False
-        rough = 1.0 if self.fit.pairs.image.any() and self.arms.q is not None else ROUGH_DATA
-        usual = OVER_USUAL[test.cause] if self.arms.q is None else 0.0
+        rough = 1.0 if self.fit.pairs.image.any() and self.q is not None else ROUGH_DATA
+        usual = OVER_USUAL[test.cause] if self.q is None else 0.0
         least_turn = max(rough * NORMAL_TURN_RAD[test.cause], usual * self.fit.turn_rad)
         least_shift = max(rough * normal, usual * self.fit.shift_m)
-        turn, shift = self.over_session(test) if test.cause == STEADY else turn_and_shift(test)
+        turn, shift = turn_and_shift(test)
         return shift > least_shift or turn > least_turn
 
     def accept(self, test: Tested) -> MendedPairs | None:
         """The data put right for a cause and fitted again; None where that does not fit better."""
-        pairs, arms, at, size = self.fit.pairs, self.arms, test.at, float(test.coefficients[0])
+        pairs, at, size = self.fit.pairs, test.at, float(test.coefficients[0])
         if test.cause == OUTLIER:
             left = pairs.keep(np.arange(len(pairs)) != at)
             return replace(self, fit=left.fit, odd=self.odd + 1)
@@ -319,8 +307,8 @@ class MendedPairs:
             pairs = pairs.scaled(1.0 + size)
             after = replace(after, scale=self.scale * (1.0 + size))
         elif test.cause == LATE:
-            assert arms.velocity is not None
-            pairs = _moved(pairs, -size * arms.velocity[pairs.row])
+            assert self.velocity is not None
+            pairs = _moved(pairs, -size * self.velocity[pairs.row])
             after = replace(after, delay_s=self.delay_s + size)
         else:
             change = size * np.eye(6)[at]
@@ -336,10 +324,10 @@ class MendedPairs:
         scale = np.zeros((n, 6))
         scale[:, 3:] = -pairs.T_camera_board[:, :3, 3]
         found = [Hypothesis(SCALE, scale.reshape(-1, 1))]
-        if self.arms.velocity is not None:
-            moved = np.einsum("nij,nj->ni", self._by_arm, self.arms.velocity[pairs.row])
+        if self.velocity is not None:
+            moved = np.einsum("nij,nj->ni", self._by_arm, self.velocity[pairs.row])
             found.append(Hypothesis(LATE, -moved.reshape(-1, 1)))
-        if self.arms.q is not None:
+        if self.q is not None:
             turned_joint = (self._by_arm @ self._jacobian()).reshape(6 * n, 6)
             # The first joint turns the base and the last the gripper: so do X and Y.
             for joint in range(1, 5):
@@ -363,12 +351,6 @@ class MendedPairs:
             found.append(Hypothesis(SLIP, columns, at, rows[after].ravel(), tried=len(later)))
         return found
 
-    def over_session(self, test: Tested) -> tuple[float, float]:
-        """How far a drift turns, rad, and moves, m, the board as the camera sees it."""
-        effect = (test.hypothesis.columns @ test.coefficients).reshape(-1, 2, 3)
-        turn, shift = np.sqrt(12.0 * (effect**2).sum(axis=2).mean(axis=0))
-        return float(turn), float(shift)
-
     def covariances(self) -> Iterator[Floats]:
         """Of all residuals, (6 n, 6 n): for each factor of the arm's errors, and of each pose's."""
         pairs, n = self.fit.pairs, len(self.fit.pairs)
@@ -376,8 +358,8 @@ class MendedPairs:
         size, same_axis = self._usual.ravel(), np.eye(6)
         owns = [np.outer(size, size) * np.kron(alike, same_axis) for alike in self._alike()]
         arms = [np.zeros((6 * n, 6 * n))]
-        if self.arms.q is not None:
-            errors = fk_covariance(self._joints(), self.arms.errors, self.arms.arm)
+        if self.q is not None:
+            errors = fk_covariance(self._joints(), arm=self.arm)
             shared = (self._by_arm @ errors.shared * errors.sigma).reshape(6 * n, -1)
             each = self._by_arm @ errors.each @ np.swapaxes(self._by_arm, 1, 2)
             arm = shared @ shared.T + block_diag(*each)
@@ -421,21 +403,20 @@ class MendedPairs:
 
     def _joints(self) -> Floats:
         """The joint angles (n, 6) with their zeros put right, rad."""
-        assert self.arms.q is not None
-        return self.arms.q[self.fit.pairs.row] + self.offsets
+        assert self.q is not None
+        return self.q[self.fit.pairs.row] + self.offsets
 
     def _jacobian(self) -> Floats:
-        return self.arms.arm.jacobian(self._joints())
-
-
-def search_pairs(pairs: PosePairs, arms: Arms) -> CauseSearch[MendedPairs]:
-    """The causes that the residuals of pairs speak for, the strongest first."""
-    return search(MendedPairs(arms, pairs.fit), _CHANCE_LEVEL)
+        return self.arm.jacobian(self._joints())
 
 
 def turn_and_shift(test: Tested) -> tuple[float, float]:
-    """How far a slip or an odd pose turns, rad, and moves, m."""
-    turn, shift = np.linalg.norm(test.coefficients.reshape(2, 3), axis=1)
+    """How far a slip or an odd pose turns, rad, and moves, m; or a drift from first to last."""
+    if test.cause == STEADY:
+        effect = (test.hypothesis.columns @ test.coefficients).reshape(-1, 2, 3)
+        turn, shift = np.sqrt(12.0 * (effect**2).sum(axis=2).mean(axis=0))
+    else:
+        turn, shift = np.linalg.norm(test.coefficients.reshape(2, 3), axis=1)
     return float(turn), float(shift)
 
 

@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from coursekit.arm import Arm, ArmErrors, pose_difference
 from coursekit.arrays import Floats
-from coursekit.causes import Accepted, CauseSearch
+from coursekit.causes import Accepted, CauseSearch, search
 from coursekit.checks import want
+from coursekit.geometry import invert_transform, pose_difference
 from coursekit.hand_eye import causes, misread
-from coursekit.hand_eye.causes import Arms, Fit, MendedPairs, PosePairs
+from coursekit.hand_eye.causes import Fit, MendedPairs, PosePairs
 from coursekit.hand_eye.closed_form import FEWEST_POSES
 from coursekit.hand_eye.poses import camera_board, observability
 from coursekit.hand_eye.session import SENTENCES, HandEyeSession
@@ -41,13 +41,9 @@ FOCAL_SPREAD, FOREIGN_SIGMAS = 0.02, 3.0
 FAR_FROM_MIDDLE = 0.12  # of the image: no camera's principal point is so far off
 
 
-def diagnose(
-    session: HandEyeSession, arm: Arm | None = None, errors: ArmErrors | None = None
-) -> Findings:
+def diagnose(session: HandEyeSession) -> Findings:
     """What is wrong with a session, the gravest first; empty when nothing is.
 
-    arm: whose joint angles the session has, `session.arm` unless given. errors: what is normal
-    for it, the sizes of `ArmErrors` unless given.
     A healthy session gets a wrong cause in at most 2 of 100 cases; equal pairs count once. Where no
     cause explains what `HandEyeResult.judgement` calls large, the finding is that. Raises
     ValueError for fewer pairs than any solver takes.
@@ -58,20 +54,15 @@ def diagnose(
     """
     want(len(session) >= FEWEST_POSES, "session", len(session), f"at least {FEWEST_POSES} pairs")
     given, session = session, session.once if len(session.once) >= FEWEST_POSES else session
-    case = _Case(session, arm or session.arm, errors, PosePairs.of(session), session.q)
+    case = _Case(session, PosePairs.of(session), session.q)
     case.lens()
     case.units()
     case.joints_in_degrees()
     if case.design():
         return case.findings("design")
-    untested = case.focal_length()
+    untested = case.focal_length() + ["repeats"] * (session is not given)
     case.readings()
     case.ambiguous_boards()
-    untested += ["repeats"] * (session is not given)
-    if len(case.pairs) < causes.FEWEST_PAIRS:
-        return case.findings("few", *untested)
-    if case.hopeless:
-        return case.findings("residuals", *untested)
     return case.findings(*case.residuals(), *untested)
 
 
@@ -80,8 +71,6 @@ class _Case:
     """A session under examination: its pairs with the mistakes found so far put right."""
 
     session: HandEyeSession
-    arm: Arm
-    errors: ArmErrors | None
     pairs: PosePairs
     q: Floats | None
     found: list[Finding] = field(default_factory=list)
@@ -113,9 +102,8 @@ class _Case:
         mended = PosePairs.of(replace(self.session, intrinsics=scaled))
         if mended.fit.better_than(given) > 1.0:
             self.pairs = mended
-        figures = {"cx": lens.cx, "cy": lens.cy, "factor": factor}
-        size = {"width": lens.width, "height": lens.height}
-        self.add("lens_of_another_size", **figures, **size, **_change(given, mended.fit))
+        change = _change(given, mended.fit)
+        self.add("lens_of_another_size", lens=lens, factor=factor, **change)
 
     def focal_length(self) -> list[str]:
         """Intrinsics of another camera: the images' own focal length tells; what is untested."""
@@ -159,11 +147,11 @@ class _Case:
         if self.q is None or np.abs(self.q).max() <= 2 * np.pi:
             return
         given = self.pairs.fit
-        largest, computed = float(np.abs(self.q).max()), self.arm.forward(self.q)
+        largest, computed = float(np.abs(self.q).max()), self.session.arm.forward(self.q)
         self.q = np.radians(self.q)
         mended = given
         if np.abs(computed - self.pairs.T_base_gripper).max() < AS_COMPUTED_M:
-            self.pairs = replace(self.pairs, T_base_gripper=self.arm.forward(self.q))
+            self.pairs = replace(self.pairs, T_base_gripper=self.session.arm.forward(self.q))
             mended = self.pairs.fit
         most = f"no joint turns by more than {2 * np.pi:.1f}"
         evidence = f"joint angles up to {largest:.0f}, where {most}"
@@ -175,21 +163,16 @@ class _Case:
         """Whether the poses leave X free, which is then a finding."""
         known = observability(self.pairs.T_base_gripper, "eye_to_hand")
         seen = observability(self.pairs.T_camera_board, "eye_to_hand").turns_deg[0]
-        first, second, third = known.turns_deg
+        first, second, _ = known.turns_deg
         if seen > SMALL_DEG and seen > 5 * first:
             return False  # the camera saw larger turns than the arm tells of: a matter of units
-        largest = known.largest_turn_deg
-        turns = {"first": first, "second": second, "third": third, "largest": largest}
-        if first < STILL_DEG:
-            self.add("pure_translation", **turns)
-        elif first < SMALL_DEG:
-            self.add("small_rotations", **turns)
-        elif second < SINGLE_DEG:
-            x, y, z = known.axis * np.sign(known.axis[np.argmax(np.abs(known.axis))]) + 0.0
-            self.add("single_axis", x=x, y=y, z=z, **turns)
-        else:
-            return False
-        return True
+        axis = known.axis * np.sign(known.axis[np.argmax(np.abs(known.axis))]) + 0.0
+        few = {"pure_translation": first < STILL_DEG, "small_rotations": first < SMALL_DEG}
+        for key, too_few in (few | {"single_axis": second < SINGLE_DEG}).items():
+            if too_few:
+                self.add(key, known=known, axis=axis)
+                return True
+        return False
 
     # --- readings ---
 
@@ -198,14 +181,14 @@ class _Case:
         given = self.pairs.fit
         pairing = misread.other_pairing(self.pairs, self.session.names)
         if pairing is not None:
-            self.pairs = pairing.mended
+            self.pairs = self.pairs.paired(pairing.rows)
             self.add(pairing.name, reading=pairing.says, **_change(given, self.pairs.fit))
             return
-        either = [misread.inverted(self.pairs)]
-        better = misread.better_reading(given, either, misread.PAIRING_SHIFT_LEFT)
-        if better:
-            self.pairs = better.fit.pairs
-            options = misread.candidates(better.fit, self.session, "inverted")
+        arm = invert_transform(self.pairs.T_base_gripper)
+        flipped = replace(self.pairs, T_base_gripper=arm).fit
+        if misread.clearly_better(flipped, given, misread.PAIRING_SHIFT_LEFT):
+            self.pairs = flipped.pairs
+            options = misread.candidates(flipped, self.session, "inverted")
             if self._off_joints(self.session.T_base_gripper, self.q) < AS_COMPUTED_M:
                 against = (*options[0].against, "the arm poses are those of the joint angles")
                 options[0] = replace(options[0], against=against)
@@ -213,7 +196,7 @@ class _Case:
                 arm, mount = given.pairs.T_base_gripper, misread.other_mount(given.pairs.mount)
                 self.pairs = replace(self.pairs, T_base_gripper=arm, mount=mount)
             words = {"candidates": _listed(options), "choice": _choice(options)}
-            self.add("inconsistent_convention", **words, **_change(given, better.fit))
+            self.add("inconsistent_convention", **words, **_change(given, flipped))
         elif given.turn_rad > POOR_RAD:
             self._rotations(given)
         elif given.shift_m < POOR_M:
@@ -239,18 +222,13 @@ class _Case:
             sides.append(("camera", self.pairs.exchanged()))
         for side, pairs in sides:
             places = misread.places(pairs)
-            if not places.agree:
-                continue
-            fit = pairs.fit
-            other = misread.other_rotations(pairs)
-            reading = misread.better_reading(fit, other, misread.ROTATION_SHIFT_LEFT)
-            reading = reading or misread.undo_notation(fit, places.expected)
-            if reading is None:
+            reading = places and misread.other_rotations(pairs, places[0])
+            if not places or not reading:
                 continue
             evidence = f"the {side}'s positions agree with the other side (within "
-            evidence += f"{1e3 * places.gap_m:.1f} mm), its rotations do not"
+            evidence += f"{1e3 * places[1]:.1f} mm), its rotations do not"
             words = {"evidence": evidence, "reading": reading.says, "side": side}
-            words |= _change(fit, reading.fit) | {"how": f" (suspected: {reading.says})"}
+            words |= _change(pairs.fit, reading.fit) | {"how": f" (suspected: {reading.says})"}
             self.add("degrees" if reading.name == "degrees" else "other_rotations", **words)
             if side == "arm":
                 self.pairs = reading.fit.pairs
@@ -262,13 +240,13 @@ class _Case:
             self.hopeless = True
             computed = self._off_joints(self.session.T_base_gripper, self.q) < AS_COMPUTED_M
             key = "computed_for_another_arm" if computed else "nothing_fits"
-            self.add(key, left=given.says(), arm=self.arm.name)
+            self.add(key, left=given.says(), arm=self.session.arm.name)
 
     def _off_joints(self, T_base_gripper: Floats, q: Floats | None) -> float:
         """How far arm poses (n, 4, 4) are from those of joint angles q (n, 6), in any entry."""
         if q is None:
             return np.inf
-        return float(np.abs(self.arm.forward(q) - T_base_gripper).max())
+        return float(np.abs(self.session.arm.forward(q) - T_base_gripper).max())
 
     # --- residuals ---
 
@@ -288,11 +266,15 @@ class _Case:
     def residuals(self) -> list[str]:
         """Causes that the residuals speak for; returns what could not be tested."""
         q, pairs = self.q, self.pairs
+        if len(pairs) < causes.FEWEST_PAIRS:
+            return ["few"]
+        if self.hopeless:
+            return ["residuals"]
         if q is not None and self._off_joints(pairs.T_base_gripper, q[pairs.row]) > BELONGS_M:
             q = self._joints_that_fit(q)
         velocity = self._velocity(q)
-        search = causes.search_pairs(self.pairs, Arms(self.arm, self.errors, q, velocity))
-        self.found += _from_residuals(search, self.session)
+        model = MendedPairs(self.session.arm, q, velocity, pairs.fit)
+        self.found += _from_residuals(search(model, causes.PAIRS_LEVEL), self.session)
         judged = self.session.solve().judgement if not self.found else None
         if judged is not None and (judged.large or judged.broken):
             self.add("unexplained", why=" ".join([judged.large, *judged.broken]).strip())
@@ -303,17 +285,17 @@ class _Case:
 
         Poses of another tool on the same arm fit the images as well as the arm's own.
         """
-        given = self.pairs.fit
-        computed = replace(self.pairs, T_base_gripper=self.arm.forward(q[self.pairs.row])).fit
+        given, arm = self.pairs.fit, self.session.arm
+        computed = replace(self.pairs, T_base_gripper=arm.forward(q[self.pairs.row])).fit
         if given.better_than(computed) > misread.CLEARLY_BETTER:
-            words = {"arm": self.arm.name, "given": given.says(), "computed": computed.says()}
-            self.add("joints_of_another_arm", **words)
+            said = {"given": given.says(), "computed": computed.says()}
+            self.add("joints_of_another_arm", arm=arm.name, **said)
         return None
 
     def _velocity(self, q: Floats | None) -> Floats | None:
         """The gripper's twist rates (n, 6) of the session's views, None where unknown."""
         if q is not None and self.session.dq is not None:
-            rates = self.arm.jacobian(q) @ self.session.dq[..., None]
+            rates = self.session.arm.jacobian(q) @ self.session.dq[..., None]
             return np.asarray(rates[..., 0])
         if self.session.times is None:
             return None
@@ -358,19 +340,19 @@ def _choice(options: list[misread.Candidate]) -> str:
     return f"The data do not decide between {names}{speaks}."
 
 
-def _from_residuals(search: CauseSearch[MendedPairs], session: HandEyeSession) -> list[Finding]:
+def _from_residuals(found: CauseSearch[MendedPairs], session: HandEyeSession) -> list[Finding]:
     """The accepted causes as findings, outliers together in one."""
-    found, odd = [], search.of(causes.OUTLIER)
-    of_odd = [_figures(step, search.model, session) for step in odd]
+    findings, odd = [], found.of(causes.OUTLIER)
+    of_odd = [_figures(step, found.model, session) for step in odd]
     names = ["{name} ({shift:.0f} mm, {turn:.1f} deg)".format(**figures) for figures in of_odd]
-    for step in search.accepted:
+    for step in found.accepted:
         if step in odd[1:]:
             continue
-        figures = _figures(step, search.model, session) | _change(step.before.fit, step.after.fit)
+        figures = _figures(step, found.model, session) | _change(step.before.fit, step.after.fit)
         if odd:
             figures |= {"names": ", ".join(names), "left": odd[-1].after.fit.says()}
-        found.append(SENTENCES.finding(step.test.cause, step.test.p_value, **figures))
-    return found
+        findings.append(SENTENCES.finding(step.test.cause, step.test.p_value, **figures))
+    return findings
 
 
 def _figures(
@@ -390,10 +372,10 @@ def _figures(
     if test.cause == causes.ARM_ERROR:
         size = np.degrees(model.offsets[test.at])
         return {"joint": test.at, "size": size, "half": np.degrees(half)}
-    if test.cause == causes.STEADY:
-        turn, shift = step.before.over_session(test)
-        what = ("the camera on its mount", "the board on its stand")[test.at]
-        return {"what": what, "turn": np.degrees(turn), "shift": 1e3 * shift}
     turn, shift = causes.turn_and_shift(test)
-    name = session.names[step.before.fit.pairs.view[test.at]]  # the odd one, or the first after
-    return {"name": name, "turn": np.degrees(turn), "shift": 1e3 * shift}
+    figures = {"turn": np.degrees(turn), "shift": 1e3 * shift}
+    if test.cause == causes.STEADY:
+        what = ("the camera on its mount", "the board on its stand")[test.at]
+        return figures | {"what": what}
+    # the odd one, or the first after
+    return figures | {"name": session.names[step.before.fit.pairs.view[test.at]]}

@@ -13,15 +13,17 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coursekit.arrays import Floats, NDArray
 from coursekit.causes import log_chi2_tail
+from coursekit.formats.poses import turned_by
 from coursekit.geometry import invert_transform, pose_difference
 from coursekit.hand_eye.causes import LEAST_M, LEAST_RAD, Fit, PosePairs
-from coursekit.hand_eye.poses import Mount, base_gripper, camera_board, nearest_rotation
+from coursekit.hand_eye.poses import FRAMES, Mount, base_gripper, camera_board, nearest_rotation
 from coursekit.hand_eye.session import SENTENCES, HandEyeSession
 
 PER_RADIAN = 180.0 / np.pi
@@ -42,7 +44,7 @@ FARTHER = 3.0  # times as far as the best one, where it does not fit its own
 TEXT_ORDER = "sorted as text, img_10 before img_2"
 MOST_FIT = 0.8  # of the images, for the name of an order
 FEWEST_OF_HALF = 5  # pairs, to find X with
-ROTATION_VECTOR = "rotation vector"
+ROTATION_VECTOR = "rotation_vector"
 FIXED, MOVING = (
     ("xyz", "zyx", "xzy", "yxz", "yzx", "zxy"),
     ("ZYX", "XYZ", "YZX", "ZXY", "XZY", "YXZ"),
@@ -65,20 +67,14 @@ class Reading:
     fit: Fit
 
 
-def better_reading(given: Fit, readings: Iterable[Reading], most_shift: float) -> Reading | None:
-    """The reading that makes residuals smallest, if clearly smaller, both turns and displacements.
+def clearly_better(fit: Fit, given: Fit, most_shift: float) -> bool:
+    """Whether a reading makes residuals clearly smaller, both turns and displacements.
 
     most_shift: how large the displacements left over may be, in units of those as given; a wrong
     reading may mend the rotations alone.
     """
-    left = most_shift * given.shift_m + LEAST_M
-    return best(
-        r
-        for r in readings
-        if r.fit.better_than(given) > CLEARLY_BETTER
-        and r.fit.shift_m < left
-        and r.fit.turn_rad < given.turn_rad / 2
-    )
+    smaller = fit.better_than(given) > CLEARLY_BETTER and fit.turn_rad < given.turn_rad / 2
+    return smaller and fit.shift_m < most_shift * given.shift_m + LEAST_M
 
 
 def best(readings: Iterable[Reading]) -> Reading | None:
@@ -86,19 +82,18 @@ def best(readings: Iterable[Reading]) -> Reading | None:
     return min(readings, key=lambda reading: float(f"{reading.fit.size:.4g}"), default=None)
 
 
-def inverted(pairs: PosePairs) -> Reading:
-    """Either side inverted."""
-    T = invert_transform(pairs.T_base_gripper)
-    return Reading("inverted", "one side inverted", replace(pairs, T_base_gripper=T).fit)
+def other_rotations(pairs: PosePairs, expected: Floats) -> Reading | None:
+    """The arm's rotations with a slip of their nine or four numbers, or in another notation.
 
-
-def other_rotations(pairs: PosePairs) -> Iterator[Reading]:
-    """The arm's rotations with a slip of their nine or four numbers; the positions stay."""
+    expected (n, 3, 3): from `places`; the positions stay. None where nothing fits.
+    """
     R = Rotation.from_matrix(pairs.T_base_gripper[:, :3, :3])
     orders = ([1, 2, 3, 0], [3, 0, 1, 2])
     slips = [*(Rotation.from_quat(R.as_quat()[:, order]) for order in orders), R.inv()]
-    for words, turns in zip(SENTENCES.words["other_rotations"], slips, strict=True):
-        yield Reading("notation", words, with_rotations(pairs, turns.as_matrix()).fit)
+    named = zip(SENTENCES.words["other_rotations"], slips, strict=True)
+    found = [Reading("notation", w, with_rotations(pairs, R.as_matrix()).fit) for w, R in named]
+    clear = [r for r in found if clearly_better(r.fit, pairs.fit, ROTATION_SHIFT_LEFT)]
+    return best(clear) or undo_notation(pairs, expected)
 
 
 def with_rotations(pairs: PosePairs, R: Floats) -> PosePairs:
@@ -111,24 +106,16 @@ def with_rotations(pairs: PosePairs, R: Floats) -> PosePairs:
 # --- images with the arm pose of another image ---
 
 
-@dataclass(frozen=True, eq=False)
-class Pairing:
+class Pairing(NamedTuple):
     """Images and arm poses put together anew.
 
     rows (n,): the arm pose of each image, -1 where it has none. name: of the finding; says: what
-    was done, with a place for the images' names. pairs: as they were given.
+    was done.
     """
 
-    pairs: PosePairs
     rows: NDArray[np.intp]
     name: str
     says: str
-
-    @property
-    def mended(self) -> PosePairs:
-        """The pairs put right, without the images that have no arm pose."""
-        T, row = self.pairs.T_base_gripper[self.rows], self.pairs.row[self.rows]
-        return replace(self.pairs, T_base_gripper=T, row=row).keep(self.rows >= 0)
 
 
 def other_pairing(pairs: PosePairs, names: Sequence[str]) -> Pairing | None:
@@ -137,25 +124,24 @@ def other_pairing(pairs: PosePairs, names: Sequence[str]) -> Pairing | None:
     names: of the views. X and Y come from all pairs, and where those do not agree from their
     halves, from pairs shifted by one or two, in the order of text, and backwards.
     """
-    n, half = len(pairs), len(pairs) // 2
-    tried = [pairs, *(pairs.shifted(by) for by in (-1, 1, -2, 2) if n - abs(by) >= 4)]
+    n, half, own = len(pairs), len(pairs) // 2, np.arange(len(pairs))
+    tried = [pairs, *(pairs.paired(own + by) for by in (-1, 1, -2, 2) if n - abs(by) >= 4)]
     if half >= FEWEST_OF_HALF:
-        tried += [tried[0].keep(np.arange(n) < half)]
+        tried += [pairs.keep(own < half)]
         tried += [part.keep(np.arange(len(part)) >= len(part) - half) for part in tried[1:3]]
-    orders = [*_text_orders(n), np.arange(n)[::-1]]
-    tried += [replace(pairs, T_base_gripper=pairs.T_base_gripper[order]) for order in orders]
-    names, own = [names[view] for view in pairs.view], np.arange(n)
+    tried += [pairs.paired(order) for order in (*_text_orders(n), own[::-1])]
+    names = [names[view] for view in pairs.view]
     found = [_fitting_rows(part.fit, pairs) for part in tried]
     rows, off = min(found, key=lambda fitting: float(fitting[1][own, fitting[0]].mean()))
     if (rows != own).sum() < 2:
         return None
     # X and Y of a few pairs may fit those by chance: all of them must say the same
-    rows, off = _fitting_rows(_in_order(pairs, rows, off, names).mended.fit, pairs)
+    rows, off = _fitting_rows(pairs.paired(_in_order(rows, off, names).rows).fit, pairs)
     moved = np.flatnonzero(rows != own)
     better = found[0][1][moved, moved] - off[moved, rows[moved]]  # than as given, logarithms
     if len(moved) < 2 or better.mean() < 2 * np.log(CLEARLY_BETTER):
         return None
-    return _in_order(pairs, rows, off, names)
+    return _in_order(rows, off, names)
 
 
 def _fitting_rows(fit: Fit, pairs: PosePairs) -> tuple[NDArray[np.intp], Floats]:
@@ -175,43 +161,41 @@ def _fitting_rows(fit: Fit, pairs: PosePairs) -> tuple[NDArray[np.intp], Floats]
     return np.where(moved, best, own), off
 
 
-def _in_order(
-    pairs: PosePairs, rows: NDArray[np.intp], off: Floats, names: Sequence[str]
-) -> Pairing:
+def _in_order(rows: NDArray[np.intp], off: Floats, names: Sequence[str]) -> Pairing:
     """What was done to images that fit other rows: shifted, sorted otherwise, or exchanged.
 
     names (n,): of the images; rows (n,), off (n, n): see `_fitting_rows`.
     """
     n, own = len(rows), np.arange(len(rows))
     moved = np.flatnonzero(rows != own)
-    orders = [Pairing(pairs, order, "text_order", TEXT_ORDER) for order in _text_orders(n)]
-    orders.append(Pairing(pairs, own[::-1], "off_by_one", "the images run backwards"))
+    orders = [Pairing(order, "text_order", TEXT_ORDER) for order in _text_orders(n)]
+    orders.append(Pairing(own[::-1], "off_by_one", "the images run backwards"))
     by = Counter((rows[moved] - moved).tolist()).most_common(1)[0][0]
-    orders += [_shifted_from(pairs, first, by, names[first]) for first in range(n - 1)]
+    orders += [_shifted_from(first, by, names) for first in range(n - 1)]
     missing = np.median(off[own, rows]) + 2 * np.log(WITHIN)  # better than to fit another's row
     best = min(orders, key=lambda o: np.where(o.rows < 0, missing, off[own, o.rows]).mean())
     if (best.rows[moved] == rows[moved]).mean() > MOST_FIT:
         return best
     couples = [f"{names[i]} and {names[j]}" for i, j in enumerate(rows) if i < j and rows[j] == i]
     if 2 * len(couples) == len(moved):
-        return Pairing(pairs, rows, "exchanged_rows", ", ".join(couples))
+        return Pairing(rows, "exchanged_rows", ", ".join(couples))
     listed = ", ".join(f"{names[int(i)]} to that of {names[int(rows[i])]}" for i in moved)
     words = f"images belong to arm poses of others ({listed})"
     taken = np.isin(own, rows[moved]) & (rows == own)
-    return Pairing(pairs, np.where(taken, -1, rows), "off_by_one", words)
+    return Pairing(np.where(taken, -1, rows), "off_by_one", words)
 
 
-def _shifted_from(pairs: PosePairs, first: int, by: int, name: str) -> Pairing:
-    """Images from the first on with the arm pose `by` places further on; name: of that image."""
-    own = np.arange(len(pairs))
+def _shifted_from(first: int, by: int, names: Sequence[str]) -> Pairing:
+    """Images from the first on with the arm pose `by` places further on; names (n,): of all."""
+    own = np.arange(len(names))
     rows = np.where(own < first, own, own + by)
     rows[(rows < 0) | (rows >= len(own)) | ((own < first) & (own >= first + by))] = -1
     where = f"{abs(by)} place{'s' * (abs(by) > 1)} {'after' if by > 0 else 'before'} its own"
     words = f"each image belongs to the arm pose {where}"
     if first > max(0, -by):
         lost = "an image" if by > 0 else "an arm pose"
-        words = f"from {name} on {words}; {lost} is missing there"
-    return Pairing(pairs, rows, "off_by_one", words)
+        words = f"from {names[first]} on {words}; {lost} is missing there"
+    return Pairing(rows, "off_by_one", words)
 
 
 def _text_orders(n: int) -> Iterator[NDArray[np.intp]]:
@@ -225,27 +209,11 @@ def _text_orders(n: int) -> Iterator[NDArray[np.intp]]:
 # --- positions alone ---
 
 
-@dataclass(frozen=True, eq=False)
-class Places:
-    """How far the arm's positions agree with the camera, whatever its rotations.
+def places(pairs: PosePairs) -> tuple[Floats, float] | None:
+    """The arm's positions against the camera's view of the board, whatever the arm's rotations.
 
-    expected (n, 3, 3): the arm's rotations but for a constant one on the right. gap_m, spread_m:
-    typical distance that is left over, and that of the positions from their mean.
-    """
-
-    expected: Floats
-    gap_m: float
-    spread_m: float
-
-    @property
-    def agree(self) -> bool:
-        """Whether the positions are true."""
-        return self.gap_m < PLACES_AGREE * self.spread_m
-
-
-def places(pairs: PosePairs) -> Places:
-    """The arm's positions against the camera's view of the board.
-
+    Returns the rotations (n, 3, 3) that they tell the arm's to be but for a constant one on the
+    right, and the typical distance that is left over, m; None where the positions are not true.
     Eye-in-hand: the gripper's origin has a fixed place p in the camera's frame, so in the board's
     it is at T_camera_board^-1 p; eye-to-hand: a fixed place p in the board's frame, at
     T_camera_board p in the camera's. A rotation and a shift bring those to the arm's positions.
@@ -270,7 +238,7 @@ def places(pairs: PosePairs) -> Places:
     Q, gaps = moved(min(fits, key=lambda found: found.cost).x)
     spread = np.median(np.linalg.norm(target - target.mean(axis=0), axis=1))
     gap = float(np.median(np.linalg.norm(gaps, axis=1)))
-    return Places(Q @ M[:, :3, :3], gap, float(spread))
+    return (Q @ M[:, :3, :3], gap) if gap < PLACES_AGREE * spread else None
 
 
 # --- three numbers read as another three ---
@@ -287,9 +255,7 @@ class Notation:
 
     def rotations(self, numbers: Floats) -> Floats:
         """Rotations (m, 3, 3) of numbers (m, 3), rad."""
-        if self.order == ROTATION_VECTOR:
-            return np.asarray(Rotation.from_rotvec(numbers).as_matrix())
-        return np.asarray(Rotation.from_euler(self.order, numbers).as_matrix())
+        return np.asarray(turned_by(numbers, self.order).as_matrix())
 
     def numbers(self, R: Floats) -> Floats:
         """The numbers (m, 3) of rotations (m, 3, 3), rad, as drivers give them."""
@@ -463,12 +429,9 @@ def misreadings() -> Iterator[Misreading]:
         yield Misreading(same, same, PER_RADIAN)
 
 
-def undo_notation(given: Fit, expected: Floats) -> Reading | None:
-    """The arm's rotations as another notation or unit would have them; None where nothing fits.
-
-    expected (n, 3, 3): from `places`.
-    """
-    G = given.pairs.T_base_gripper[:, :3, :3]
+def undo_notation(pairs: PosePairs, expected: Floats) -> Reading | None:
+    """The arm's rotations as another notation or unit would have them; None where nothing fits."""
+    G = pairs.T_base_gripper[:, :3, :3]
     found: list[Reading] = []
     for misreading in misreadings():
         if found and misreading.factor > 1:
@@ -476,11 +439,11 @@ def undo_notation(given: Fit, expected: Floats) -> Reading | None:
         R = misreading.undone(G, expected)
         if R is None:
             continue
-        fit = with_rotations(given.pairs, R).fit
+        fit = with_rotations(pairs, R).fit
         # `expected` leans on positions alone; with X and Y a pose's neighbours are told apart
         arm = base_gripper(fit.pairs.T_camera_board, fit.X, fit.Y[0], fit.pairs.mount)
         numbers, _ = misreading.nearest(misreading.read.numbers(G), arm[:, :3, :3])
-        fit = with_rotations(given.pairs, misreading.written.rotations(numbers)).fit
+        fit = with_rotations(pairs, misreading.written.rotations(numbers)).fit
         if misreading.log_p(G, fit) < np.log(NOTATION_LEVEL):
             found.append(Reading(misreading.name, misreading.says(), fit))
     return best(found)
@@ -491,7 +454,7 @@ def undo_notation(given: Fit, expected: Floats) -> Reading | None:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A way to read a session, with the X and Y that it implies.
+    """A way to read a session, with the X that it implies.
 
     against: what speaks against it; () where nothing does.
     """
@@ -499,14 +462,12 @@ class Candidate:
     name: str
     mount: Mount
     X: Floats
-    Y: Floats
     against: tuple[str, ...]
 
     def says(self) -> str:
         """In one line."""
         where = ", ".join(f"{value:.3f}" for value in self.X[:3, 3])
-        name = "T_gripper_camera" if self.mount == "eye_in_hand" else "T_base_camera"
-        line = f"{self.name}: {name} at ({where}) m"
+        line = f"{self.name}: {FRAMES[self.mount][0]} at ({where}) m"
         return line + (f"; against it: {', '.join(self.against)}" if self.against else "")
 
 
@@ -526,7 +487,7 @@ def candidates(fit: Fit, session: HandEyeSession, kind: str) -> list[Candidate]:
         against = list(_implausible(mount, X_, Y_, C, session))
         if session.detections is not None and C is not seen:
             against.append("the board's poses were computed here from the images")
-        found.append(Candidate(name.format(other=other), mount, X_, Y_, tuple(against)))
+        found.append(Candidate(name.format(other=other), mount, X_, tuple(against)))
     return found
 
 

@@ -78,28 +78,25 @@ def held_out(
     T_base_gripper: ArrayLike,
     seen: Sequence[Detection] | ArrayLike,
     *,
-    board: Board | None = None,
-    intrinsics: Intrinsics | None = None,
     q: ArrayLike | None = None,
     fk: FkErrors | None = None,
 ) -> HeldOut:
     """The gap between prediction and sight at poses that were not used for the fit.
 
-    T_base_gripper (m, 4, 4), m, and seen as in a session; board and intrinsics are the result's
-    unless given. q (m, 6), rad, or fk for these poses apply what the fit has learnt of the arm's
+    T_base_gripper (m, 4, 4), m, and seen as in a session, of the result's board and camera.
+    q (m, 6), rad, or fk for these poses apply what the fit has learnt of the arm's
     own errors; without them the arm of a session with joint angles is taken at its word. Compare
     its rms_px with the result's own: where it is much larger, X fits the noise of its poses. Raises
     ValueError as a session does.
     """
     given, fit = result.session, result.refined
-    board, intrinsics = board or given.board, intrinsics or given.intrinsics
-    other = HandEyeSession(result.mount, T_base_gripper, seen, board, intrinsics, q)  # type: ignore[arg-type]
+    about = given.board, given.intrinsics, q
+    other = HandEyeSession(result.mount, T_base_gripper, seen, *about)  # type: ignore[arg-type]
     poses = other.T_base_gripper
-    offsets = fit is not None and fit.problem.arm is not None and other.q is not None
     known = other.q is not None or not given.has_its_joints
-    if fit is not None and fit.problem.guessed and fk is None and known:
-        fk = given.shared_errors(poses, other.q)
-    if fit is not None and (fk is not None or offsets):
+    if fit is not None:
+        if fit.problem.guessed and fk is None and known:
+            fk = given.shared_errors(poses, other.q)
         poses = arm_poses_with(fit, replace(fit.problem, T_base_gripper=poses, q=other.q, fk=fk))
     expected = camera_board(poses, result.X, result.Y, result.mount)
     residuals = None

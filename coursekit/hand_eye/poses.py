@@ -155,11 +155,6 @@ class Observability:
         with np.errstate(divide="ignore"):
             return 1e3 / self.singular_values
 
-    @property
-    def determined(self) -> bool:
-        """Whether all six directions are."""
-        return not self.free
-
     def __repr__(self) -> str:
         turns = ", ".join(f"{turn:.1f}" for turn in self.turns_deg)
         known = np.minimum(self.sigma_mm, NOTHING_MM)[:, None] * self.directions

@@ -23,7 +23,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from itertools import groupby
@@ -290,9 +290,9 @@ class HandEyeSession:
         if len(used) < FEWEST_POSES:
             facts = {"used": len(used), "folder": os.fspath(folder), "fewest": FEWEST_POSES}
             raise ValueError(say("hand_eye.few_pairs", **facts) + why_unused(skipped))
-        T, columns = _stacked(rows[file] for file in used)
+        T, columns = _stacked([rows[file] for file in used])
         views_ = Detections(found[file] for file in used)
-        size, wanted = views_.size, (intrinsics.width, intrinsics.height)
+        size, wanted = views_.size, intrinsics.size
         lens = "a lens of {} x {} px".format(*wanted)
         want(size == wanted, "intrinsics", lens, say("hand_eye.of_these_images", size=size))
         names, unused = tuple(used), tuple(skipped)
@@ -371,7 +371,7 @@ def _board(card: dict[str, Any]) -> Board:
 
 def _table(
     folder: Path, in_order: bool, **notation: str | None
-) -> tuple[dict[str, dict[str, Any]], list[Skipped]]:
+) -> tuple[dict[str, PoseRow], list[Skipped]]:
     """The usable rows of poses.csv by their file, and what is wrong with the others."""
     path = folder / POSES
     if not path.is_file():
@@ -387,7 +387,7 @@ def _table(
         read = [replace(row, file=file.relative_to(folder).as_posix()) for row, file in named]
         columns |= {"file"}
     _check_columns(columns)
-    rows: dict[str, dict[str, Any]] = {}
+    rows: dict[str, PoseRow] = {}
     skipped = []
     for row in read:
         file, problem = _image(folder, files, row.file) if row.file else ("", "no file is named")
@@ -397,7 +397,7 @@ def _table(
             where = f"{POSES}, line {row.line}" + (f" ({row.file})" if row.file else "")
             skipped.append(Skipped(where, problem or row.problem))
         else:
-            rows[file] = _read_row(row, columns)
+            rows[file] = row
     return rows, skipped
 
 
@@ -427,22 +427,16 @@ def _check_columns(columns: set[str]) -> None:
         raise ValueError(say("hand_eye.no_pose_column", **facts))
 
 
-def _read_row(row: PoseRow, columns: set[str]) -> dict[str, Any]:
-    """T (4, 4), and of `OPTIONAL` what the table has, None for the rest."""
-    found: dict[str, Any] = {
-        name: np.array([row.values[one] for one in names]) if columns.issuperset(names) else None
+def _stacked(rows: Sequence[PoseRow]) -> tuple[Floats, dict[str, Floats]]:
+    """T_base_gripper (n, 4, 4) of the rows of a table, and of `OPTIONAL` what it has."""
+    known = {
+        name: np.squeeze([[row.values[one] for one in names] for row in rows])
         for name, names in OPTIONAL.items()
+        if rows[0].values.keys() >= {*names}
     }
-    if found["times"] is not None:
-        found["times"] = found["times"][0]
-    return found | {"T": widowx().forward(found["q"]) if row.T is None else row.T}
-
-
-def _stacked(rows: Iterable[dict[str, Any]]) -> tuple[Floats, dict[str, Any]]:
-    """T_base_gripper (n, 4, 4), and of `OPTIONAL` what all rows have, None for the rest."""
-    T, *others = zip(*([row[name] for name in ("T", *OPTIONAL)] for row in rows), strict=True)
-    known = (None if any(row is None for row in rows) else np.array(rows) for rows in others)
-    return np.stack(T), dict(zip(OPTIONAL, known, strict=True))
+    arm = widowx()
+    T = [arm.forward(known["q"][i]) if row.T is None else row.T for i, row in enumerate(rows)]
+    return np.stack(T), known
 
 
 # --- where the camera is ---
@@ -761,7 +755,8 @@ class HandEyeResult(Estimate):
             weak.append(says["narrow"].format(turned=known.turns_deg[1]))
         if self.refined is not None and self.refined.alike:
             weak.append(says["alike"].format(alike=self.refined.alike))
-        worst = self.quantile() * self.reach_sigma_mm if self.refined is not None else math.inf
+        ahead = (0.0, 0.0, LEVER_M)
+        worst = self.quantile() * self.sigma_at_mm(ahead) if self.refined else math.inf
         return Trust(worst, tuple(weak), self._disagreement(), tuple(self._broken()))
 
     def _disagreement(self) -> str:
@@ -868,11 +863,6 @@ class HandEyeResult(Estimate):
             return f"{judged.grade} how good it is: {self._untold}."
         reaches = SENTENCES.words["reaches"].format(ahead=1e3 * LEVER_M, worst=judged.worst_mm)
         return f"{judged.grade}: {reaches}"
-
-    @property
-    def reach_sigma_mm(self) -> float:
-        """Standard deviation, mm, worst direction, of where X puts a point `LEVER_M` ahead."""
-        return self.sigma_at_mm((0.0, 0.0, LEVER_M))
 
     def sigma_at_mm(self, point: ArrayLike) -> float:
         """Standard deviation, mm, worst direction, of where X puts a point (3,), m, of the camera.

@@ -53,11 +53,6 @@ class PixelViews:
         pixels = np.concatenate([seen.pixels for seen in detections])
         return cls(board.points[ids], pixels, starts, lens, sigma_px)
 
-    @property
-    def observations(self) -> int:
-        """Two a corner."""
-        return self.pixels.size
-
     @cached_property
     def view(self) -> Integers:
         """The view (N,) of each corner."""
@@ -110,11 +105,6 @@ class PoseViews:
 
     poses: Floats
     information: Floats
-
-    @property
-    def observations(self) -> int:
-        """Six a pose."""
-        return 6 * len(self.poses)
 
     def linear(self, T_camera_board: Floats, scale: float) -> tuple[Floats, Floats, Floats]:
         """As `PixelViews.linear`: at poses (n, 4, 4), and in rad and m where that is in px.

@@ -16,12 +16,9 @@ from coursekit.intrinsics.diagnosis import diagnose, stored_power
 from coursekit.intrinsics.fit import (
     MODELS,
     CalibrationFailed,
-    Coverage,
     IntrinsicsResult,
-    Tilts,
     calibrate,
     coverage,
-    image_grid,
     rms_under,
     tilts,
 )

@@ -37,13 +37,13 @@ from functools import cached_property
 import numpy as np
 
 from coursekit import causes as engine
-from coursekit.arrays import Floats, Interval, Mask, NDArray
+from coursekit.arrays import Floats, Mask, NDArray
 from coursekit.boards import Detection, Detections
 from coursekit.checks import want
 from coursekit.geometry import Intrinsics, distort, moved
 from coursekit.intrinsics import derivatives
 from coursekit.intrinsics.fit import MIN_CORNERS, IntrinsicsResult, evaluate
-from coursekit.words import p_text
+from coursekit.words import p_text, say
 
 BOW, HEIGHTS, FLEX = "bowed_board", "heights", "flexing_board"
 STRETCH, PRINT = "stretch", "print"
@@ -136,8 +136,8 @@ class Calibration:
     centre in px; focus (n, 1); motion (n, 3) during the readout of a whole image, m; lens (8 or
     more,), the terms of `lens_terms`. sizes: the causes that were added, with their coefficients'
     rms. prior_px: the
-    corners' noise against which those are weighed. fisheye: the camera's coefficients are those of
-    `fisheye_with_derivatives`.
+    corners' noise against which those are weighed. project: how points become pixels, whose
+    coefficients the camera's are.
     """
 
     camera: Intrinsics
@@ -150,7 +150,7 @@ class Calibration:
     values: dict[str, Floats]
     sizes: dict[str, float]
     prior_px: float = PRIOR_PX
-    fisheye: bool = False
+    project: derivatives.Projector = derivatives.project_with_derivatives
 
     @classmethod
     def of(cls, result: IntrinsicsResult) -> Calibration:
@@ -164,13 +164,9 @@ class Calibration:
         left_out = int((~estimated[4:].any(axis=1)).sum())
         corners = CornerTable(points[ids], pixels, view, ids)
         names = tuple(d.name or f"view {i}" for i, d in enumerate(detections))
-        values = {
-            BOW: np.zeros(3),
-            STRETCH: np.zeros(2),
-            DRIFT: np.zeros(3),
-            LENS: np.zeros(8 + left_out),
-        }
-        values |= {c: np.zeros(f.shape[-1]) for c, f in zip((HEIGHTS, PRINT), free, strict=True)}
+        widths = {BOW: 3, STRETCH: 2, DRIFT: 3, LENS: 8 + left_out}
+        widths |= {HEIGHTS: free[0].shape[-1], PRINT: free[1].shape[-1]}
+        values = {cause: np.zeros(width) for cause, width in widths.items()}
         values |= {cause: np.zeros((n, width)) for cause, width in OWN.items()}
         camera, poses = result.intrinsics, result.T_camera_board
         return cls(camera, estimated, poses, corners, names, points, free, values, {})
@@ -197,6 +193,16 @@ class Calibration:
         x, y, z = self.seen.T
         return float((np.hypot(x, y) / z).max())
 
+    @property
+    def shared(self) -> list[str]:
+        """The causes that were added with one set of coefficients for all views."""
+        return [cause for cause in self.sizes if cause not in OWN]
+
+    @property
+    def own(self) -> list[str]:
+        """Those of which each view has its own."""
+        return [cause for cause in self.sizes if cause in OWN]
+
     @cached_property
     def linear(self) -> Linear:
         """Residuals and derivatives at the corners."""
@@ -209,12 +215,7 @@ class Calibration:
         # The row at which a corner was seen is measured: nothing has to be solved for it.
         time = (corners.pixels[:, 1] + 0.5) / camera.height - 0.5
         points = still + time[:, None] * values[SHUTTER][corners.view]
-        project = (
-            derivatives.fisheye_with_derivatives
-            if self.fisheye
-            else derivatives.project_with_derivatives
-        )
-        pixels, by_camera, by_point = project(points, camera)
+        pixels, by_camera, by_point = self.project(points, camera)
         left_out = by_camera[:, :, 4:][:, :, ~self.estimated[4:].any(axis=1)]
         terms = np.concatenate([lens_terms(pixels, camera.size), left_out], axis=2)
         principal = np.array([camera.cx, camera.cy])
@@ -240,18 +241,12 @@ class Calibration:
             SHUTTER: by_point * time[:, None, None],
             LENS: terms * scale,
         }
-        shared = [by_camera @ self.estimated, *(columns[c] for c in self.sizes if c not in OWN)]
-        own = [
-            derivatives.twist_columns(points, by_point),
-            *(columns[c] for c in self.sizes if c in OWN),
-        ]
+        shared = [by_camera @ self.estimated, *(columns[c] for c in self.shared)]
+        own = [derivatives.twist_columns(points, by_point), *(columns[c] for c in self.own)]
         moved_centre = principal + number[:, None] * values[DRIFT][1:]
-        return Linear(
-            corners.pixels - moved_centre - from_axis * scale[:, 0],
-            np.concatenate(shared, axis=2),
-            np.concatenate(own, axis=2),
-            columns,
-        )
+        residuals = corners.pixels - moved_centre - from_axis * scale[:, 0]
+        of_all, of_each = (np.concatenate(blocks, axis=2) for blocks in (shared, own))
+        return Linear(residuals, of_all, of_each, columns)
 
     @property
     def shape(self) -> Floats:
@@ -377,12 +372,8 @@ class Calibration:
         it all and are the likelier, clearly; where corners only share errors with their neighbours,
         all do.
         """
-        fields = self._by_view(self._fields)
-        return (
-            self.plain.explains(engine.Hypothesis("smooth", fields, typical=PRIOR_PX))
-            .tested()
-            .strength
-        )
+        fields = engine.Hypothesis("smooth", self._by_view(self._fields), typical=PRIOR_PX)
+        return self.plain.explains(fields).tested().strength
 
     def tested(self, hypotheses: Sequence[engine.Hypothesis]) -> list[engine.Tested]:
         """The test of each hypothesis; the fair p-value only of those that can be accepted."""
@@ -491,18 +482,16 @@ def as_fisheye(model: Calibration) -> tuple[Calibration, float]:
     parameters = derivatives.parameter_vector(camera)
     straight = parameters[4:] * [1, 1, 0, 0, 1]  # without the tangential ones
     radius = distort(np.column_stack([tangent, 0.0 * tangent]), straight)[:, 0]
-    series = np.linalg.lstsq(
-        np.arctan(tangent)[:, None] ** derivatives.FISHEYE_POWERS, radius, rcond=None
-    )[0]
+    powers = np.arctan(tangent)[:, None] ** derivatives.FISHEYE_POWERS
+    series = np.linalg.lstsq(powers, radius, rcond=None)[0]
     parameters[:2] *= series[0]
     parameters[4:] = 0.0
     parameters[derivatives.RADIAL] = series[1:] / series[0]
     estimated = model.estimated[:, model.estimated[[6, 7]].sum(axis=0) == 0]
-    camera, values = (
-        derivatives.with_parameters(camera, parameters),
-        {**model.values, LENS: np.zeros(10)},
-    )
-    rival = replace(model, camera=camera, estimated=estimated, values=values, fisheye=True)
+    camera, values = derivatives.with_parameters(camera, parameters), model.values.copy()
+    values[LENS] = np.zeros(10)
+    project = derivatives.fisheye_with_derivatives
+    rival = replace(model, camera=camera, estimated=estimated, values=values, project=project)
     rival = refit(turned_over(refit(rival, FISHEYE_STEPS)))
     mine, theirs = (np.log(_squares_by_view(m) + LEAST_PX**2) for m in (model, rival))
     return rival, float(ttest_1samp(mine - theirs, 0.0, alternative="greater").pvalue)
@@ -733,40 +722,29 @@ def _squares_by_view(model: Calibration) -> Floats:
 
 def _squares(model: Calibration) -> float:
     with np.errstate(all="ignore"):
-        held = sum(float((prior(model)[1] ** 2).sum()) for prior in (_prior, _shape_prior))
+        held = sum(float((_prior(model, own)[1] ** 2).sum()) for own in (True, False))
         return float((model.linear.residuals**2).sum()) + held
 
 
-def _shape_prior(model: Calibration) -> tuple[Floats, Floats]:
-    """As `_prior`, of what is shared (g,): corners are held to where the board has them."""
-    causes = [cause for cause in model.sizes if cause not in OWN]
-    weights, values = [np.zeros(model.estimated.shape[1])], [np.zeros(model.estimated.shape[1])]
-    for cause in causes:
-        value = model.values[cause]
-        held = model.prior_px / model.sizes[cause] if cause in (HEIGHTS, PRINT) else 0.0
-        weights.append(np.full(len(value), held))
-        values.append(value)
-    weight = np.concatenate(weights)
-    return weight, np.concatenate(values) * weight
+def _prior(model: Calibration, own: bool) -> tuple[Floats, Floats]:
+    """How what is shared, or a view's own, is held: px a number (g,), (k,), and what it amounts to.
 
-
-def _prior(model: Calibration) -> tuple[Floats, Floats]:
-    """Of the views' own causes: px a coefficient (k,), and what they amount to (views, k), px.
-
-    Coefficients are held towards 0 as by one corner coordinate of noise `prior_px` each.
+    That is (g,) or (views, k), px. A view's own coefficients, and corners that are off the board's
+    smooth shape, are held towards 0 as by one corner coordinate of noise `prior_px` each.
     """
-    own = [cause for cause in model.sizes if cause in OWN]
-    weights = [np.full(OWN[cause], model.prior_px / model.sizes[cause]) for cause in own]
-    values = [np.zeros((len(model.views), 0)), *(model.values[cause][model.views] for cause in own)]
-    weight = np.concatenate([np.zeros(0), *weights])
-    return weight, np.concatenate(values, axis=1) * weight
+    causes = model.own if own else model.shared
+    free = np.zeros((len(model.views), 0) if own else model.estimated.shape[1])
+    values = [free, *(model.values[c][model.views] if own else model.values[c] for c in causes)]
+    held = [model.prior_px / model.sizes[c] * (own or c in (HEIGHTS, PRINT)) for c in causes]
+    weight = np.repeat([0.0, *held], [value.shape[-1] for value in values])
+    return weight, np.concatenate(values, axis=-1) * weight
 
 
 def _step(model: Calibration, damping: float) -> tuple[Floats, Floats]:
     """The damped step of what is shared (g,) and of each view's own (views, w)."""
     linear = model.linear
     g, width = linear.shared.shape[2], linear.own.shape[2]
-    weight, prior = _prior(model)
+    weight, prior = _prior(model, own=True)
     weak = np.eye(width)[6:] * np.concatenate([np.ones(6), weight])
     sizes = np.linalg.norm(linear.shared, axis=(0, 1))
     damp = np.sqrt(damping / len(model.views)) * np.diag(sizes)
@@ -778,7 +756,7 @@ def _step(model: Calibration, damping: float) -> tuple[Floats, Floats]:
         s += [linear.shared[rows].reshape(-1, g), np.zeros((len(weak) + width, g)), damp]
         b.append(np.concatenate([mine, weak, damp_own, np.zeros((g, width))]))
         r += [linear.residuals[rows].ravel(), -prior[index], np.zeros(width + g)]
-    held, values = _shape_prior(model)
+    held, values = _prior(model, own=False)
     s.append(np.diag(held)[held > 0])
     r.append(-values[held > 0])
     return derivatives.NormalEquations(np.concatenate(s), b, np.concatenate(r)).step()
@@ -826,18 +804,11 @@ class Bow:
     p_value: float
     result: IntrinsicsResult
 
-    def interval_m(self, level: float = 0.95) -> Interval:
-        """The interval that holds the sag with probability `level`, m."""
-        half = self.result.quantile(level) * self.sigma_m
-        return self.sag_m - half, self.sag_m + half
-
     def __repr__(self) -> str:
         half = 1e3 * self.result.quantile() * self.sigma_m
         found = "a bow" if self.p_value < BOW_LEVEL else "no more than a flat board would show"
-        return (
-            f"the board's middle stands out by {1e3 * self.sag_m:+.2f} ± {half:.2f} mm (95 %):\n"
-            f"{found} ({p_text(self.p_value)})"
-        )
+        facts = {"sag": 1e3 * self.sag_m, "half": half, "found": found}
+        return say("intrinsics.bow", p=p_text(self.p_value), **facts)
 
 
 def fit_bow(result: IntrinsicsResult) -> Bow:
@@ -857,17 +828,11 @@ def fit_bow(result: IntrinsicsResult) -> Bow:
     columns, rows = result.board.corners
     outermost = shape[[0, columns - 1, (rows - 1) * columns, rows * columns - 1]].mean(axis=0)
     flat, bent = (float(np.sum(r.equations.residuals**2)) for r in (result, bowed))
-    return Bow(
-        # With the old origin z points out of the board.
-        sag_m=float(outermost @ coefficients) * (-1 if result.board.old_origin else 1),
-        sigma_m=math.sqrt(float(outermost @ covariance @ outermost)),
-        coefficients=coefficients,
-        covariance=covariance,
-        p_value=float(
-            f.sf(max(0.0, flat - bent) / 3 / (bent / bowed.equations.dof), 3, bowed.equations.dof)
-        ),
-        result=bowed,
-    )
+    ratio, dof = max(0.0, flat - bent) / 3 / (bent / bowed.equations.dof), bowed.equations.dof
+    # With the old origin z points out of the board.
+    sag_m = float(outermost @ coefficients) * (-1 if result.board.old_origin else 1)
+    sigma_m = math.sqrt(float(outermost @ covariance @ outermost))
+    return Bow(sag_m, sigma_m, coefficients, covariance, float(f.sf(ratio, 3, dof)), bowed)
 
 
 # --- the shape, corner by corner ---
@@ -905,11 +870,10 @@ def shaped(model: Calibration, result: IntrinsicsResult) -> IntrinsicsResult:
         STRETCH: _flat(stretch_shape(model, model.board)),
         PRINT: _flat(spread),
     }
-    causes = [cause for cause in model.sizes if cause in SHAPE]
-    extra = {f"{c} {k}": moves[c][:, :, k] for c in causes for k in range(moves[c].shape[2])}
-    weights = [model.prior_px / model.sizes[c] * (c in (HEIGHTS, PRINT)) for c in causes]
-    held = np.repeat(weights, [moves[c].shape[2] for c in causes])
-    values = np.concatenate([np.zeros(0), *(model.values[c] for c in causes)])
+    sizes = {cause: size for cause, size in model.sizes.items() if cause in SHAPE}
+    extra = {f"{c} {k}": moves[c][:, :, k] for c in sizes for k in range(moves[c].shape[2])}
+    held = _prior(replace(model, sizes=sizes), own=False)
+    weights, off = (part[model.estimated.shape[1] :] for part in held)
     return evaluate(
         model.camera,
         model.poses,
@@ -919,5 +883,5 @@ def shaped(model: Calibration, result: IntrinsicsResult) -> IntrinsicsResult:
         result.names,
         result.model,
         extra,
-        (held, held * values),
+        (weights, off),
     )

@@ -111,15 +111,11 @@ def halves(
     apart = np.array([second.value(name) - first.value(name) for name in first.names])
     known = len(apart)
     noise = [r.sigma_px**2 * r.equations.shared_covariance[:known, :known] for r in both]
-    return HalvesDifference(
-        first=first,
-        second=second,
-        range_m=range_m,
-        difference_px=difference.reshape(*shape, 2),
-        expected_px=worst_direction(spread @ total @ np.swapaxes(spread, -1, -2)).reshape(shape),
-        p_value=_wald(apart, total, min(first.dof, second.dof)),
-        noise_p_value=_wald(apart, noise[0] + noise[1], min(r.equations.dof for r in both)),
-    )
+    expected = worst_direction(spread @ total @ np.swapaxes(spread, -1, -2)).reshape(shape)
+    p_value = _wald(apart, total, min(first.dof, second.dof))
+    noise_p_value = _wald(apart, noise[0] + noise[1], min(r.equations.dof for r in both))
+    maps = difference.reshape(*shape, 2), expected
+    return HalvesDifference(first, second, range_m, *maps, p_value, noise_p_value)
 
 
 def difference_px(
@@ -145,9 +141,8 @@ def difference_px(
     for _ in range(_GAUSS_NEWTON_STEPS):
         at = points[known] @ T[:3, :3].T + T[:3, 3]
         seen, _, by_point = derivatives.project_with_derivatives(at, second)
-        columns = (weight[..., None] * derivatives.twist_columns(at, by_point)[..., :free]).reshape(
-            -1, free
-        )
+        columns = weight[..., None] * derivatives.twist_columns(at, by_point)[..., :free]
+        columns = columns.reshape(-1, free)
         residuals = (weight * (pixels[known] - seen)).ravel()
         twist = np.zeros(6)
         twist[:free] = derivatives.scaled_inverse(columns.T @ columns) @ (columns.T @ residuals)
@@ -214,10 +209,8 @@ class Comparison:
     def __repr__(self) -> str:
         lines = ["fitted - factory:"]
         for name, difference, sigma in zip(self.names, self.differences, self.sigmas, strict=True):
-            places = 2 if name[0] in "fc" else 4
-            lines.append(
-                f"{name:>4} {difference:+9.{places}f}, {difference / sigma:+6.1f} of its sigma"
-            )
+            off = f"{difference:+9.2f}" if name[0] in "fc" else f"{difference:+9.4f}"
+            lines.append(f"{name:>4} {off}, {difference / sigma:+6.1f} of its sigma")
         maps = (self.difference_px, 1e3 * self.shift_m, 1e3 * self.expected_shift_m)
         px, mm, sigma = ({"median": np.nanmedian(m), "worst": np.nanmax(m)} for m in maps)
         facts = {"p": p_text(self.p_value), "range_m": self.range_m, "px": px, "mm": mm}
@@ -256,18 +249,10 @@ def compare(
     theirs = deproject(grid, depth, factory.K, factory.dist)
     shift = np.linalg.norm(deproject(grid, depth, ours.K, ours.dist) - theirs, axis=1)
     full = derivatives.parameter_vector(ours) - derivatives.parameter_vector(factory)
-    difference = (
-        np.linalg.pinv(derivatives.selection(names)) @ full
-    )  # "f" against the mean of fx and fy
-    sigma_px = result.uncertainty_map(range_m, shape, "camera")
-    return Comparison(
-        names=names,
-        differences=difference,
-        sigmas=np.sqrt(np.diag(result.covariance)),
-        p_value=_wald(difference, result.covariance, result.dof),
-        range_m=float(range_m),
-        difference_px=np.linalg.norm(pixels, axis=-1),
-        shift_m=shift.reshape(shape),
-        expected_shift_m=sigma_px * range_m / result.value("fx"),
-        size=ours.size,
-    )
+    # "f" against the mean of fx and fy
+    difference = np.linalg.pinv(derivatives.selection(names)) @ full
+    sigmas = np.sqrt(np.diag(result.covariance))
+    p_value = _wald(difference, result.covariance, result.dof)
+    expected = result.uncertainty_map(range_m, shape, "camera") * range_m / result.value("fx")
+    maps = np.linalg.norm(pixels, axis=-1), shift.reshape(shape), expected
+    return Comparison(names, difference, sigmas, p_value, float(range_m), *maps, ours.size)

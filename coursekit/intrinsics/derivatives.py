@@ -8,7 +8,7 @@ columns, and the pose that several boards have in common is the mean of their xi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -18,6 +18,7 @@ from coursekit.arrays import Floats
 from coursekit.geometry import Intrinsics, distort, distortion_jacobian
 
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+Projector = Callable[[Floats, Intrinsics], tuple[Floats, Floats, Floats]]
 RADIAL = [4, 5, 8]  # of them; a fisheye has these and no others
 FISHEYE_POWERS = np.array([1, 3, 5, 7])  # of the angle from the axis, of 1 and those
 
@@ -242,21 +243,11 @@ class NormalEquations:
         views = zip(self.poses, self.slices, strict=True)
         return np.stack([block.T @ values[rows] for block, rows in views])
 
-    def covariance(self, shared: Floats, variance: float) -> Floats:
-        """The covariance (g + 6n, g + 6n) of the shared parameters, then the poses in order.
+    def mean_motion_covariance(self, shared: Floats, variance: float) -> Floats:
+        """The covariance (g + 6, g + 6) of the shared parameters and of the poses' mean twist.
 
         shared (g, g): that of the shared. variance: of one coordinate of a corner.
         """
-        g, n = self.shared.shape[1], len(self.poses)
-        spread = np.concatenate([np.eye(g), -self.responses.reshape(6 * n, g)])
-        joint = spread @ shared @ spread.T
-        for i, own in enumerate(self.pose_covariances):
-            at = slice(g + 6 * i, g + 6 * i + 6)
-            joint[at, at] += variance * own
-        return joint
-
-    def mean_motion_covariance(self, shared: Floats, variance: float) -> Floats:
-        """The covariance (g + 6, g + 6) of the shared parameters and of the poses' mean twist."""
         spread = np.concatenate([np.eye(self.shared.shape[1]), -self.responses.mean(axis=0)])
         joint = spread @ shared @ spread.T
         joint[-6:, -6:] += variance * self.pose_covariances.sum(axis=0) / len(self.poses) ** 2

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -118,9 +118,9 @@ def diagnose(
         if lens := _wrong_lens(start):  # passes for everything else
             return Findings([*found, lens], _TEXTS.looked_for, [_TEXTS.not_tested["lens_first"]])
         found += _residuals(start, result, unseen)
-    scale = depth_scale(result, [depths[i] for i in used]) if depths else None
-    design = [_blur(views), flat, _no_edge_corners(views), _wrong_squares(result, scale)]
-    found += [finding for finding in design if finding]
+    found += [finding for finding in (_blur(views), flat, _no_edge_corners(views)) if finding]
+    if depths and (scaled := _wrong_squares(result, [depths[i] for i in used])):
+        found.append(scaled)
     return Findings(found, _TEXTS.looked_for, unseen)
 
 
@@ -176,13 +176,10 @@ def _layout(detections: list[Detection], board: Board) -> Finding | None:
     tried = range(2, min(highest, MOST_COLUMNS) + 1)
     misfits = {c: _lattice_misfit(detections[:5], c) for c in tried}
     best = min(misfits, key=lambda c: misfits[c], default=columns)
-    if highest >= columns * rows:
-        evidence = f"corner {highest} was seen, the board has 0 to {columns * rows - 1}"
-    else:
-        evidence = f"they miss the board's lattice by {misfit:.2f} squares in the median view, "
-        evidence += "with any pose"
+    reason = _TEXTS.words["no_such_corner" if highest >= columns * rows else "off_lattice"]
+    evidence = reason.format(highest=highest, last=columns * rows - 1, misfit=misfit)
     if best != columns and misfits[best] < LAYOUT_MISFIT:
-        evidence += f"; with {best} inner corners in a row they fit"
+        evidence += _TEXTS.words["other_columns"].format(best=best)
     return _TEXTS.finding("wrong_board_size", evidence=evidence, board=board.text)
 
 
@@ -236,14 +233,14 @@ def _residuals(start: Calibration, result: IntrinsicsResult, unseen: list[str]) 
 
 def _took(steps: _Steps, before: Calibration, after: Calibration) -> _Figures:
     """What the residuals lose to a cause, and what explains them as well."""
-    took = f"it takes the RMS from {_flat(before.left_px)} to {_flat(after.left_px)} px "
-    took += f"(corner noise {_flat(after.noise_px)})"
+    sigmas = {"before": before.left_px, "after": after.left_px, "noise": after.noise_px}
+    took = _TEXTS.words["took"].format(**{name: _flat(px) for name, px in sigmas.items()})
     mine = {step.test.cause for step in steps}
     rivals = {r.cause for step in steps for r in step.rivals if r.cause in causes.PHYSICAL}
     rivals -= {causes.FLEX}
     names = sorted({_TEXTS.findings[_ENTRY.get(r, r)]["name"] for r in rivals - mine})
     if names and not (mine | rivals) <= set(causes.SHAPE):
-        took += f"; {' or '.join(n.replace('_', ' ') for n in names)} explains it as well"
+        took += _TEXTS.words["as_well"].format(rivals=" or ".join(names).replace("_", " "))
     return {"took": took}
 
 
@@ -309,17 +306,16 @@ def _shape(search: _Search, steps: _Steps, model: Calibration) -> _Told:
     if max(sag, print_m) < NORMAL_BOW_M:
         return None
     before, camera = search.start.camera.fx, model.camera
-    figures: _Figures = {"before": before, "change": 100 * (before / camera.fx - 1)}
-    figures |= {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
-    figures |= {"sag": 1e3 * sag, "half": 1.96e3 * sigma, "print": 1e3 * print_m, "more": ""}
+    change = 100 * (before / camera.fx - 1)
+    figures: _Figures = {"before": before, "change": change, "camera": camera, "more": ""}
+    figures |= {"sag": 1e3 * sag, "half": 1.96e3 * sigma, "print": 1e3 * print_m}
     if sag < NORMAL_BOW_M:
         return "uneven_print", figures
     if print_m >= NORMAL_BOW_M:
-        figures["more"] += f", and up to {1e3 * print_m:.2f} mm off their places in it"
-    figures["more"] += "".join(
-        f"; corner {k} is {1e3 * abs(off):.2f} mm {'into' if off > 0 else 'out of'} the board"
-        for k, off in causes.dents(model)
-    )
+        figures["more"] = _TEXTS.words["beside"].format(**figures)
+    for corner, off in causes.dents(model):
+        facts = {"corner": corner, "off": 1e3 * abs(off), "way": "into" if off > 0 else "out of"}
+        figures["more"] += _TEXTS.words["dent"].format(**facts)
     return "bowed_board", figures
 
 
@@ -447,28 +443,19 @@ def _no_edge_corners(detections: Sequence[Detection]) -> Finding | None:
     bare = [margin for margin in seen.margins if margin > BARE_MARGIN]
     if len(bare) < BARE_SIDES and max(seen.margins) < ONE_BARE_MARGIN:
         return None
-    names = ("left", "top", "right", "bottom")
-    empty = {name: 100 * margin for name, margin in zip(names, seen.margins, strict=True)}
-    return _TEXTS.finding("no_edge_corners", reach=100 * seen.reach, **empty)
+    return _TEXTS.finding("no_edge_corners", **seen.percent)
 
 
 # --- metres from elsewhere ---
 
 
-@dataclass(frozen=True)
-class Scale:
-    """How much larger the world is than the board claims: `factor` (1 is right) and its sigma."""
+def depth_scale(result: IntrinsicsResult, depth_m: Sequence[Floats]) -> tuple[float, float] | None:
+    """How much larger the world is than the board claims (1 is right), and its sigma.
 
-    factor: float
-    sigma: float
-
-
-def depth_scale(result: IntrinsicsResult, depth_m: Sequence[Floats]) -> Scale | None:
-    """The median over the views of measured Z over the fit's Z; None with fewer than 3 views."""
-    ratios = []
-    for T, detection, measured in zip(
-        result.T_camera_board, result.detections, depth_m, strict=True
-    ):
+    The median over the views of measured Z over the fit's Z; None with fewer than 3 views.
+    """
+    ratios, poses = [], result.T_camera_board
+    for T, detection, measured in zip(poses, result.detections, depth_m, strict=True):
         predicted = result.points[detection.ids] @ T[2, :3] + T[2, 3]
         valid = np.isfinite(measured) & (np.asarray(measured) > 0)
         if valid.sum() >= MIN_CORNERS:
@@ -479,14 +466,15 @@ def depth_scale(result: IntrinsicsResult, depth_m: Sequence[Floats]) -> Scale | 
     spread = 1.4826 * float(np.median(np.abs(np.array(ratios) - factor)))
     # A median of n values has 1.25 times the error of a mean. All predicted Z scale with fx.
     own = 1.25 * spread / np.sqrt(len(ratios))
-    return Scale(factor, float(np.hypot(own, result.sigma("fx") / result.value("fx"))))
+    return factor, float(np.hypot(own, result.sigma("fx") / result.value("fx")))
 
 
-def _wrong_squares(result: IntrinsicsResult, scale: Scale | None) -> Finding | None:
-    if scale is None or abs(scale.factor - 1) < max(DEPTH_TOLERANCE, SCALE_SIGMAS * scale.sigma):
+def _wrong_squares(result: IntrinsicsResult, depth_m: Sequence[Floats]) -> Finding | None:
+    factor, sigma = depth_scale(result, depth_m) or (1.0, 0.0)
+    if abs(factor - 1) < max(DEPTH_TOLERANCE, SCALE_SIGMAS * sigma):
         return None
-    stated, half = 1e3 * result.board.square_m, 1.96 * scale.sigma
-    figures = {"factor": scale.factor, "half": half, "true": scale.factor * stated}
+    stated = 1e3 * result.board.square_m
+    figures = {"factor": factor, "half": 1.96 * sigma, "true": factor * stated}
     return _TEXTS.finding("wrong_square_size", stated=stated, **figures)
 
 

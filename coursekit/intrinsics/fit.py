@@ -26,7 +26,7 @@ what the corners cover (`coverage`) and from how the boards were tilted (`tilts`
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -186,18 +186,6 @@ class IntrinsicsResult(Estimate):
         """
         return self._scatter.covariance[: len(self.names), : len(self.names)]
 
-    @cached_property
-    def joint_covariance(self) -> Floats:
-        """The covariance (p + 6n, p + 6n) of the parameters, then (omega, v) of each pose."""
-        return self._without_extra(self.equations.covariance)
-
-    def _without_extra(self, covariance_of: Callable[[Floats, float], Floats]) -> Floats:
-        """A covariance of shared parameters and motions as the views scatter, without `extra`."""
-        covariance = covariance_of(self._scatter.covariance, self._scatter.variance)
-        extra = np.s_[len(self.names) : len(self.names) + len(self.extra)]
-        kept = np.delete(np.arange(len(covariance)), extra)
-        return covariance[np.ix_(kept, kept)]
-
     def value(self, name: str) -> float:
         """The estimate of one of `names`."""
         return float(derivatives.parameter_vector(self.intrinsics)[self._row(name)])
@@ -227,9 +215,11 @@ class IntrinsicsResult(Estimate):
         choice("fixed", fixed, ("world", "camera"))
         uv = array("pixels", pixels, (2,), leading=True)
         columns = projection_columns(self.intrinsics, uv.reshape(-1, 2), range_m, self.names)
-        covariance = self._without_extra(self.equations.mean_motion_covariance)
-        known = len(self.names) if fixed == "camera" else len(covariance)
-        columns, covariance = columns[..., :known], covariance[:known, :known]
+        scatter, p = self._scatter, len(self.names)
+        joint = self.equations.mean_motion_covariance(scatter.covariance, scatter.variance)
+        asked = np.delete(np.arange(len(joint)), np.s_[p : p + len(self.extra)])
+        asked = asked[:p] if fixed == "camera" else asked
+        columns, covariance = columns[..., : len(asked)], joint[np.ix_(asked, asked)]
         return (columns @ covariance @ np.swapaxes(columns, -1, -2)).reshape(*uv.shape, 2)
 
     def uncertainty_map(
@@ -267,13 +257,8 @@ class IntrinsicsResult(Estimate):
         None where there is none. Raises ValueError as `calibrate`.
         """
         smaller = list(MODELS)[: list(MODELS).index(self.model)]
-        for model in reversed(smaller):
-            fit = calibrate(
-                self.detections, self.board, model, "f" in self.names, None, self.points
-            )
-            if not fit.folded_share:
-                return fit
-        return None
+        fits = (self._refitted(self.detections, model) for model in reversed(smaller))
+        return next((fit for fit in fits if not fit.folded_share), None)
 
     def held_out_px(self) -> float:
         """The RMS in px of each half of the views under the camera of the other half.
@@ -284,10 +269,12 @@ class IntrinsicsResult(Estimate):
         squares = 0.0
         for part in (0, 1):
             views, others = self.detections[part::2], self.detections[1 - part :: 2]
-            same = "f" in self.names
-            lens = calibrate(views, self.board, self.model, same, None, self.points).intrinsics
+            lens = self._refitted(views, self.model).intrinsics
             squares += rms_under(lens, others, self.points) ** 2 * sum(map(len, others))
         return math.sqrt(squares / self.corners)
+
+    def _refitted(self, views: Sequence[Detection], model: str) -> IntrinsicsResult:
+        return calibrate(views, self.board, model, "f" in self.names, None, self.points)
 
     # --- in words ---
 
@@ -299,9 +286,8 @@ class IntrinsicsResult(Estimate):
         by what the corners cover, and by how the boards are tilted; not by the RMS.
         """
         range_m, wide, views = self.board_range_m, self.quantile(), len(self.residuals)
-        near, far = (
-            wide * float(np.nanquantile(self.uncertainty_map(r), 0.95)) for r in (range_m, math.inf)
-        )
+        maps = (self.uncertainty_map(r) for r in (range_m, math.inf))
+        near, far = (wide * float(np.nanquantile(sigmas, 0.95)) for sigmas in maps)
         focal = wide * max(self.sigma(f) / self.value(f) for f in ("fx", "fy"))
         centre = wide * max(self.sigma(c) for c in ("cx", "cy"))
         determined = max(focal, centre / self.value("fx")) < DETERMINED_SHARE
@@ -323,13 +309,9 @@ class IntrinsicsResult(Estimate):
         return "\n".join(map(wrapped, lines))
 
     def __repr__(self) -> str:
-        width, height = self.intrinsics.size
-        lines = [
-            f"{width}x{height} px, model {self.model}, {len(self.residuals)} views, "
-            f"{self.corners} corners"
-            + (", the board's shape fitted too" if self.extra else "")
-            + ("" if self.converged else "; NOT CONVERGED")
-        ]
+        lines = [say("intrinsics.fit", fit=self, views=len(self.residuals))]
+        lines[0] += ", the board's shape fitted too" if self.extra else ""
+        lines[0] += "" if self.converged else "; NOT CONVERGED"
         for name in self.names:
             places, unit = (2, " px") if name[0] in "fc" else (4, "")
             half = self.quantile() * self.sigma(name)
@@ -413,9 +395,8 @@ def calibrate(
     """
     choice("model", model, tuple(MODELS))
     check_detections(detections, board, MIN_CORNERS, MIN_VIEWS)
-    corners = array(
-        "points", board.points if points is None else points, board.points.shape, finite=True
-    )
+    points = board.points if points is None else points
+    corners = array("points", points, board.points.shape, finite=True)
     width, height = size = detections[0].size
     if guess is not None:
         want(guess.size == size, "guess", guess.size, f"the images' size, {size} px")
@@ -472,22 +453,12 @@ def evaluate(
     weights, off = held or (np.zeros(len(extra)), np.zeros(len(extra)))
     known = np.concatenate([np.zeros((len(extra), len(names))), np.diag(weights)], axis=1)
     seen = np.concatenate(shared, axis=-1).reshape(2 * len(ids), -1)
-    equations = derivatives.NormalEquations(
-        shared=np.concatenate([seen, known[weights > 0]]),
-        poses=tuple(block.reshape(-1, 6) for block in poses),
-        residuals=np.concatenate([residuals.ravel(), -off[weights > 0]]),
-    )
-    return IntrinsicsResult(
-        intrinsics=intrinsics,
-        model=model,
-        names=names,
-        T_camera_board=T_camera_board,
-        equations=equations,
-        board=board,
-        points=points,
-        detections=detections,
-        extra=tuple(extra),
-    )
+    rows = np.concatenate([seen, known[weights > 0]])
+    blocks = tuple(block.reshape(-1, 6) for block in poses)
+    left = np.concatenate([residuals.ravel(), -off[weights > 0]])
+    equations = derivatives.NormalEquations(rows, blocks, left)
+    fitted = intrinsics, model, names, T_camera_board, equations
+    return IntrinsicsResult(*fitted, board, points, detections, tuple(extra))
 
 
 def _solve(
@@ -533,10 +504,8 @@ def _solve(
         cv2.setNumThreads(threads)
     if not all(np.isfinite(found).all() for found in (K, dist, *rotations, *translations)):
         raise CalibrationFailed("detections: the solver ran away to infinity; tilt the board more")
-    poses = np.stack([
-        make_transform(Rotation.from_rotvec(r.ravel()), t.ravel())
-        for r, t in zip(rotations, translations, strict=True)
-    ])  # fmt: skip
+    places = zip(map(np.ravel, rotations), map(np.ravel, translations), strict=True)
+    poses = np.stack([make_transform(Rotation.from_rotvec(r), t) for r, t in places])
     depths = [p @ T[2, :3] + T[2, 3] for T, p in zip(poses, points, strict=True)]
     in_front = all((z > 0).all() for z in depths)
     if min(K[0, 0], K[1, 1]) < LEAST_FOCAL * size[0] or not in_front:
@@ -617,15 +586,16 @@ class Coverage:
         """The sides of the image where more than a tenth of it saw no corner."""
         return tuple(s for s, m in zip(SIDES, self.margins, strict=True) if m > GOOD_MARGIN)
 
+    @property
+    def percent(self) -> dict[str, float]:
+        """How far out corners reach, and what is empty at each side, in per cent."""
+        shares = zip(("reach", *SIDES), (self.reach, *self.margins), strict=True)
+        return {name: 100 * share for name, share in shares}
+
     def __repr__(self) -> str:
-        margins = ", ".join(
-            f"{100 * m:.0f} % {side}" for side, m in zip(SIDES, self.margins, strict=True)
-        )
-        rows, columns = self.counts.shape
-        return (
-            f"corners in {100 * self.fraction:.0f} % of {columns}x{rows} image cells, out to "
-            f"{100 * self.reach:.0f} % of the half diagonal\nempty margins: {margins}"
-        )
+        (rows, columns), covered = self.counts.shape, 100 * self.fraction
+        facts = {"rows": rows, "columns": columns, "covered": covered}
+        return say("intrinsics.coverage", **facts, **self.percent)
 
 
 def coverage(detections: Sequence[Detection], cells: tuple[int, int] = (6, 8)) -> Coverage:
@@ -642,17 +612,13 @@ def coverage(detections: Sequence[Detection], cells: tuple[int, int] = (6, 8)) -
     width, height = size = np.array(detections[0].size)
     pixels = np.concatenate([d.pixels for d in detections])
     # pixel 0 is the centre of the first pixel: the image reaches from -0.5 to size - 0.5
-    counts, _, _ = np.histogram2d(
-        pixels[:, 1], pixels[:, 0], cells, [(-0.5, height - 0.5), (-0.5, width - 0.5)]
-    )
+    spans = (-0.5, height - 0.5), (-0.5, width - 0.5)
+    counts, _, _ = np.histogram2d(pixels[:, 1], pixels[:, 0], cells, spans)
     left, top = (pixels.min(axis=0) + 0.5) / size
     right, bottom = (size - 0.5 - pixels.max(axis=0)) / size
     outermost = np.linalg.norm(pixels - (size - 1) / 2, axis=1).max()
-    return Coverage(
-        counts.astype(np.intp),
-        (float(left), float(top), float(right), float(bottom)),
-        float(outermost / np.linalg.norm(size / 2)),
-    )
+    margins = float(left), float(top), float(right), float(bottom)
+    return Coverage(counts.astype(np.intp), margins, float(outermost / np.linalg.norm(size / 2)))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -674,11 +640,8 @@ class Tilts:
         return float(np.std(self.about_x_deg)), float(np.std(self.about_y_deg))
 
     def __repr__(self) -> str:
-        spread = "{:.0f} and {:.0f}".format(*self.spread_deg)
-        return (
-            f"boards tilted {self.total_deg.min():.0f} to {self.total_deg.max():.0f} deg, "
-            f"spread {spread} deg about x and y"
-        )
+        least, most = self.total_deg.min(), self.total_deg.max()
+        return say("intrinsics.tilts", least=least, most=most, spread=self.spread_deg)
 
 
 def tilts(result: IntrinsicsResult) -> Tilts:
@@ -721,9 +684,9 @@ def _fewer_coefficients(result: IntrinsicsResult) -> str:
     fit = result.simpler
     if fit is None:
         return "no smaller model here does better: push the board into the image's corners."
-    says = f"fit fewer coefficients, calibrate(..., model='{fit.model}'): "
+    held_out, fx = "", "f" if "f" in result.names else "fx"
     if len(result.detections) >= 2 * MIN_VIEWS:
-        says += f"held-out views RMS {fit.held_out_px():.2f} px, with these coefficients "
-        says += f"{result.held_out_px():.2f} px; "
-    fx = "f" if "f" in result.names else "fx"
-    return f"{says}sigma of fx {fit.sigma(fx):.2f} px, with these {result.sigma(fx):.2f} px."
+        rms = {"theirs": fit.held_out_px(), "ours": result.held_out_px()}
+        held_out = say("intrinsics.held_out", **rms)
+    sigmas = {"theirs": fit.sigma(fx), "ours": result.sigma(fx)}
+    return say("intrinsics.fewer", model=fit.model, held_out=held_out, **sigmas)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from itertools import compress
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 
 from coursekit.arrays import Floats
 from coursekit.lessons import questions
-from coursekit.lessons.exercises import Exercise, Model, Step
+from coursekit.lessons.exercises import Exercise, Step, Steps
 from coursekit.specifications import device
 
 Bounds = tuple[int, int, int, int]  # first row, the one after the last; the same for columns
@@ -19,12 +18,9 @@ Bounds = tuple[int, int, int, int]  # first row, the one after the last; the sam
 # --- depth_noise ---
 
 
-def _build_depth_noise(steps: Mapping[str, Step]) -> Model:
-    def depth_noise(Z: Any, fx: float, baseline: float, sigma_d: float) -> Any:
-        slope = steps["divide"](steps["power"](Z), steps["constant"](fx, baseline))
-        return steps["result"](steps["noise"](slope, sigma_d, Z))
-
-    return depth_noise
+def _depth_noise(steps: Steps, Z: Any, fx: float, baseline: float, sigma_d: float) -> Any:
+    slope = steps["divide"](steps["power"](Z), steps["constant"](fx, baseline))
+    return steps["result"](steps["noise"](slope, sigma_d, Z))
 
 
 def _describe_depth_noise(args: tuple[Any, ...]) -> str:
@@ -38,9 +34,9 @@ def _noise_by_disparity(Z: Any, fx: float, baseline: float, sigma_d: float) -> A
     return fx * baseline / d**2 * sigma_d
 
 
-DEPTH_NOISE = Exercise(
-    name="depth_noise.depth_noise",
-    build=_build_depth_noise,
+DEPTH_NOISE = Exercise.told(
+    "depth_noise.depth_noise",
+    build=_depth_noise,
     steps={
         "power": lambda Z: Z**2,
         "constant": lambda fx, baseline: fx * baseline,
@@ -48,32 +44,21 @@ DEPTH_NOISE = Exercise(
         "noise": lambda slope, sigma_d, Z: slope * sigma_d,
         "result": lambda sigma: sigma,
     },
-    cases=[
-        (0.4, 447.0, 0.05, 0.08),
-        (1.0, 447.0, 0.05, 0.08),
-        (np.array([0.30, 0.45, 0.60]), 431.1, 0.0502, 0.08),
-        (np.array([0.15, 0.20, 0.30, 0.45]), 425.0, 0.018, 0.06),
-        (np.array([[0.5, 0.7, 1.1], [1.3, 1.9, 7.5]]), 390.4, 0.0951, 0.25),
-    ],
-    per_row=1,
-    unit="m",
-    tolerance=1e-8,
     describe=_describe_depth_noise,
     styles=[_noise_by_disparity],
-    show=lambda row: ", ".join(f"{v:.7g}" for v in np.ravel(row)),
 )
 
 
-def _difference(divisor: Step) -> Step:
+def _difference(of_part: tuple[float, int]) -> Step:
     """fx B / (d - sigma_d) - Z; Z - fx B / (d + sigma_d); half of the two together; and the same
-    with half of sigma_d to each side: divisor(what part of Z the noise is) tells which.
+    with half of sigma_d to each side: the factor and the power of what part of Z the noise is.
     """
-    return lambda slope, sigma_d, Z: slope * sigma_d / divisor(slope * sigma_d / Z)
+    factor, power = of_part
+    return lambda slope, sigma_d, Z: slope * sigma_d / (1 + factor * (slope * sigma_d / Z) ** power)
 
 
 DEPTH_NOISE.add_mistakes(
-    ("power", "linear_in_Z", lambda Z: Z),
-    ("power", "linear_in_Z", lambda Z: 2 * Z),
+    ("power", "linear_in_Z", lambda Z: Z, lambda Z: 2 * Z),
     ("", "depth_for_slope", lambda _: lambda Z, fx, baseline, sigma_d: Z * sigma_d),
     ("power", "cubed", lambda Z: Z**3),
     ("constant", "baseline_forgotten", lambda fx, baseline: fx),
@@ -87,10 +72,7 @@ DEPTH_NOISE.add_mistakes(
     ("divide", "upside_down", lambda power, constant: constant / power),
     ("noise", "noise_divided", lambda slope, sigma_d, Z: slope / sigma_d),
     ("noise", "noise_forgotten", lambda slope, sigma_d, Z: slope),
-    ("noise", "difference", _difference(lambda part: 1 - part)),
-    ("noise", "difference", _difference(lambda part: 1 + part)),
-    ("noise", "difference", _difference(lambda part: 1 - part**2)),
-    ("noise", "difference", _difference(lambda part: 1 - (part / 2) ** 2)),
+    ("noise", "difference", *map(_difference, ((-1, 1), (1, 1), (-1, 2), (-1 / 4, 2)))),
     ("result", "negative", lambda sigma: -sigma),
     ("", "disparity", lambda law: lambda Z, fx, baseline, sigma_d: fx * baseline / Z),
 )
@@ -99,23 +81,7 @@ DEPTH_NOISE.add_mistakes(
 # --- robust_depth ---
 
 
-def _depth_image() -> Floats:
-    """A block before a wall, 16x12 px in metres: with zeros, NaN, infinity and flying pixels."""
-    rng = np.random.default_rng(2)
-    image = np.where(np.arange(16) < 9, 0.45, 0.95) * rng.normal(1.0, 0.01, (12, 16))
-    image[:, 9] = rng.uniform(0.5, 0.9, 12)  # flying pixels between block and wall
-    image[[0, 1, 3, 6, 8, 9, 10], 8] = 0.0
-    image[[4, 5, 6, 7, 7, 8], [1, 3, 2, 0, 3, 1]] = 0.0
-    image[[2, 3], [6, 7]] = np.nan
-    image[[8, 9, 10], [5, 4, 5]] = np.inf
-    image[0:6, 12:15] = 0.0
-    image[2, 13] = 0.9317
-    return image.round(4)
-
-
-IMAGE = _depth_image()
-IMAGE.setflags(write=False)
-WINDOWS = questions.lesson_texts("depth_noise")["windows"]
+IMAGE = np.array(questions.lesson_texts("depth_noise")["given"]["image"])  # metres
 
 
 def _window(row: int, column: int, half: int) -> Bounds:
@@ -140,19 +106,18 @@ def _as_they_come(start: int, stop: int, size: int) -> slice:
     return slice(start, stop)
 
 
-def _build_robust_depth(steps: Mapping[str, Step]) -> Model:
-    def robust_depth(depth_m: Floats, u: float, v: float, half: int = 2, min_valid: int = 5) -> Any:
-        column, row = (steps["round"](c) for c in steps["read"](u, v))
-        alone = steps["shortcut"](depth_m, row, column)
-        if alone is not None:
-            return alone
-        pixels = steps["cut"](depth_m, *steps["window"](row, column, half))
-        valid = steps["finite"](steps["zeros"](pixels.ravel()))
-        if len(valid) == 0 or not steps["enough"](valid, pixels, min_valid):
-            return steps["none"]()
-        return steps["middle"](valid)
-
-    return robust_depth
+def _robust_depth(
+    steps: Steps, depth_m: Floats, u: float, v: float, half: int = 2, min_valid: int = 5
+) -> Any:
+    column, row = (steps["round"](c) for c in steps["read"](u, v))
+    alone = steps["shortcut"](depth_m, row, column)
+    if alone is not None:
+        return alone
+    pixels = steps["cut"](depth_m, *steps["window"](row, column, half))
+    valid = steps["finite"](steps["zeros"](pixels.ravel()))
+    if len(valid) == 0 or not steps["enough"](valid, pixels, min_valid):
+        return steps["none"]()
+    return steps["middle"](valid)
 
 
 def _describe_robust_depth(args: tuple[Any, ...]) -> str:
@@ -177,9 +142,9 @@ def _describe_robust_depth(args: tuple[Any, ...]) -> str:
     return f"{text} ({inside})"
 
 
-ROBUST_DEPTH = Exercise(
-    name="depth_noise.robust_depth",
-    build=_build_robust_depth,
+ROBUST_DEPTH = Exercise.told(
+    "depth_noise.robust_depth",
+    build=_robust_depth,
     steps={
         "read": lambda u, v: (u, v),
         "round": round,
@@ -192,12 +157,9 @@ ROBUST_DEPTH = Exercise(
         "none": lambda: math.nan,
         "middle": lambda valid: float(np.median(valid)),
     },
-    cases=[(IMAGE, *pixel) for pixel in WINDOWS["near"]]
-    + [(7 * IMAGE, *pixel) for pixel in WINDOWS["far"]],
-    unit="m",
+    cases=[(7 * IMAGE, 10, 8)],  # far away
     describe=_describe_robust_depth,
     show=lambda depth: "NaN" if np.isnan(depth) else f"{float(depth):.5f}",
-    nan_answers=True,
 )
 
 
@@ -245,11 +207,8 @@ ROBUST_DEPTH.add_mistakes(
     ("window", "last_missing", lambda *at: np.subtract(_window(*at), (0, 1, 0, 1))),
     ("window", "half_ignored", lambda row, column, half: _window(row, column, 2)),
     ("window", "half_halved", lambda row, column, half: _window(row, column, half // 2)),
-    ("shortcut", "pixel_alone", _pixel_alone),
-    ("shortcut", "pixel_alone", _pixel_alone_if_valid),
-    ("shortcut", "pixel_alone", _pixel_alone_if_positive),
-    ("cut", "negative_index", _cut(_as_they_come)),
-    ("cut", "negative_index", _cut(_as_they_come, _inside)),
+    ("shortcut", "pixel_alone", _pixel_alone, _pixel_alone_if_valid, _pixel_alone_if_positive),
+    ("cut", "negative_index", _cut(_as_they_come), _cut(_as_they_come, _inside)),
     ("cut", "negative_index", _cut(_inside, _as_they_come)),
     ("cut", "negative_index", _cut(lambda a, b, size: np.arange(a, min(b, size)))),
     ("cut", "negative_end", _cut(lambda a, b, size: slice(max(a, 0), b))),
@@ -263,8 +222,7 @@ ROBUST_DEPTH.add_mistakes(
     ("cut", "height_width_swapped", _height_width_swapped),
     ("cut", "border_refused", _cut(lambda a, b, size: slice(a, b if a >= 0 and b <= size else a))),
     ("zeros", "zeros_counted", lambda pixels: pixels),
-    ("finite", "nan_counted", lambda pixels: pixels),
-    ("finite", "nan_counted", lambda pixels: pixels[~np.isinf(pixels)]),
+    ("finite", "nan_counted", lambda pixels: pixels, lambda pixels: pixels[~np.isinf(pixels)]),
     ("finite", "infinity_counted", lambda pixels: pixels[~np.isnan(pixels)]),
     ("enough", "min_valid_ignored", lambda valid, pixels, min_valid: True),
     ("enough", "min_valid_fixed", lambda valid, pixels, min_valid: len(valid) >= 5),
@@ -311,16 +269,13 @@ def _steady(z: Floats) -> Floats:
     return z[:, np.isfinite(z).all(axis=0)][..., None]
 
 
-def _build_table_row(steps: Mapping[str, Step]) -> Model:
-    def table_row(counts: Any, scale: float, distance: float) -> Any:
-        step_mm = 1e3 * scale
-        z = steps["depth"](counts, step_mm)
-        for_bias, for_std = steps["keep"](z)
-        bias = steps["bias"](steps["level"](for_bias), 1e3 * distance)
-        std = steps["report"](steps["std"](for_std), len(z))
-        return np.array([*steps["unit"]((bias, std), step_mm), steps["invalid"](counts)])
-
-    return table_row
+def _table_row(steps: Steps, counts: Any, scale: float, distance: float) -> Any:
+    step_mm = 1e3 * scale
+    z = steps["depth"](counts, step_mm)
+    for_bias, for_std = steps["keep"](z)
+    bias = steps["bias"](steps["level"](for_bias), 1e3 * distance)
+    std = steps["report"](steps["std"](for_std), len(z))
+    return np.array([*steps["unit"]((bias, std), step_mm), steps["invalid"](counts)])
 
 
 def _table_case(shape: tuple[int, int, int], scale: float, distance: float, seed: int) -> Any:
@@ -360,9 +315,9 @@ def _row_by_sums(counts: Any, scale: float, distance: float) -> Any:
     return np.nanmean(error), np.sqrt(np.mean(variance)), np.sum(counts == 0) / counts.size
 
 
-TABLE_ROW = Exercise(
-    name="depth_noise.table_row",
-    build=_build_table_row,
+TABLE_ROW = Exercise.told(
+    "depth_noise.table_row",
+    build=_table_row,
     steps={
         "depth": lambda counts, step: np.where(counts > 0, step * counts, np.nan),
         "keep": lambda z: (z, z),
@@ -380,14 +335,8 @@ TABLE_ROW = Exercise(
         _table_case((10, 5, 4), 0.00025, 0.3, 5),
         _table_case((16, 4, 5), 0.0001, 0.6, 7),
     ],
-    parts=("the bias", "the std", "the invalid part"),
-    unit="(mm, mm, 1)",
-    tolerance=1e-4,
     describe=_describe_table_row,
-    show=lambda row: f"({', '.join(f'{v:.5g}' for v in np.ravel(row))})",
-    nan_answers=True,
     styles=[_row_by_lines, _row_by_sums],
-    way="mismatches kept",
     ways=[  # how the means and variances of pixels with holes are weighted is free
         (f"mismatches {way}{mean}{mix}", {"keep": keep, "level": level, "std": std})
         for way, keep in (("kept", lambda z: (z, z)), ("left out", lambda z: (_left_out(z),) * 2))
@@ -397,25 +346,17 @@ TABLE_ROW = Exercise(
 )
 
 
-def _mismatches_invalid(row: Model) -> Model:
-    def part(c: Floats) -> Any:
-        return np.isnan(_left_out(np.where(c, c, np.nan))).mean()
-
-    return lambda c, *at: np.r_[row(c, *at)[:2], part(c)]
+def _instead(at: int, part: Step) -> Step:
+    """Another way to one part of the whole result."""
+    return lambda right: lambda *args: np.r_[right(*args)[:at], part(*args), right(*args)[at + 1 :]]
 
 
-def _wraps_round(row: Model) -> Model:
-    def bias(c: Any, scale: float, distance: float) -> Any:
-        return 1e3 * scale * np.mean(c[c > 0] - np.uint16(distance / scale))
-
-    return lambda *args: np.r_[bias(*args), row(*args)[1:]]
+def _bias_wrapped(c: Any, scale: float, distance: float) -> Any:
+    return 1e3 * scale * np.mean(c[c > 0] - np.uint16(distance / scale))
 
 
-def _about_the_distance(row: Model) -> Model:
-    def std(c: Any, scale: float, distance: float) -> Any:
-        return 1e3 * np.sqrt(np.nanmean((np.where(c > 0, scale * c, np.nan) - distance) ** 2))
-
-    return lambda *args: np.array([row(*args)[0], std(*args), row(*args)[2]])
+def _about_the_distance(c: Any, scale: float, distance: float) -> Any:
+    return 1e3 * np.sqrt(np.nanmean((np.where(c > 0, scale * c, np.nan) - distance) ** 2))
 
 
 # Tried two at a time are only these steps': with eight ways to be right, all would take too long.
@@ -443,22 +384,16 @@ TABLE_ROW.add_mistakes(
     ("std", "over_space", lambda z: np.nanmean(np.nanstd(z, axis=(1, 2)))),
     ("std", "over_space", lambda z: np.nanstd(np.nanmean(z, axis=0))),
     ("std", "over_space", lambda z: np.nanstd(np.nanmean(z, axis=0), ddof=1)),
-    ("std", "over_everything", np.nanstd),
-    ("std", "over_everything", lambda z: np.nanstd(z, ddof=1)),
+    ("std", "over_everything", np.nanstd, lambda z: np.nanstd(z, ddof=1)),
     ("bias", "distance_in_metres", lambda level, distance: level - distance / 1e3),
-    ("", "about_the_distance", _about_the_distance),
-    ("keep", "mixed_treatment", lambda z: (_left_out(z), z)),
-    ("keep", "mixed_treatment", lambda z: (z, _left_out(z))),
+    ("", "about_the_distance", _instead(1, _about_the_distance)),
+    ("keep", "mixed_treatment", lambda z: (_left_out(z), z), lambda z: (z, _left_out(z))),
     ("keep", "median_of_all", lambda z: (_left_out(z, None),) * 2),
     ("keep", "steady_only", lambda z: (_steady(z),) * 2),
     ("std", "steady_only", lambda z: _pooled(_steady(z))),
-    ("", "mismatches_invalid", _mismatches_invalid),
-    ("", "wraps_round", _wraps_round),
-    (
-        "depth",
-        "wraps_round",
-        lambda c, step: np.where(c, c * np.uint16(1000) * (step / 1e3), np.nan),
-    ),
+    ("invalid", "mismatches_invalid", lambda c: np.isnan(_left_out(np.where(c, c, np.nan))).mean()),
+    ("", "wraps_round", _instead(0, _bias_wrapped)),
+    ("depth", "wraps_round", lambda c, mm: np.where(c, c * np.uint16(1000) * (mm / 1e3), np.nan)),
     ("std", "over_space", lambda z: np.sqrt(np.nanmean(np.nanvar(z, axis=1, ddof=1)))),
     ("std", "over_space", lambda z: np.sqrt(np.nanmean(np.nanvar(z, axis=2, ddof=1)))),
     ("std", "median_deviation", lambda z: 1.4826 * np.nanmedian(abs(z - np.nanmedian(z, axis=0)))),
@@ -475,18 +410,15 @@ TABLE_ROW.add_mistakes(
 # --- standard_errors ---
 
 
-def _build_standard_errors(steps: Mapping[str, Step]) -> Model:
-    def standard_errors(z: Floats) -> Any:
-        spread, root, sides = steps["spread"], steps["root"], steps["sides"]()
-        areas = [steps["area"](*z[0].shape, side) for side in sides]
-        patches, frames = steps["patches"](areas[0], sides[0]), steps["frames"](len(z))
-        for_stays, for_moves = steps["numbers"](patches, frames)
-        stays = spread(np.nanmean(z, axis=0)) / root(for_stays)
-        moves = spread(steps["levels"](z)) / root(for_moves)
-        nu = steps["squares"](steps["count"](z), areas[1], sides[1])
-        return np.array([steps["sum"](stays, moves), steps["pooled"](z) / math.sqrt(nu)])
-
-    return standard_errors
+def _standard_errors(steps: Steps, z: Floats) -> Any:
+    spread, root, sides = steps["spread"], steps["root"], steps["sides"]()
+    areas = [steps["area"](*z[0].shape, side) for side in sides]
+    patches, frames = steps["patches"](areas[0], sides[0]), steps["frames"](len(z))
+    for_stays, for_moves = steps["numbers"](patches, frames)
+    stays = spread(np.nanmean(z, axis=0)) / root(for_stays)
+    moves = spread(steps["levels"](z)) / root(for_moves)
+    nu = steps["squares"](steps["count"](z), areas[1], sides[1])
+    return np.array([steps["sum"](stays, moves), steps["pooled"](z) / math.sqrt(nu)])
 
 
 def _freedom(z: Floats) -> Any:
@@ -528,9 +460,9 @@ def _errors_by_stds(z: Floats) -> Any:
     return np.sqrt(stays**2 + moves**2), std / np.sqrt(2 * nu)
 
 
-STANDARD_ERRORS = Exercise(
-    name="depth_noise.standard_errors",
-    build=_build_standard_errors,
+STANDARD_ERRORS = Exercise.told(
+    "depth_noise.standard_errors",
+    build=_standard_errors,
     steps={
         "levels": lambda z: np.nanmean(z, axis=(1, 2)),
         "spread": lambda means: np.nanstd(means, ddof=1),
@@ -546,14 +478,8 @@ STANDARD_ERRORS = Exercise(
         "sum": math.hypot,
     },
     cases=[_errors_case((5 + 3 * i, 12 + 8 * i, 12 + 9 * i), i) for i in range(3)],
-    parts=("the bias's ±", "the std's ±"),
-    unit="mm",
-    tolerance=1e-5,
     describe=lambda args: f"z of shape {args[0].shape}, {np.sum(np.isnan(args[0]))} of it NaN",
-    show=TABLE_ROW.show,
-    nan_answers=True,
     styles=[_errors_by_variances, _errors_by_stds],
-    way="n = frames, holes or not",
     ways=[
         ("n = each pixel's valid samples" + mix, {"count": _freedom, "pooled": std})
         for mix, std in (("", _pooled), _BY_SAMPLES)
@@ -572,7 +498,7 @@ def _samples_independent(z: Floats) -> Floats:
 
 def _of_every_frame(spread: Step) -> Step:
     """The bias's ± as if each frame had patches of its own, which scatter by so much."""
-    return lambda errors: lambda z: np.array([12 * spread(z) / math.sqrt(z.size), errors(z)[1]])
+    return _instead(0, lambda z: 12 * spread(z) / math.sqrt(z.size))
 
 
 STANDARD_ERRORS.add_mistakes(
@@ -607,8 +533,7 @@ STANDARD_ERRORS.add_mistakes(
     ("pooled", "divided_by_n", lambda z: np.sqrt(np.nanmean(_variances(z, 0)))),
     ("pooled", "variance_pooled", lambda z: np.nanmean(_variances(z))),
     ("pooled", "stds_averaged", lambda z: np.nanmean(np.sqrt(_variances(z)))),
-    ("pooled", "over_everything", np.nanstd),
-    ("pooled", "over_everything", lambda z: np.nanstd(z, ddof=1)),
+    ("pooled", "over_everything", np.nanstd, lambda z: np.nanstd(z, ddof=1)),
     ("pooled", "nan_spreads", lambda z: np.sqrt(np.mean(np.var(z, axis=0, ddof=1)))),
     ("", "nan_spreads", lambda f: lambda z: f(z) * np.where(np.isnan(z).any(), np.nan, 1)),
 )

@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from coursekit.arrays import Floats
-from coursekit.lessons.exercises import Exercise, Model, Step
+from coursekit.lessons.exercises import Exercise, Step, Steps
 
 # --- sensitivities ---
 
 
-def _build(steps: Mapping[str, Step]) -> Model:
-    def sensitivities(u: float, Z: float, fx: float, cx: float, depth_error: float) -> Floats:
-        dX_du, dX_dZ = steps["pixel"](u, Z, fx, cx), steps["depth"](u, Z, fx, cx)
-        return steps["order"](dX_du, dX_dZ, steps["leak"](dX_du, dX_dZ, depth_error, Z))
-
-    return sensitivities
+def _sensitivities(
+    steps: Steps, u: float, Z: float, fx: float, cx: float, depth_error: float
+) -> Floats:
+    dX_du, dX_dZ = steps["pixel"](u, Z, fx, cx), steps["depth"](u, Z, fx, cx)
+    return steps["order"](dX_du, dX_dZ, steps["leak"](dX_du, dX_dZ, depth_error, Z))
 
 
 def _prices(u: float, Z: float, fx: float, cx: float, depth_error: float) -> Any:
@@ -37,38 +35,24 @@ def _prices_by_differences(u: float, Z: float, fx: float, cx: float, depth_error
     return dX_du, dX_dZ, (u - cx) * (Z + depth_error) / fx - X
 
 
-SENSITIVITIES = Exercise(
-    name="error_budget.sensitivities",
-    build=_build,
+SENSITIVITIES = Exercise.told(
+    "error_budget.sensitivities",
+    build=_sensitivities,
     steps={
         "pixel": lambda u, Z, fx, cx: Z / fx,
         "depth": lambda u, Z, fx, cx: (u - cx) / fx,
         "leak": lambda dX_du, dX_dZ, depth_error, Z: dX_dZ * depth_error,
         "order": lambda dX_du, dX_dZ, leak: np.array([dX_du, dX_dZ, leak]),
     },
-    cases=[
-        (524.0, 0.5, 500.0, 424.0, 0.004),
-        (847.0, 0.45, 447.0, 424.0, 0.005),
-        (20.0, 0.30, 612.0, 322.0, 0.003),
-        (700.0, 3.70, 390.4, 331.4, -0.006),
-    ],
-    parts=("dX/du", "dX/dZ", "the leak"),
-    unit="m/px, 1 and m",
-    tolerance=1e-9,
     describe=lambda args: (
         "u = {:g} px, Z = {:g} m, fx = {:g} px, cx = {:g} px, depth error {:g} m".format(*args)
     ),
-    show=lambda row: "(" + ", ".join(f"{v:.6g}" for v in np.ravel(row)) + ")",
     styles=[_prices, _prices_by_differences],
 )
 
 
 SENSITIVITIES.add_mistakes(
-    (
-        "leak",
-        "whole_shift",
-        lambda dX_du, dX_dZ, depth_error, Z: depth_error * math.hypot(1, dX_dZ),
-    ),
+    ("leak", "whole_shift", lambda dX_du, dX_dZ, off, Z: off * math.hypot(1, dX_dZ)),
     ("pixel", "distance_forgotten", lambda u, Z, fx, cx: 1 / fx),
     ("pixel", "not_differentiated", lambda u, Z, fx, cx: (u - cx) * Z / fx),
     ("depth", "not_differentiated", lambda u, Z, fx, cx: (u - cx) * Z / fx),
@@ -89,26 +73,20 @@ SENSITIVITIES.add_mistakes(
 Rows = list[tuple[float, float, Any, str]]
 
 
-def _build_sums(steps: Mapping[str, Step]) -> Model:
-    def add_up(rows: Rows, tolerance: float) -> Floats:
-        noise, bias = steps["kinds"](rows)
-        along = steps["along"]
-        noises = [high * steps["noise part"](toward, along) for _, high, toward, _ in noise]
-        most = [steps["most"](low, high, toward) * along(toward) for low, high, toward, _ in bias]
-        squares, others = (
-            [
-                steps["square"](low, high) * steps["part"](toward, along)
-                for low, high, toward, _ in of
-            ]
-            for of in (bias, noise)
-        )
-        variance = steps["rigs"](squares, noises, others)
-        summed = steps["summed"](most, noises)
-        sums = steps["noise"](noises), steps["worst"](summed), steps["quadrature"](summed)
-        sigma = steps["sigma"](variance, most)
-        return steps["order"](*sums, steps["share"](tolerance / sigma if sigma else math.inf))
-
-    return add_up
+def _add_up(steps: Steps, rows: Rows, tolerance: float) -> Floats:
+    noise, bias = steps["kinds"](rows)
+    along = steps["along"]
+    noises = [high * steps["noise part"](toward, along) for _, high, toward, _ in noise]
+    most = [steps["most"](low, high, toward) * along(toward) for low, high, toward, _ in bias]
+    squares, others = (
+        [steps["square"](low, high) * steps["part"](toward, along) for low, high, toward, _ in of]
+        for of in (bias, noise)
+    )
+    variance = steps["rigs"](squares, noises, others)
+    summed = steps["summed"](most, noises)
+    sums = steps["noise"](noises), steps["worst"](summed), steps["quadrature"](summed)
+    sigma = steps["sigma"](variance, most)
+    return steps["order"](*sums, steps["share"](tolerance / sigma if sigma else math.inf))
 
 
 def _sorted(rows: Rows) -> tuple[Rows, Rows]:
@@ -118,6 +96,10 @@ def _sorted(rows: Rows) -> tuple[Rows, Rows]:
 
 def _along(toward: Any) -> float:
     return 1.0 if toward is None else abs(toward[0])
+
+
+def _third_along(toward: Any) -> float:
+    return 3**-0.5 if toward is None else _along(toward)
 
 
 def _part(toward: Any, along: Step, third: float = 1 / 3) -> float:
@@ -163,9 +145,9 @@ def _sums_by_rows(rows: Rows, tolerance: float) -> Any:
     return np.sqrt(noise), worst, np.sqrt(quadrature), share
 
 
-ADD_UP = Exercise(
-    name="error_budget.add_up",
-    build=_build_sums,
+ADD_UP = Exercise.told(
+    "error_budget.add_up",
+    build=_add_up,
     steps={
         "kinds": _sorted,
         "along": _along,
@@ -191,11 +173,8 @@ ADD_UP = Exercise(
         ([(2.0, 4.0, None, "bias"), (0.8, 0.8, _tilted(30), "noise"),
           (0.5, 5.0, (0.6, 0.0, -0.8), "bias"), (0.4, 0.4, None, "noise")], 0.8),
     ],
-    parts=("the noise", "the worst case", "the quadrature", "the share"),
-    unit="(mm, mm, mm and a share)",
     describe=lambda args: "; ".join(_row_in_words(row) for row in args[0])
     + f"; tolerance {args[1]:g} mm",
-    show=lambda row: "(" + ", ".join(f"{v:.4g}" for v in np.ravel(row)) + ")",
     styles=[_sums_by_rows],
 )  # fmt: skip
 
@@ -208,8 +187,7 @@ def _row_in_words(row: tuple[float, float, Any, str]) -> str:
 
 ADD_UP.add_mistakes(
     ("kinds", "kinds_exchanged", lambda rows: _sorted(rows)[::-1]),
-    ("kinds", "noise_in_the_bias", lambda rows: (_sorted(rows)[0], rows)),
-    ("kinds", "noise_in_the_bias", lambda rows: ([], rows)),
+    ("kinds", "noise_in_the_bias", lambda rows: (_sorted(rows)[0], rows), lambda rows: ([], rows)),
     ("kinds", "kind_ignored", lambda rows: (rows, rows)),
     ("", "first_row_only", lambda sums: lambda rows, tolerance: sums(rows[:1], tolerance)),
     ("noise part", "noise_shared_out", lambda way, along: along(way) if way else 3**-0.5),
@@ -219,12 +197,8 @@ ADD_UP.add_mistakes(
     ("along", "direction_sign", lambda toward: 1.0 if toward is None else toward[0]),
     ("along", "other_axis", lambda toward: 1.0 if toward is None else abs(toward[1])),
     ("along", "any_way_nothing", lambda toward: 0.0 if toward is None else abs(toward[0])),
-    (
-        "most",
-        "third_of_the_worst",
-        lambda low, high, toward: high * (3**-0.5 if toward is None else abs(toward[0])),
-    ),
-    ("along", "third_of_the_worst", lambda toward: 3**-0.5 if toward is None else abs(toward[0])),
+    ("most", "third_of_the_worst", lambda low, high, toward: high * _third_along(toward)),
+    ("along", "third_of_the_worst", _third_along),
     ("most", "least_for_most", lambda low, high, toward: low),
     ("most", "middle_for_most", lambda low, high, toward: (low + high) / 2),
     ("noise", "noise_added", sum),
@@ -245,12 +219,8 @@ ADD_UP.add_mistakes(
     ("part", "half_for_third", lambda toward, along: _part(toward, along, 0.5)),
     ("part", "third_for_all", lambda toward, along: 1 / 3),
     ("part", "not_squared", lambda toward, along: 1 / 3 if toward is None else along(toward)),
-    (
-        "rigs",
-        "noise_in_the_share",
-        lambda squares, noises, others: sum(squares) + _root(noises) ** 2,
-    ),
-    ("rigs", "noise_in_the_share", lambda squares, noises, others: sum(squares) + sum(others)),
+    ("rigs", "noise_in_the_share", lambda squares, noise, _: sum(squares) + _root(noise) ** 2),
+    ("rigs", "noise_in_the_share", lambda squares, noise, others: sum(squares) + sum(others)),
     ("sigma", "variance_for_sigma", lambda variance, most: variance),
     ("sigma", "quadrature_for_sigma", lambda variance, most: _root(most)),
     ("sigma", "quadrature_over_root_3", lambda variance, most: _root(most) / 3**0.5),

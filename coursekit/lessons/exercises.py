@@ -38,6 +38,7 @@ from coursekit.lessons import questions
 from coursekit.lessons.questions import Verdict
 
 Step = Callable[..., Any]
+Steps = Mapping[str, Step]
 Model = Callable[..., Any]
 
 
@@ -64,20 +65,21 @@ class Mistake:
 class Core:
     """The part of an exercise that comes first, where the rest may wait.
 
-    of(args) is a case without the rest; the cases that it leaves as they are belong to the core.
-    The verdict calls them "the cases <which>", and what may wait `rest`.
+    It uses the first so many `arguments`; the cases that have no more belong to it, and as many
+    are `beyond` it. The verdict calls them "the cases <which>", and what may wait `rest`.
     """
 
-    of: Callable[[tuple[Any, ...]], tuple[Any, ...]]
+    arguments: int
     which: str
     rest: str
+    beyond: int = 0
 
 
 @dataclass(kw_only=True)
 class Exercise:
     """A function the learner writes, and all that is known about getting it wrong.
 
-    build(steps) returns the model that uses these steps. Cases go from small to large, and the
+    build(steps, *args) is the model that uses these steps. Cases go from small to large, and the
     first one that fails is shown: `describe(args)` and `show(row)` put it into words. Where a
     result has rows and the first `per_row` arguments have the same, one row of them is shown;
     otherwise (a result that is one number, say) the whole case. parts: what the columns of a
@@ -92,13 +94,13 @@ class Exercise:
     """
 
     name: str
-    build: Callable[[Mapping[str, Step]], Model]
+    build: Model
     steps: dict[str, Step]
     cases: list[tuple[Any, ...]]
     unit: str
     describe: Callable[[tuple[Any, ...]], str]
     show: Callable[[Floats], str]
-    parts: tuple[str, ...] = ()
+    parts: Sequence[str] = ()
     seen: str = ""
     per_row: int = 0
     tolerance: float = 1e-6
@@ -108,36 +110,54 @@ class Exercise:
     core: Core | None = None
     styles: list[Model] = field(default_factory=list)
     mistakes: list[Mistake] = field(default_factory=list)
-    part_of: Exercise | None = field(default=None, repr=False)
+    part_of: Core | None = None
+    another_way: bool = False
     _known: dict[tuple[int, ...], Floats | None] = field(
         default_factory=dict, init=False, repr=False
     )
-    _edits: list[list[Mistake]] = field(default_factory=list, init=False, repr=False)
-    _alone: list[Exercise] = field(default_factory=list, init=False, repr=False)  # the core
+
+    @classmethod
+    def told(cls, name: str, cases: Sequence[tuple[Any, ...]] = (), **own: Any) -> Exercise:
+        """An exercise of which the lesson's TOML file tells the rest; `cases` follow those there.
+
+        A list there is an array, and a name in a case is what stands under it in [given].
+        """
+        texts = questions.lesson_texts(name.partition(".")[0])
+        facts = dict(texts["exercises"][name.partition(".")[2]])
+
+        def argument(value: Any) -> Any:
+            value = texts["given"][value] if isinstance(value, str) else value
+            return np.array(value) if isinstance(value, list) else value
+
+        written = [tuple(map(argument, case)) for case in facts.pop("cases", ())]
+        if "core" in facts:
+            facts["core"] = Core(**facts["core"])
+        if "show" in facts:
+            facts["show"] = partial(in_digits, facts["show"])
+        return cls(name=name, cases=[*written, *cases], **facts, **own)
 
     @property
     def function(self) -> str:
         """The learner's function's name."""
         return self.name.rpartition(".")[2]
 
-    def add_mistakes(self, *wrong: tuple[str, str, Step], alone: bool = False) -> None:
+    def add_mistakes(self, *wrong: tuple[str, str, *tuple[Step, ...]], alone: bool = False) -> None:
         """Add wrong steps: the step, the misconception's name, and what is done in its place.
 
-        One name may come several times: other ways to write the same misconception. What the
-        student reads stands under it in the lesson's TOML file: what is wrong, and a question that
-        leads on. Without a step, the wrong one is made of the whole function, and stands alone.
+        Other ways to write the same misconception follow, there or under its name once more. What
+        the student reads stands under it in the lesson's TOML file: what is wrong, and a question
+        that leads on. Without a step, the wrong one is made of the whole function, and stands
+        alone.
         """
-        texts = self._written("mistakes")
-        for step, name, instead in wrong:
+        texts = questions.lesson_texts(self.name.partition(".")[0])["mistakes"]
+        for step, name, *ways in wrong:
             says, ask = (" ".join(text.split()) for text in texts[name])
-            self.mistakes.append(Mistake(name, says, ask, step, instead, alone or not step))
-
-    def _written(self, table: str) -> dict[str, Any]:
-        return dict(questions.lesson_texts(self.name.partition(".")[0])[table])
+            for way in ways:
+                self.mistakes.append(Mistake(name, says, ask, step, way, alone or not step))
 
     def model(self, *mistakes: Mistake) -> Model:
         """The right function with these mistakes built in."""
-        model = self.build(self.steps | {m.step: m.wrong for m in mistakes if m.step})
+        model = partial(self.build, self.steps | {m.step: m.wrong for m in mistakes if m.step})
         for mistake in mistakes:
             model = model if mistake.step else mistake.wrong(model)
         return model
@@ -162,17 +182,15 @@ class Exercise:
 
         The device edits their results only.
         """
-        others = [replace(self, way=w, steps=self.steps | own, ways=[]) for w, own in self.ways]
-        for other in others:
-            other._edits.extend(([], _result_edits(other), []))
-        return others
+        also = partial(replace, self, ways=[], another_way=True)
+        return [also(way=way, steps=self.steps | own) for way, own in self.ways]
 
     def _verdict(self, function: Callable[..., Any]) -> Verdict:
         if not callable(function):
             return self._say("not attempted", f"got a {type(function).__name__}, not a function.")
         runs = [_run(function, args) for args in self.cases]
         if self.core and self._leaves_the_rest(self.core, function, runs):
-            return self._core_alone()._verdict(function)
+            return self._core_alone._verdict(function)
         unfinished = self._unfinished(function, runs)
         if unfinished:
             return unfinished
@@ -184,14 +202,14 @@ class Exercise:
             return self._one(RANDOM, "", self._given(self.cases[0]))
         return self._compare(runs, expected, known | _names_in(getattr(function, "__code__", None)))
 
+    @cached_property
     def _core_alone(self) -> Exercise:
-        if not self._alone:
-            cases = [args for args in self.cases if self.is_core(args)]
-            self._alone.append(replace(self, cases=cases, core=None, part_of=self))
-        return self._alone[0]
+        cases = [args for args in self.cases if self.is_core(args)]
+        core = self.core and replace(self.core, beyond=len(self.cases) - len(cases))
+        return replace(self, cases=cases, core=None, part_of=core)
 
     def is_core(self, args: tuple[Any, ...]) -> bool:
-        return self.core is None or len(self.core.of(args)) == len(args)
+        return self.core is None or len(args) <= self.core.arguments
 
     def _leaves_the_rest(self, core: Core, function: Callable[..., Any], runs: list[Run]) -> bool:
         """Whether every case beyond the core gets nothing, or what it gets without the rest."""
@@ -202,7 +220,7 @@ class Exercise:
                 return False
             if run.value is not None:
                 value = _as_numbers(run.value)
-                bare = _as_numbers(_run(function, core.of(args)).value)
+                bare = _as_numbers(_run(function, args[: core.arguments]).value)
                 if value is None or bare is None or not np.array_equal(value, bare, equal_nan=True):
                     return False
         return True
@@ -251,10 +269,10 @@ class Exercise:
             right = f"The numbers are right.{self._later}"
             return self._one(formal[0], right) if len(formal) == 1 else self._several(formal[0])
         count = len(self.cases)
-        if self.part_of and self.part_of.core:
-            core, others = self.part_of.core, len(self.part_of.cases) - count
+        if core := self.part_of:
             text = f"the core is right: all {count} cases {core.which} agree."
-            return self._say("core right", f"{text} Deeper: the other {others} use {core.rest}.")
+            deeper = f"Deeper: the other {core.beyond} use {core.rest}."
+            return self._say("core right", f"{text} {deeper}")
         way = f", {self.way}" if self.way else ""
         within = f"{self.tolerance:g} {self.unit} or a millionth of their size"
         text = f"right{way}. All {count} cases agree to {within}."
@@ -270,7 +288,9 @@ class Exercise:
         agree = [self._agrees(v, e) for v, e in zip(values, expected, strict=True)]
         if all(agree):
             return self._right(formal)
-        count = f"{sum(agree)} of {self._all_cases} agree.{self._later}"
+        core = self.part_of
+        cases = f"the {len(agree)} cases {core.which}" if core else f"{len(agree)} cases"
+        count = f"{sum(agree)} of {cases} agree.{self._later}"
         relation = self._relation(values, expected)
         if relation == "runs_away":  # show one that does
             both = zip(agree, values, strict=True)
@@ -288,7 +308,7 @@ class Exercise:
         if self.core and not mistakes:  # what is wrong there may hide behind the rest
             of_core = [i for i, args in enumerate(self.cases) if self.is_core(args)]
             ours, wanted = ([of[i] for i in of_core] for of in (values, expected))
-            verdict = self._core_alone()._judged(ours, wanted, [], known)
+            verdict = self._core_alone._judged(ours, wanted, [], known)
             if verdict.named:
                 return verdict
         where = self._parts_off(values, expected)
@@ -403,18 +423,9 @@ class Exercise:
         return mistakes[0]
 
     @property
-    def _all_cases(self) -> str:
-        count = len(self.cases)
-        if self.part_of and self.part_of.core:
-            return f"the {count} cases {self.part_of.core.which}"
-        return f"{count} cases"
-
-    @property
     def _later(self) -> str:
         """Says in a verdict on the core what may wait."""
-        if self.part_of and self.part_of.core:
-            return f" ({self.part_of.core.rest} can wait.)"
-        return ""
+        return f" ({self.part_of.rest} can wait.)" if self.part_of else ""
 
     def _one(self, mistake: Mistake, count: str, *lines: str) -> Verdict:
         text = f"{mistake.says}{'.' * (mistake.says[-1] != '?')} {count}".strip()
@@ -444,9 +455,12 @@ class Exercise:
 
     def single_mistakes(self) -> list[Mistake]:
         """Those listed, the device's edits of the result, and those in one part of it."""
-        if not self._edits:
-            self._edits += _all_edits(self)
         return [*self.mistakes, *self._edits[0], *self._partial]
+
+    @cached_property
+    def _edits(self) -> tuple[list[Mistake], list[Mistake], list[Mistake]]:
+        """The device's: of the result, all else, and pairs within one step's source."""
+        return ([], _result_edits(self), []) if self.another_way else _all_edits(self)
 
     @cached_property
     def _partial(self) -> list[Mistake]:
@@ -544,6 +558,12 @@ class Exercise:
         return Verdict(self.name, kind, f"{self.function}: {text}", lines, named)
 
 
+def in_digits(form: str, values: Any) -> str:
+    """Numbers by a format, such as ".3f", or "(.3f)" with brackets around them."""
+    digits = form.strip("()")
+    return form.replace(digits, ", ".join(f"{v:{digits}}" for v in np.ravel(values)))
+
+
 def _has_hole(args: tuple[Any, ...]) -> bool:
     return any(a.dtype.kind == "f" and np.isnan(a).any() for a in args if isinstance(a, np.ndarray))
 
@@ -598,11 +618,8 @@ def _names_in(code: Any) -> set[str]:
 def _in_words(mistake: Mistake, known: set[str]) -> Mistake:
     """The device's words without names that the learner has not seen, and without many."""
     names = set(re.findall(r"`(\w+)`", mistake.says))
-    if (
-        not mistake.device
-        or FOUND["line"] in mistake.says
-        or (len(names) <= MOST_NAMES and known.issuperset(names))
-    ):
+    seen = len(names) <= MOST_NAMES and known.issuperset(names)
+    if not mistake.device or FOUND["line"] in mistake.says or seen:
         return mistake
     return replace(mistake, says=_NAMED.sub(FOUND["unseen"], mistake.says))
 
@@ -669,16 +686,13 @@ def _all_edits(exercise: Exercise) -> tuple[list[Mistake], list[Mistake], list[M
         return seen[name][1]
 
     split = partial(_split, exercise)
-    result = split(exercise.build({name: partial(watched, name) for name in steps})(*args))
+    result = split(exercise.build({name: partial(watched, name) for name in steps}, *args))
     inputs = [f"`{name}`" for name in inspect.signature(exercise.model()).parameters]
-    rewritten = [(name, edit) for name, step in steps.items() for edit in _rewritten(step)]
-    found: list[tuple[str, str, str, Step]] = []
-    lines = [
-        (kind, where, "", lambda _, new=new: new)
-        for style in exercise.styles
-        for n, kind, where, new in _rewritten(style, whole=True)
-    ]
-    found += [(kind, where, name, new) for name, (n, kind, where, new) in rewritten if n == 1]
+    rewritten = [(name, *edit) for name, step in steps.items() for edit in _rewritten(step)]
+    found = [(kind, where, name, new) for name, n, kind, where, new in rewritten if n == 1]
+    double = [(kind, where, name, new) for name, n, kind, where, new in rewritten if n == 2]
+    whole = [edit for style in exercise.styles for edit in _rewritten(style, whole=True)]
+    lines = [(kind, where, "", lambda _, new=new: new) for _, kind, where, new in whole]
     for kind, where, edit in _edits_of(args, _listed(inputs), inputs):
         found.append((kind, where, "", lambda f, e=edit: lambda *a: f(*e(a))))
     for kind, where, by in _factors(args, inputs, result):
@@ -689,29 +703,15 @@ def _all_edits(exercise: Exercise) -> tuple[list[Mistake], list[Mistake], list[M
             found.append((kind, where, name, lambda *a, e=edit, f=step: f(*e(a))))
         for kind, where, edit in _edits_of(given, f"what is made of {_listed(own)}", deep=False):
             found.append((kind, where, name, lambda *a, e=edit, f=step: e(f(*a))))
-    pairs = [
-        _device(kind, where, name, new, FOUND["more"])
-        for name, (n, kind, where, new) in rewritten
-        if n == 2
-    ]
-    edits = [_device(*edit) for edit in (*found, *sorted(lines, key=_is_wrapped))]
-    return _result_edits(exercise), edits, pairs
-
-
-def _is_wrapped(edit: tuple[str, str, str, Step]) -> bool:
-    return edit[0] in FOUND["wrapped"]
+    lines.sort(key=lambda edit: edit[0] in FOUND["wrapped"])
+    pairs = [_device(*edit, before=FOUND["more"]) for edit in double]
+    return _result_edits(exercise), [_device(*edit) for edit in (*found, *lines)], pairs
 
 
 def _device(kind: str, where: str, step: str, wrong: Step, before: str = "") -> Mistake:
     says, ask = (" ".join(text.split()) for text in FOUND["kinds"][kind])
-    return Mistake(
-        kind,
-        before + says.replace("WHERE", where or FOUND["unseen"]),
-        ask,
-        step,
-        wrong,
-        device=True,
-    )
+    says = before + says.replace("WHERE", where or FOUND["unseen"])
+    return Mistake(kind, says, ask, step, wrong, device=True)
 
 
 def _listed(names: Iterable[str]) -> str:
@@ -977,10 +977,9 @@ def _compiled(tree: Any, space: dict[str, Any]) -> Any:
     own: dict[str, Any] = {}
     if isinstance(tree, ast.Lambda):
         tree = ast.Assign([ast.Name("step", ast.Store())], tree)
+    module = ast.fix_missing_locations(ast.Module([tree], []))
     try:
-        exec(
-            compile(ast.fix_missing_locations(ast.Module([tree], [])), "<edit>", "exec"), space, own
-        )
+        exec(compile(module, "<edit>", "exec"), space, own)
     except SyntaxError:
         return None
     return next(iter(own.values()))

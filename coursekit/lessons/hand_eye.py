@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from coursekit.arrays import Floats
 from coursekit.geometry import make_transform
-from coursekit.lessons.exercises import Exercise, Model, Step
+from coursekit.lessons.exercises import Exercise, Step, Steps, in_digits
 
 Pair = tuple[Floats, Floats]
 
@@ -23,19 +23,13 @@ def _pose(rng: np.random.Generator, reach_m: float = 0.5) -> Floats:
 # --- motion_pair ---
 
 
-def _build_pair(steps: Mapping[str, Step]) -> Model:
-    def motion_pair(
-        gripper_i: Floats, gripper_j: Floats, board_i: Floats, board_j: Floats
-    ) -> Floats:
-        gripper_i, gripper_j, board_i, board_j = steps["read"](
-            gripper_i, gripper_j, board_i, board_j
-        )
-        invert = steps["inverse"]
-        A = steps["A"](*steps["A pair"](gripper_i, gripper_j), invert)
-        B = steps["B"](*steps["B pair"](board_i, board_j), invert)
-        return steps["order"](A, B)
-
-    return motion_pair
+def _motion_pair(
+    steps: Steps, gripper_i: Floats, gripper_j: Floats, board_i: Floats, board_j: Floats
+) -> Floats:
+    i, j, seen_i, seen_j = steps["read"](gripper_i, gripper_j, board_i, board_j)
+    A = steps["A"](*steps["A pair"](i, j), steps["inverse"])
+    B = steps["B"](*steps["B pair"](seen_i, seen_j), steps["inverse"])
+    return steps["order"](A, B)
 
 
 def _session_pair(seed: int, plain: bool = False) -> tuple[Floats, ...]:
@@ -60,10 +54,6 @@ def _describe_pair(args: tuple[Floats, ...]) -> str:
     return text.format(*places) + end
 
 
-def _vector(T: Floats) -> str:
-    return "(" + ", ".join(f"{v:.3f}" for v in T[:3, 3]) + ")"
-
-
 def _pair_by_halves(gripper_i: Floats, gripper_j: Floats, board_i: Floats, board_j: Floats) -> Any:
     A, B = np.eye(4), np.eye(4)
     A[:3, :3] = gripper_j[:3, :3].T @ gripper_i[:3, :3]
@@ -73,9 +63,9 @@ def _pair_by_halves(gripper_i: Floats, gripper_j: Floats, board_i: Floats, board
     return A, B
 
 
-MOTION_PAIR = Exercise(
-    name="hand_eye.motion_pair",
-    build=_build_pair,
+MOTION_PAIR = Exercise.told(
+    "hand_eye.motion_pair",
+    build=_motion_pair,
     steps={
         "read": lambda *poses: poses,
         "inverse": np.linalg.inv,
@@ -86,10 +76,10 @@ MOTION_PAIR = Exercise(
         "order": lambda A, B: np.stack([A, B]),
     },
     cases=[_session_pair(0, plain=True), *(_session_pair(seed) for seed in range(1, 5))],
-    parts=("A", "B"),
-    unit="m",
     describe=_describe_pair,
-    show=lambda row: f"translations of A and B {_vector(row[0])} and {_vector(row[1])}",
+    show=lambda row: "translations of A and B {} and {}".format(
+        *(in_digits("(.3f)", T[:3, 3]) for T in row)
+    ),
     styles=[_pair_by_halves],
 )
 
@@ -111,12 +101,9 @@ for _step in ("A", "B"):
         (_step, "product_inverted", lambda i, j, inverse: inverse(j @ i)),
         (_step, "product_inverted", lambda i, j, inverse: inverse(i @ j)),
         (_step, "elementwise", lambda i, j, inverse: inverse(j) * i),
-        (_step, "elementwise", lambda i, j, inverse: j * inverse(i)),
-        (_step, "elementwise", lambda i, j, inverse: j * i),
-        (_step, "subtracted", lambda i, j, inverse: j - i),
-        (_step, "subtracted", lambda i, j, inverse: i - j),
-        (_step, "places_subtracted", _places_subtracted(_motion, 1)),
-        (_step, "places_subtracted", _places_subtracted(_motion, -1)),
+        (_step, "elementwise", lambda i, j, inverse: j * inverse(i), lambda i, j, _: j * i),
+        (_step, "subtracted", lambda i, j, inverse: j - i, lambda i, j, inverse: i - j),
+        (_step, "places_subtracted", *(_places_subtracted(_motion, sign) for sign in (1, -1))),
     )
 MOTION_PAIR.add_mistakes(
     ("read", "gripper_twice", lambda gi, gj, bi, bj: (gi, gj, gi, gj)),
@@ -148,11 +135,8 @@ def _turn(a: Floats, b: Floats) -> Floats:
     return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
 
 
-def _build_half(steps: Mapping[str, Step]) -> Model:
-    def rotation_half(R_A: Floats, R_B: Floats) -> Floats:
-        return steps["result"](steps["turn"](*steps["used"](*steps["axes"](R_A, R_B))))
-
-    return rotation_half
+def _rotation_half(steps: Steps, R_A: Floats, R_B: Floats) -> Floats:
+    return steps["result"](steps["turn"](*steps["used"](*steps["axes"](R_A, R_B))))
 
 
 def _motions(seed: int, n: int, parallel: bool = False) -> Pair:
@@ -194,9 +178,9 @@ def _half_by_null_space(R_A: Floats, R_B: Floats, row: int = -1) -> Any:
     return U @ Vt
 
 
-ROTATION_HALF = Exercise(
-    name="hand_eye.rotation_half",
-    build=_build_half,
+ROTATION_HALF = Exercise.told(
+    "hand_eye.rotation_half",
+    build=_rotation_half,
     steps={
         "axes": lambda *motions: [Rotation.from_matrix(R).as_rotvec() for R in motions],
         "used": lambda a, b: (a, b),
@@ -211,7 +195,6 @@ ROTATION_HALF = Exercise(
         _motions(3, 6),
         _motions(4, 20),
     ],
-    unit="(rotation matrix)",
     describe=lambda args: (
         "the arm turns by 60 degrees about x, then by 40 about y; X is a quarter turn about z"
         if np.array_equal(args[0], _quarter_turns()[0])
@@ -236,6 +219,10 @@ def _same_frame(A: Floats, B: Floats) -> Floats:
     return np.asarray((A @ np.swapaxes(B, 1, 2)).mean(axis=0))
 
 
+def _mean_turn(R: Floats) -> Floats:
+    return np.asarray(Rotation.from_matrix(R).mean().as_matrix())
+
+
 def _kabsch(product: Callable[[Floats, Floats, Floats], Floats]) -> Step:
     """Kabsch's method with another product of U, V^T and the matrix that makes it a rotation."""
 
@@ -251,8 +238,7 @@ def _kabsch(product: Callable[[Floats, Floats, Floats], Floats]) -> Step:
 ROTATION_HALF.add_mistakes(
     ("result", "inverse_of_x", lambda R: R.T),
     ("turn", "not_a_rotation", lambda a, b: np.linalg.lstsq(b, a, rcond=None)[0].T),
-    ("turn", "not_a_rotation", lambda a, b: a.T @ b),
-    ("turn", "not_a_rotation", lambda a, b: a.T @ b / len(a)),
+    ("turn", "not_a_rotation", lambda a, b: a.T @ b, lambda a, b: a.T @ b / len(a)),
     ("used", "first_motion_only", lambda a, b: (a[:1], b[:1])),
     ("result", "negative", lambda R: -R),
     ("used", "mean_taken_off", lambda a, b: (a - a.mean(axis=0), b - b.mean(axis=0))),
@@ -267,15 +253,11 @@ ROTATION_HALF.add_mistakes(
     ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: U.T @ D @ Vt)),
     ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: Vt @ U.T)),
     ("axes", "axis_without_sign", _no_signs),
-    *(("axes", "one_sign", _flipped(signs)) for signs in 1 - 2 * np.eye(3)),
+    ("axes", "one_sign", *map(_flipped, 1 - 2 * np.eye(3))),
     ("", "same_frame", lambda _: lambda A, B: A[0] @ B[0].T),
     ("", "largest_singular", lambda _: lambda A, B: _half_by_null_space(A, B, 0)),
     ("", "same_frame", lambda _: _same_frame),
     ("", "same_frame", lambda _: lambda *AB: Rotation.from_matrix(_same_frame(*AB)).as_matrix()),
     ("", "same_frame", lambda _: lambda A, B: _same_frame(*np.swapaxes([A, B], 2, 3))),
-    (
-        "",
-        "same_frame",
-        lambda _: lambda A, B: Rotation.from_matrix(np.swapaxes(A, 1, 2) @ B).mean().as_matrix(),
-    ),
+    ("", "same_frame", lambda _: lambda A, B: _mean_turn(np.swapaxes(A, 1, 2) @ B)),
 )

@@ -32,15 +32,8 @@ def technologies(fx: float, baseline_m: float, sigma_d_px: float) -> LessonFigur
             label="time of flight (Azure Kinect, upper limit)")  # fmt: skip
     ax.set(xlabel="distance Z (m)", ylabel="std of depth (mm)", ylim=(0, None))
     ax.legend()
-    return fig.saying(
-        f"Random depth error against distance: active stereo {_at(stereo, 1):.1f} mm at 1 m and "
-        f"{_at(stereo, 2):.1f} mm at 2 m, structured light {_at(light, 1):.1f} and "
-        f"{_at(light, 2):.1f} mm; time of flight stays under a constant limit of 17 mm."
-    )
-
-
-def _at(values: Floats, distance_m: float) -> float:
-    return float(np.interp(distance_m, RANGE_M, values))
+    at = [np.interp((1, 2), RANGE_M, values) for values in (stereo, light)]
+    return fig.saying("technologies", stereo=at[0], light=at[1])
 
 
 def two_eyes(fx: float, baseline_m: float, distance_m: float) -> LessonFigure:
@@ -69,10 +62,7 @@ def two_eyes(fx: float, baseline_m: float, distance_m: float) -> LessonFigure:
     image.set_yticks([0, 1], ["left", "right"])
     d = u["left"] - u["right"]
     image.set_title(f"d = {u['left']:.1f} - ({u['right']:.1f}) = {d:.1f} px")
-    return fig.saying(
-        f"Two eyes {1000 * baseline_m:.0f} mm apart see a point at {distance_m:.2f} m at "
-        f"{u['left']:.1f} px (left) and {u['right']:.1f} px (right): a disparity of {d:.1f} px."
-    )
+    return fig.saying("two_eyes", baseline_mm=1000 * baseline_m, distance_m=distance_m, u=u, d=d)
 
 
 def reciprocal(fx_baseline: float, distance_m: float, sigma_d_px: float) -> LessonFigure:
@@ -99,11 +89,8 @@ def reciprocal(fx_baseline: float, distance_m: float, sigma_d_px: float) -> Less
     ax.set_title(
         f"d = {at:.1f} px, Z = {distance_m:.2f} m: {sigma_d_px:.2f} px become {sigma_mm:.2f} mm"
     )
-    return fig.saying(
-        f"The hyperbola Z = f B / d with f B = {fx_baseline:.2f} px m. At Z = {distance_m:.2f} m a "
-        f"disparity noise of {sigma_d_px:.2f} px becomes a depth noise of {sigma_mm:.2f} mm; the "
-        "bands are drawn ten times too wide."
-    )
+    facts = {"fb": fx_baseline, "distance_m": distance_m, "d_px": sigma_d_px, "z_mm": sigma_mm}
+    return fig.saying("reciprocal", **facts)
 
 
 def prices(devices: Mapping[str, tuple[float, float]], sigma_d_px: float) -> LessonFigure:
@@ -117,15 +104,13 @@ def prices(devices: Mapping[str, tuple[float, float]], sigma_d_px: float) -> Les
     for style, (name, (fx, baseline_m)) in zip(STYLES, devices.items(), strict=False):
         sigma = 1000 * RANGE_M**2 * sigma_d_px / (fx * baseline_m)
         ax.plot(RANGE_M, sigma, style, label=name)
-        texts.append(f"{name} {_at(sigma, 0.45):.2f} mm")
+        texts.append(f"{name} {np.interp(0.45, RANGE_M, sigma):.2f} mm")
     ax.axvspan(0.4, 0.6, color=COLORS["faint"], alpha=0.4, label="over a tabletop")
     ax.set(xscale="log", yscale="log", xlabel="distance Z (m)", ylabel="std of depth (mm)")
     plain_ticks(ax.xaxis, (0.3, 0.5, 1, 2, 3))
     plain_ticks(ax.yaxis, (0.1, 0.3, 1, 3, 10, 30))
     ax.legend()
-    return fig.saying(
-        f"Depth noise by the law for {sigma_d_px:.2f} px, at 0.45 m: {', '.join(texts)}."
-    )
+    return fig.saying("prices", sigma_d_px=sigma_d_px, each=", ".join(texts))
 
 
 def infrared_pair(
@@ -148,10 +133,7 @@ def infrared_pair(
             ax.plot(x + box[:, 0], v + box[:, 1], color=color, lw=1.5)
         ax.set(xlim=(u - 110, u + 60), ylim=(v + 60, v - 60), xlabel="u (px)", title=name)
     axes[0].set_ylabel("v (px)")
-    return fig.saying(
-        f"The infrared pair around pixel ({u}, {v}): the window of the left image is found "
-        f"{disparity_px:.1f} px further left in the right image."
-    )
+    return fig.saying("infrared_pair", u=u, v=v, disparity_px=disparity_px)
 
 
 def cost_curve(costs: Floats, disparity_px: float) -> LessonFigure:
@@ -171,10 +153,7 @@ def cost_curve(costs: Floats, disparity_px: float) -> LessonFigure:
         ax.set(xlabel="disparity d (px)", ylabel="cost (grey levels)")
     whole.set_title("all candidates")
     close.set_title(f"around the minimum: d = {disparity_px:.2f} px")
-    return fig.saying(
-        f"Matching cost against disparity: lowest at candidate {best}, and between the candidates "
-        f"the two straight flanks meet at d = {disparity_px:.2f} px."
-    )
+    return fig.saying("cost_curve", best=best, disparity_px=disparity_px)
 
 
 def _flanks(ax: Any, costs: Floats, best: int, disparity_px: float) -> None:
@@ -211,7 +190,7 @@ def depth_image(
     ax.set(xlabel="u (px)", ylabel="v (px)")
     said = f" Marked: {', '.join(labels)}." if labels else ""
     said += f" {np.sum(flying)} flying pixels are ringed." if flying is not None else ""
-    return fig.saying(f"Depth image, {np.mean(depth_m == 0):.0%} of it without depth.{said}")
+    return fig.saying("depth_image", without=np.mean(depth_m == 0), more=said)
 
 
 def noise_law(
@@ -242,10 +221,8 @@ def noise_law(
     ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0))
     plain = law.translate({36: None, 92: None})  # without the signs of mathematics
     others = "".join(f"; {name}: {_listed(x, y)}" for name, (x, y) in (extra or {}).items())
-    return fig.saying(
-        f"Standard deviation of depth against distance over the {plain}: "
-        f"{_listed(distances_m, std_mm)}{others}."
-    )
+    each = _listed(distances_m, std_mm) + others
+    return fig.saying("noise_law", law=plain, each=each)
 
 
 def _listed(distances_m: ArrayLike, std_mm: ArrayLike) -> str:
@@ -269,7 +246,5 @@ def averaging(counts: ArrayLike, error_mm: ArrayLike, floor_mm: float) -> Lesson
     plain_ticks(ax.xaxis, tuple(n))
     plain_ticks(ax.yaxis, (0.05, 0.1, 0.2, 0.5, 1, 2, 5))
     ax.legend()
-    return fig.saying(
-        f"A pixel's error in the mean of N frames: {e[0]:.2f} mm at N = {n[0]} and {e[-1]:.2f} mm "
-        f"at N = {n[-1]}, where 1/√N would leave {ideal[-1]:.2f} mm; {floor_mm:.2f} mm stay."
-    )
+    ends = {"n": (n[0], n[-1]), "mm": (e[0], e[-1]), "ideal_mm": ideal[-1]}
+    return fig.saying("averaging", floor_mm=floor_mm, **ends)

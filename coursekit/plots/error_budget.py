@@ -45,7 +45,7 @@ def bars(budget: ErrorBudget) -> LessonFigure:
     right = max(1.5 * tolerance, 1050 * max(row.high_m for row in rows))
     ax.set(xlabel="at the object (mm)", xlim=(0, right), ylim=(len(rows) - 0.5, -1.0))
     ax.set_ylabel(" ")
-    return fig.saying("The budget's rows at the object: " + "; ".join(said))
+    return fig.saying("bars", each="; ".join(said))
 
 
 def between_fingers(
@@ -78,13 +78,8 @@ def between_fingers(
     ax.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal",
            xlabel="closing (mm)", ylabel="lateral (mm)")  # fmt: skip
     ax.set_title(f"from above: its centre must stay within ±{room:.1f} mm")
-    return fig.saying(
-        f"A {width:g} mm cube between fingers that open {opening:g} mm, from above, with the "
-        f"ellipse that holds its centre in 95 of 100 grasps, {half[0]:.1f} by {half[1]:.1f} mm to "
-        f"either side, its middle {np.linalg.norm(bias):.1f} mm off, {bias[0]:+.1f} mm of it "
-        f"along the closing axis; the room is ±{room:.1f} mm. {len(others)} dots: the same for "
-        "other rigs, without noise."
-    )
+    lengths = {"width": width, "opening": opening, "room": room, "off": np.linalg.norm(bias)}
+    return fig.saying("between_fingers", half=half, bias=bias, dots=len(others), **lengths)
 
 
 def misses(sets: Mapping[str, SimulatedMisses], times: float = 15.0) -> LessonFigure:
@@ -104,6 +99,4 @@ def misses(sets: Mapping[str, SimulatedMisses], times: float = 15.0) -> LessonFi
         ax.label_outer()
         mean_mm = 1000 * np.linalg.norm(one.misses.mean(axis=0))
         texts.append(f"{name}, {len(one.misses)} trials, mean {mean_mm:.1f} mm")
-    return fig.saying(
-        f"Misses from above, {times:g} times as long, where they happened: {'; '.join(texts)}"
-    )
+    return fig.saying("misses", times=times, each="; ".join(texts))

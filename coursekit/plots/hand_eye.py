@@ -52,10 +52,7 @@ def mounts(
         ax.set_title(name, y=0.94)
         lengths = _rig(ax, setup, np.asarray(joints[name], float))
         texts.append(f"{name}: " + ", ".join(f"{k} {v:.2f} m" for k, v in lengths.items()))
-    return fig.saying(
-        "Two rigs in space with the arrows T (base to gripper), X (to the camera) and C (camera to "
-        "board), at true scale. " + "; ".join(texts)
-    )
+    return fig.saying("mounts", each="; ".join(texts))
 
 
 def _rig(ax: Any, setup: Setup, q: Floats) -> dict[str, float]:
@@ -147,9 +144,7 @@ def agreement(sessions: Mapping[str, HandEyeSession]) -> LessonFigure:
             f"{fit.spread_board_mm:.1f} mm"
         )
     fig.legend(*axes[2].get_legend_handles_labels(), loc="outside lower right", ncols=3)
-    return fig.saying(
-        "Gripper and camera between any two poses, and the board. " + "; ".join(texts)
-    )
+    return fig.saying("agreement", each="; ".join(texts))
 
 
 def _screw(T: Floats) -> tuple[Floats, Floats]:
@@ -175,9 +170,7 @@ def study(points: Sequence[StudyPoint]) -> LessonFigure:
         ax.set(xlabel="the wrist turns by up to ± (deg)", ylabel=f"median error, {label}",
                ylim=(0, None))  # fmt: skip
         ax.legend()
-    return fig.saying(
-        "Median error of X against the range of rotation: " + "; ".join(map(repr, points))
-    )
+    return fig.saying("study", each="; ".join(map(repr, points)))
 
 
 def more_poses(
@@ -203,9 +196,7 @@ def more_poses(
     plain_ticks(axes[0].yaxis, (0.1, 0.3, 1, 3, 10), widen=True)
     axes[0].set_ylabel("translation of X (mm)")
     axes[0].legend()
-    return fig.saying(
-        f"Error of X against the number of poses, {counts[0]} to {counts[-1]}. " + "; ".join(texts)
-    )
+    return fig.saying("more_poses", counts=(counts[0], counts[-1]), each="; ".join(texts))
 
 
 def touched(gap_mm: ArrayLike) -> LessonFigure:
@@ -224,6 +215,4 @@ def touched(gap_mm: ArrayLike) -> LessonFigure:
     ax.set(xlabel="corner, look after look (number)", ylabel="camera - fingertip (mm)")
     ax.legend(ncols=3)
     rows = (", ".join(map("{} {:+.1f}".format, "xyz", row)) for row in gap)
-    return fig.saying(
-        f"Camera minus fingertip, corner by corner and look by look, mm: {'; '.join(rows)}"
-    )
+    return fig.saying("touched", each="; ".join(rows))

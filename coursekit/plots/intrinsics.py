@@ -56,7 +56,7 @@ def best_fits(X: Floats, Y: Floats, seen: Mapping[str, Floats], f_px: float) -> 
     ax.set(xlim=(F_PX[0], F_PX[-1]), ylim=(0, 3), xlabel="assumed focal length f (px)",
            ylabel="smallest RMS (px)")  # fmt: skip
     fig.legend(loc="outside right upper", title="f (px) within a tenth\nof the smallest RMS")
-    return fig.saying(f"The smallest RMS against the assumed focal length. {'; '.join(texts)}.")
+    return fig.saying("best_fits", each="; ".join(texts))
 
 
 def _best_rms(X: Floats, Y: Floats, seen: Floats) -> Floats:
@@ -95,10 +95,8 @@ def views(folder: str | Path, detections: Sequence[Detection]) -> LessonFigure:
         ax.set_title(f"{found.name}: {len(found.ids)} corners", fontsize=10)
         ax.set(xlabel="u (px)", ylabel="v (px)")
         ax.label_outer()
-    return fig.saying(
-        "Views of the board: "
-        + ", ".join(f"{d.name} with {len(d.ids)} corners" for d in detections)
-    )
+    each = (f"{d.name} with {len(d.ids)} corners" for d in detections)
+    return fig.saying("views", each=", ".join(each))
 
 
 def coverage(result: IntrinsicsResult) -> LessonFigure:
@@ -118,11 +116,8 @@ def coverage(result: IntrinsicsResult) -> LessonFigure:
              xlabel="tilt about the vertical (deg)",
              ylabel="tilt about the horizontal (deg)")  # fmt: skip
     tilt.set_title("tilt of the board, one dot a view")
-    return fig.saying(
-        f"Corners of {len(result.detections)} views over the image, and the tilts of the board: "
-        f"{x.min():.0f} to {x.max():.0f} degrees about the horizontal, {y.min():.0f} to "
-        f"{y.max():.0f} about the vertical."
-    )
+    ends = {"x": (x.min(), x.max()), "y": (y.min(), y.max())}
+    return fig.saying("coverage", views=len(result.detections), **ends)
 
 
 # --- a result ---
@@ -145,10 +140,7 @@ def residuals(result: IntrinsicsResult) -> LessonFigure:
     cloud.set(xlim=(-reach, reach), ylim=(reach, -reach), aspect="equal",
               xlabel="residual in u (px)", ylabel="residual in v (px)")  # fmt: skip
     cloud.set_title("circles: 1 and 2 σ per axis")
-    return fig.saying(
-        f"Residuals of {len(errors)} corners: RMS {result.rms_u_px:.3f} px in u, "
-        f"{result.rms_v_px:.3f} px in v, {result.rms_px:.3f} px in two dimensions."
-    )
+    return fig.saying("residuals", corners=len(errors), fit=result)
 
 
 def _arrows(ax: Any, at: Floats, vectors: Floats, times: float, width: float = 0.003) -> None:
@@ -184,10 +176,7 @@ def uncertainty(results: Mapping[str, IntrinsicsResult], range_m: float) -> Less
         texts.append(f"{name} from {np.nanmin(sigma):.3f} to {np.nanmax(sigma):.3f} px")
     bar = fig.colorbar(shown, ax=axes, label="σ of a projected pixel (px)", shrink=0.9)
     plain_ticks(bar.ax.yaxis, LEVELS_PX)
-    return fig.saying(
-        f"Standard deviation of a projected pixel over the image, for points {range_m:g} m away: "
-        f"{'; '.join(texts)}."
-    )
+    return fig.saying("uncertainty", range_m=range_m, each="; ".join(texts))
 
 
 def two_sessions(results: Mapping[str, IntrinsicsResult]) -> LessonFigure:
@@ -207,7 +196,7 @@ def two_sessions(results: Mapping[str, IntrinsicsResult]) -> LessonFigure:
         image_axes(image, *result.intrinsics.size)
         fx = f"fx {result.intrinsics.fx:.1f} px"
         texts.append(f"session {name} has RMS {result.rms_px:.3f} px and {fx}")
-    return fig.saying(f"RMS of each view and the outlines of the boards: {'; '.join(texts)}")
+    return fig.saying("two_sessions", each="; ".join(texts))
 
 
 def outlines(result: IntrinsicsResult) -> list[Floats]:
@@ -240,13 +229,8 @@ def rules(rows: Mapping[str, IntrinsicsResult], range_m: float) -> LessonFigure:
                         fontsize=10, bbox={"fc": "white", "ec": "none", "pad": 1})  # fmt: skip
     axes[0].invert_yaxis()
     axes[0].set_ylabel(" ")
-    return fig.saying(
-        "What each rule buys: "
-        + "; ".join(
-            f"{n}: fx to {f:.2g} %, worst pixel {w:.2g} px"
-            for n, f, w in zip(names, fx, worst, strict=True)
-        )
-    )
+    each = map("{}: fx to {:.2g} %, worst pixel {:.2g} px".format, names, fx, worst)
+    return fig.saying("rules", each="; ".join(each))
 
 
 # --- the museum ---
@@ -269,14 +253,9 @@ def rooms(results: Mapping[str, IntrinsicsResult]) -> LessonFigure:
             bar.annotate(f"{rms[at]:.1f} px", (at + 1, 3 * usual), (6, -4), va="top",
                          textcoords="offset points", fontsize=9)  # fmt: skip
         _pattern(view, result)
-    return fig.saying(
-        "RMS of each view, and the residuals of the worst one, smoothed: "
-        + "; ".join(
-            f"{name}, RMS of all views {r.rms_px:.2f} px, of the worst one "
-            f"{r.per_view_rms_px.max():.2f} px"
-            for name, r in results.items()
-        )
-    )
+    said = "{}, RMS of all views {:.2f} px, of the worst one {:.2f} px".format
+    each = (said(name, r.rms_px, max(r.per_view_rms_px)) for name, r in results.items())
+    return fig.saying("rooms", each="; ".join(each))
 
 
 def _pattern(ax: Any, result: IntrinsicsResult) -> None:
@@ -310,15 +289,10 @@ def power(table: Mapping[str, Mapping[str, Any]]) -> LessonFigure:
         ax.set(xscale="log", ylim=(-3, 103),
                xlabel=f"{effect.replace('_', ' ')} ({row['unit']})")  # fmt: skip
         plain_ticks(ax.xaxis, (0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1, 2))
-        texts.append(
-            f"{effect}: "
-            + ", ".join(
-                f"{s:.0f} % at {x:g} {row['unit']}"
-                for x, s in zip(row["sizes"], share, strict=True)
-            )
-        )
+        shares = map(f"{{:.0f}} % at {{:g}} {row['unit']}".format, share, row["sizes"])
+        texts.append(f"{effect}: {', '.join(shares)}")
     axes[0].set_ylabel("sessions that it is named in (%)")
-    return fig.saying("Share of sessions in which the cause is named. " + "; ".join(texts))
+    return fig.saying("power", each="; ".join(texts))
 
 
 # --- against the factory ---
@@ -341,8 +315,5 @@ def difference(comparison: Comparison) -> LessonFigure:
         fig.colorbar(shown, ax=ax, location="bottom", label=label, shrink=0.9)
         image_axes(ax, width, height)
         ax.label_outer()
-    return fig.saying(
-        f"The fit against the factory over the image: {np.nanmin(pixels):.2f} to "
-        f"{np.nanmax(pixels):.2f} px, and {np.nanmin(shift_mm):.2f} to "
-        f"{np.nanmax(shift_mm):.2f} mm at {comparison.range_m:g} m."
-    )
+    px, mm = ((np.nanmin(values), np.nanmax(values)) for values in (pixels, shift_mm))
+    return fig.saying("difference", px=px, mm=mm, range_m=comparison.range_m)

@@ -38,11 +38,8 @@ def similar_triangles(focal_length_mm: float = 1.93, depth_m: float = 0.45) -> L
     sensor.plot([x_mm], [0], "o", color=COLORS["measured"], ms=10)
     sensor.set(xlim=(-1.3, 1.3), ylim=(-1.3, 1.3), xlabel="$x_s$ on the sensor (mm)")
     sensor.set(aspect="equal", yticks=[], title=f"$x_s = f\\,X/Z$ = {x_mm:.3f} mm")
-    return fig.saying(
-        f"Side by side: the ray from a point {1000 * POINT_X_M:.0f} mm off the axis at Z = "
-        f"{depth_m:.2f} m through the pinhole, and its image {x_mm:.3f} mm off the sensor's "
-        f"centre for f = {focal_length_mm:.2f} mm."
-    )
+    facts = {"off_mm": 1000 * POINT_X_M, "depth_m": depth_m, "f_mm": focal_length_mm}
+    return fig.saying("similar_triangles", x_mm=x_mm, **facts)
 
 
 def _triangles(ax: Any, plane_m: float, depth_m: float) -> None:
@@ -88,11 +85,8 @@ def pixel_grid(principal: tuple[float, float] = (3.3, 2.2)) -> LessonFigure:
     ax.set(xlim=(-0.8, columns - 0.2), ylim=(rows - 0.2, -0.8), aspect="equal")
     ax.set(xlabel="u (px), to the right", ylabel="v (px), down")
     fig.legend(loc="outside lower center", ncols=2)
-    return fig.saying(
-        f"A grid of {columns} by {rows} pixels. The origin (0, 0) is the centre of the top-left "
-        f"pixel, the middle of the image is {middle}; the principal point, {principal}, is "
-        "elsewhere, between pixel centres."
-    )
+    size = {"columns": columns, "rows": rows}
+    return fig.saying("pixel_grid", middle=middle, principal=principal, **size)
 
 
 def entries_of_K(scene: tuple[Box, ...], camera: Intrinsics, **moved: float) -> LessonFigure:
@@ -115,9 +109,7 @@ def entries_of_K(scene: tuple[Box, ...], camera: Intrinsics, **moved: float) -> 
     ax.legend(loc="upper right")
     values = ", ".join(f"{k} = {getattr(changed, k):.0f}" for k in ("fx", "fy", "cx", "cy"))
     ax.set_title(values + " px")
-    return fig.saying(
-        f"Wire frame of the tabletop in the image with the camera's K and with {values} px."
-    )
+    return fig.saying("entries_of_K", values=values)
 
 
 def _edges(scene: tuple[Box, ...]) -> list[Floats]:
@@ -156,7 +148,7 @@ def displacement(lenses: Mapping[str, Intrinsics]) -> LessonFigure:
         texts.append(f"{name}, {edge:.1f} px at an edge, {corner:.1f} px in a corner")
     bar = fig.colorbar(shown, ax=axes, label="displacement (px)", shrink=0.6)
     bar.set_ticks([0.1, 1, 10, 100], labels=["0.1", "1", "10", "100"])
-    return fig.saying("Maps of the displacement by distortion: " + "; ".join(texts) + ".")
+    return fig.saying("displacement", each="; ".join(texts))
 
 
 def displacement_px(lens: Intrinsics) -> tuple[Floats, Floats]:
@@ -191,10 +183,10 @@ def frame(shot: Frame) -> LessonFigure:
     if shot.color is not None:
         axes[1].imshow(shot.color)
         axes[1].set(title="colour", xlabel="u (px)", ylabel="v (px)")
+    beside = "" if shot.color is None else ", and the colour image beside it"
+    half_m, without = np.nanmedian(depth), np.isnan(depth).mean()
     return fig.saying(
-        f"Depth image of {width} by {height} pixels, half of them nearer than "
-        f"{np.nanmedian(depth):.2f} m, {np.isnan(depth).mean():.0%} of it without depth"
-        + ("." if shot.color is None else ", and the colour image beside it.")
+        "frame", width=width, height=height, half_m=half_m, without=without, beside=beside
     )
 
 
@@ -232,12 +224,8 @@ def point_cloud(points: NDArray[np.float32]) -> LessonFigure:
     above.set(xlabel="X (m)", ylabel="Z (m)", aspect="equal", ylim=(-0.05, None))
     above.set_xlim(-side, side)
     above.set_title(f"from above, |Y| < {1000 * SLICE_M:.0f} mm")
-    low, high = cloud.min(axis=0), cloud.max(axis=0)
-    return fig.saying(
-        f"Point cloud of {len(cloud)} points (false matches left out), X from {low[0]:.2f} to "
-        f"{high[0]:.2f} m, Z from {low[2]:.2f} to {high[2]:.2f} m, and a slice of {len(flat)} "
-        "points from above."
-    )
+    ends = {"low": cloud.min(axis=0), "high": cloud.max(axis=0)}
+    return fig.saying("point_cloud", n=len(cloud), in_slice=len(flat), **ends)
 
 
 def _solid(ax: Any, cloud: NDArray[np.float32], colors: Mapping[str, float]) -> None:

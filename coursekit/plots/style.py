@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from coursekit.checks import want
-from coursekit.words import stacked
+from coursekit.words import say, stacked
 
 # Okabe-Ito, its two lightest darker for 3:1 on white: distinguishable with any colour vision; the
 # same thing has the same colour everywhere.
@@ -58,9 +58,9 @@ class LessonFigure(Figure):
 
     alt: str = ""
 
-    def saying(self, alt: str) -> LessonFigure:
-        """The figure itself, with its text alternative: what a drawing function returns."""
-        self.alt = alt
+    def saying(self, what: str, /, **facts: Any) -> LessonFigure:
+        """The figure itself, with the facts in its text alternative, which texts.toml has."""
+        self.alt = say(f"plots.{what}", **facts)
         return self
 
     def png(self) -> bytes:

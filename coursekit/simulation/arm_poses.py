@@ -16,12 +16,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coursekit.arm import Arm
-from coursekit.arrays import ArrayLike, Bools, Floats, Integers
+from coursekit.arrays import Bools, Floats, Integers
 from coursekit.boards import Board
 from coursekit.boards.board import seen
-from coursekit.checks import choice, number, settle, transform, transforms, whole
-from coursekit.geometry import Intrinsics, inverse_of, invert_transform, make_transform
-from coursekit.hand_eye.poses import MOUNTS, Mount
+from coursekit.checks import choice, number, settle, transform, whole
+from coursekit.geometry import Intrinsics, make_transform
+from coursekit.hand_eye.poses import MOUNTS, Mount, camera_board
 from coursekit.specifications import DATA
 from coursekit.words import say
 
@@ -38,17 +38,14 @@ DEGENERATE = DATA / "degenerate_poses.json"
 # --- where things are by default ---
 
 
-def board_on_table(
-    board: Board, centre_m: tuple[float, float] = (0.40, 0.0), turn_rad: float = 0.0
-) -> Floats:
+def board_on_table(board: Board) -> Floats:
     """T_base_board (4, 4) of a board that lies on the table, pattern up, its top away from the arm.
 
-    centre_m: x and y of the pattern's middle in the base. turn_rad: about the vertical.
+    Its middle is 0.40 m in front of the base.
     """
     # x right, y towards the arm, z into the table, as one looks from the arm
-    axes = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]).T
-    R = Rotation.from_euler("z", turn_rad).as_matrix() @ axes
-    return make_transform(R, np.array([*centre_m, 0.0]) - R @ board.middle)
+    R = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    return make_transform(R, np.array([0.40, 0.0, 0.0]) - R @ board.middle)
 
 
 def board_in_gripper(board: Board) -> Floats:
@@ -103,53 +100,38 @@ class Setup:
         settle(self, X=transform("X", self.X), Y=transform("Y", self.Y))
         number("share", self.share, "more than 0 and at most 1", above=0.0, most=1.0)
 
-    def T_camera_board(self, T_base_gripper: ArrayLike) -> Floats:
-        """The board in the camera (..., 4, 4) for gripper poses (..., 4, 4)."""
-        return self._seen(transforms("T_base_gripper", T_base_gripper))
+    def T_camera_board(self, T_base_gripper: Floats) -> Floats:
+        """The board in the camera (n, 4, 4) for gripper poses (n, 4, 4)."""
+        return camera_board(T_base_gripper, self.X, self.Y, self.mount)
 
-    def T_base_gripper(self, T_camera_board: ArrayLike) -> Floats:
-        """The gripper poses (..., 4, 4) at which the camera has the board at (..., 4, 4)."""
-        arm = self.X @ transforms("T_camera_board", T_camera_board) @ invert_transform(self.Y)
-        return invert_transform(arm) if self.mount == "eye_in_hand" else arm
-
-    def sees(self, T_base_gripper: ArrayLike) -> Bools:
-        """(...): whether enough of the board is in view, from the front, and large enough."""
+    def sees(self, T_base_gripper: Floats) -> Bools:
+        """(n,): whether enough of the board is in view, from the front, and large enough."""
         T = self.T_camera_board(T_base_gripper)
-        flat = T.reshape(-1, 4, 4)
-        good = self._faces(flat)
-        corners = seen(self.board.points, flat[good], self.intrinsics)
+        good = self._faces(T)
+        corners = seen(self.board.points, T[good], self.intrinsics)
         good[good] = corners.mean(axis=-1) >= self.share - 1e-9
-        return good.reshape(T.shape[:-2])
+        return good
 
-    def allows(self, q: ArrayLike) -> Bools:
-        """(...): whether the arm can hold still at q (..., 6), rad, and the camera then `sees`.
+    def allows(self, q: Floats) -> Bools:
+        """(n,): whether the arm can hold still at q (n, 6), rad, and the camera then `sees`.
 
         Inside the limits, the arm free, and a board in the gripper above the table.
         """
-        q = np.asarray(q, dtype=np.float64)
-        flat = q.reshape(-1, 6)
-        T = self.arm.forward(flat)
+        T = self.arm.forward(q)
         # most fail the first test, so the costly ones come last and see only what is left
-        left = np.flatnonzero(self._faces(self._seen(T)) & self.arm.within_limits(flat))
+        left = np.flatnonzero(self._faces(self.T_camera_board(T)) & self.arm.within_limits(q))
         if self.mount == "eye_to_hand":
             outline = self.Y[:3, :3] @ self.board.outline.T + self.Y[:3, 3:]
             heights = T[left, 2, :3] @ outline + T[left, 2, 3:]
             left = left[(heights >= CLEARANCE_M).all(axis=-1)]
         left = left[self.sees(T[left])]
-        left = left[self.arm.is_free(flat[left], CLEARANCE_M)]
-        allowed = np.zeros(len(flat), bool)
-        allowed[left] = True
-        return allowed.reshape(q.shape[:-1])
+        left = left[self.arm.is_free(q[left], CLEARANCE_M)]
+        return np.isin(np.arange(len(q)), left)
 
     def upright(self, T_camera_board: Floats) -> Floats:
         """1 + 2 cos of the angle (n,) by which boards (n, 4, 4) are turned from upright."""
         axes = np.array([1.0, -1.0, -1.0]) if self.board.old_origin else np.ones(3)
         return np.einsum("nii,i->n", T_camera_board[:, :3, :3], axes)
-
-    def _seen(self, T: Floats) -> Floats:
-        """As `T_camera_board`, without its check."""
-        arm = inverse_of(T) if self.mount == "eye_in_hand" else T
-        return inverse_of(self.X) @ arm @ self.Y
 
     def _faces(self, T: Floats) -> Bools:
         """(n,): whether the board is in front, little enough turned, and its squares large."""
@@ -215,12 +197,12 @@ def _farthest(R: Floats, n: int) -> Integers:
     return np.array(taken)
 
 
-def half_turns(T_base_gripper: ArrayLike) -> Floats:
+def half_turns(T_base_gripper: Floats) -> Floats:
     """How far poses (n, 4, 4) turn to either side about their main axes, (3,) rad, largest first.
 
     Rotation vectors from the mean orientation, along their principal directions: half the range.
     """
-    R = Rotation.from_matrix(transforms("T_base_gripper", T_base_gripper)[:, :3, :3])
+    R = Rotation.from_matrix(T_base_gripper[:, :3, :3])
     vectors = (R.mean().inv() * R).as_rotvec()
     _, axes = np.linalg.eigh(vectors.T @ vectors)
     return np.sort(np.ptp(vectors @ axes, axis=0) / 2)[::-1]

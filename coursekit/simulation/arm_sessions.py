@@ -14,7 +14,7 @@ from __future__ import annotations
 import json
 import os
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
@@ -160,13 +160,11 @@ def default_setup(mount: Mount) -> Setup:
     >>> default_setup("eye_to_hand").board.squares
     (7, 5)
     """
-    arm = widowx()
-    lens = device(WHOSE_LENS[choice("mount", mount, MOUNTS)]).unit.color
-    if mount == "eye_in_hand":
-        X, board = arm.T_gripper_camera, TABLE_BOARD
-        return Setup(arm, mount, X, arm_poses.board_on_table(board), lens, board)
-    board = HELD_BOARD
-    X, Y = arm_poses.over_the_shoulder(), arm_poses.board_in_gripper(board)
+    arm, lens = widowx(), device(WHOSE_LENS[choice("mount", mount, MOUNTS)]).unit.color
+    board, X, Y = TABLE_BOARD, arm.T_gripper_camera, arm_poses.board_on_table(TABLE_BOARD)
+    if mount == "eye_to_hand":
+        board, X = HELD_BOARD, arm_poses.over_the_shoulder()
+        Y = arm_poses.board_in_gripper(board)
     return Setup(arm, mount, X, Y, lens, board)
 
 
@@ -213,8 +211,7 @@ def unknown_sessions(seed: int) -> dict[str, HandEyeSession]:
         "Q": HandEyeMistakes(inverted_poses=True),
         "R": HandEyeMistakes(slip_m=0.005),
     }
-    made = {name: hand_eye_session("eye_in_hand", seed, mistakes=m) for name, m in mistakes.items()}
-    return {name: session for name, (session, _) in made.items()}
+    return {n: hand_eye_session("eye_in_hand", seed, mistakes=m)[0] for n, m in mistakes.items()}
 
 
 def rendered_session(
@@ -226,8 +223,9 @@ def rendered_session(
     BoardNotFound where the board is not found in one, which the poses are chosen to avoid.
     """
     truth, q, dq = _poses(mount, seed, n, arm_errors, HandEyeMistakes())
-    images = list(counting(images_of(truth, seed), n, "image", n >= FOLDER_VIEWS))
-    board = truth.setup.board
+    rng, board, lens = _stream(seed, b"images"), truth.setup.board, truth.setup.intrinsics
+    pictures = (render_board(board, T, lens, rng) for T in truth.T_camera_board)
+    images = list(counting(pictures, n, "image", n >= FOLDER_VIEWS))
     found = [detect(image, board, f"view_{i:02d}") for i, image in enumerate(images)]
     return _reported(truth, q, dq, Detections(found)), truth, images
 
@@ -271,16 +269,6 @@ def truth_of(folder: str | os.PathLike[str]) -> HandEyeTruth:
         raise ValueError(f"folder: {path.parent.name} is no simulated session; nobody knows its X")
     asked = card["mount"], int(card["seed"]), int(card["views"])
     return _poses(*asked, ArmErrors(), HandEyeMistakes())[0]
-
-
-def images_of(truth: HandEyeTruth, seed: int) -> Iterator[Grey]:
-    """The rendered pictures (h, w) of a session, one after the other."""
-    rng = _stream(seed, b"images")
-    board, scale = truth.setup.board, truth.mistakes.square_scale
-    marker_m = (board.marker_m or 0) * scale or None
-    real = replace(board, square_m=board.square_m * scale, marker_m=marker_m)
-    for T in truth.T_camera_board:
-        yield render_board(real, T, truth.setup.intrinsics, rng)
 
 
 # --- what really happens ---
@@ -420,17 +408,10 @@ def _reported(truth: HandEyeTruth, q: Floats, dq: Floats, found: Detections) -> 
     if mistakes.millimetres == "arm":
         T[:, :3, 3] *= 1e3
     only_poses = mistakes.inverted_poses or mistakes.degrees == "rotation_vectors"
-    session = HandEyeSession(
-        mount=setup.mount,
-        T_base_gripper=T,
-        seen=found,
-        board=setup.board,
-        intrinsics=setup.intrinsics,
-        q=None if only_poses else q,
-        dq=dq if dq.any() and not only_poses else None,
-        times=np.arange(len(q)) * np.float64(SECONDS),
-        names=tuple(view.name for view in found),
-    )
+    read, moving = None if only_poses else q, None if only_poses or not dq.any() else dq
+    times, names = np.arange(len(q)) * np.float64(SECONDS), tuple(view.name for view in found)
+    seen_by = setup.board, setup.intrinsics
+    session = HandEyeSession(setup.mount, T, found, *seen_by, read, moving, times, names)
     if mistakes.inverted_detections or mistakes.millimetres == "board":
         T = session.T_camera_board.copy()
         T = invert_transform(T) if mistakes.inverted_detections else T

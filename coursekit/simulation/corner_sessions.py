@@ -87,12 +87,10 @@ class Effects:
     def __post_init__(self) -> None:
         most = {"max_tilt_deg": 60.0, "inner_only": 0.3, "blur_share": 1.0}
         array("rational", self.rational, (3,), finite=True)
-        for field in fields(self):
-            if field.type not in ("float", "int"):
-                continue
-            least, highest = -np.inf if field.name == "bow_m" else 0.0, most.get(field.name, np.inf)
+        for name in (field.name for field in fields(self) if field.type in ("float", "int")):
+            least, highest = -np.inf if name == "bow_m" else 0.0, most.get(name, np.inf)
             wanted = f"a finite number from {least:g} to {highest:g}"
-            number(field.name, getattr(self, field.name), wanted, least=least, most=highest)
+            number(name, getattr(self, name), wanted, least=least, most=highest)
         positive("square_scale", self.square_scale)
         positive("wave_reach", self.wave_reach)
 
@@ -101,20 +99,13 @@ class Effects:
 class Truth:
     """What a simulated session really was.
 
-    lens: the camera; T_camera_board (n, 4, 4): the poses, at mid readout, m; effects as asked for.
-    focal_scale (n,): of each view. velocity_m_s (n, 3): of the board in the camera's frame.
-    blurred: the indices of the views with motion blur. spoiled_view: an index, or None.
-    bad_corners: (view, corner id) of each. depth_m: the true Z of each corner, m, (N_i,) a view.
-    points (N, 3): where the board's corners really are in its own frame, m.
+    T_camera_board (n, 4, 4): the poses, at mid readout, m. draw: what its effects made of each
+    view. bad_corners: (view, corner id) of each. depth_m: the true Z of each corner, m, (N_i,) a
+    view. points (N, 3): where the board's corners really are in its own frame, m.
     """
 
-    lens: Intrinsics
     T_camera_board: Floats
-    effects: Effects
-    focal_scale: Floats
-    velocity_m_s: Floats
-    blurred: tuple[int, ...]
-    spoiled_view: int | None
+    draw: Drawn
     bad_corners: tuple[tuple[int, int], ...]
     depth_m: tuple[Floats, ...]
     points: Floats
@@ -183,13 +174,10 @@ def corner_session(
     # then has the poses and the noise of the healthy session with the same seed.
     poses = view_poses(board, lens, np.random.default_rng([seed, 0]), views, effects)
     rng = np.random.default_rng([seed, 1])
-    draw = _Draw(rng, views, effects)
+    draw = Drawn(rng, views, effects)
     street = np.random.default_rng([seed, 2])  # drawn after and apart: the rest stays as it is
     points = printed(board, effects, street)
-    looks = [
-        _look(board, points, lens, poses[i], effects, draw.focal_scale[i], draw.velocity_m_s[i])
-        for i in range(views)
-    ]
+    looks = [_look(board, points, lens, poses[i], draw, i) for i in range(views)]
     # single bad corners, in different views as far as they go round
     order = np.resize(rng.permutation(views), effects.bad_corners).tolist()
     wrong = tuple((view, int(rng.choice(looks[view][0]))) for view in order)
@@ -210,9 +198,7 @@ def corner_session(
         found = pixels + noise + wild
         said_px = effects.claimed * sigma_px
         detections.append(Detection(ids, found, lens.size, f"view {i:02d}", said_px, measured))
-    depth_m, drawn = tuple(Z for _, _, Z in looks), (draw.focal_scale, draw.velocity_m_s)
-    blurred, odd_view = draw.blurred, draw.spoiled_view
-    truth = Truth(lens, poses, effects, *drawn, blurred, odd_view, wrong, depth_m, points)
+    truth = Truth(poses, draw, wrong, tuple(Z for _, _, Z in looks), points)
     return Detections(detections), truth
 
 
@@ -287,10 +273,16 @@ def _visible(points: Floats, lens: Intrinsics, T: Floats, effects: Effects) -> B
 # --- what is seen of them ---
 
 
-class _Draw:
-    """The random numbers of a session's effects, all drawn whether an effect is on or not."""
+class Drawn:
+    """The random numbers of a session's effects, all drawn whether an effect is on or not.
+
+    focal_scale (n,): of each view. velocity_m_s (n, 3): of the board in the camera's frame.
+    along (n, 2): the direction of a motion blur. blurred: the indices of the views with one.
+    noise_scale (n,): of the corners. spoiled_view: an index, or None.
+    """
 
     def __init__(self, rng: np.random.Generator, views: int, effects: Effects) -> None:
+        self.effects = effects
         self.focal_scale = 1 + effects.focus_drift * rng.uniform(-1, 1, views)
         direction = rng.normal(size=(views, 3))
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -306,15 +298,10 @@ class _Draw:
 
 
 def _look(
-    board: Board,
-    shape: Floats,
-    lens: Intrinsics,
-    T: Floats,
-    effects: Effects,
-    scale: float,
-    velocity: Floats,
+    board: Board, shape: Floats, lens: Intrinsics, T: Floats, draw: Drawn, view: int
 ) -> tuple[Integers, Floats, Floats]:
     """The ids of the corners in the image, their pixels (N, 2) without noise, and their Z (N,)."""
+    effects, scale, velocity = draw.effects, draw.focal_scale[view], draw.velocity_m_s[view]
     ids = np.flatnonzero(_visible(board.points, lens, T, effects))
     points = transform_points(T, shape[ids])
     see = _through(replace(lens, fx=lens.fx * scale, fy=lens.fy * scale), effects)

@@ -28,7 +28,7 @@ import os
 import time
 import zlib
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -38,10 +38,9 @@ from numba import njit, prange
 
 from coursekit.arrays import ArrayLike, Floats, Grey, NDArray
 from coursekit.checks import number, positive, want
-from coursekit.geometry import Intrinsics, pixel_grid
-from coursekit.simulation import raycast
+from coursekit.geometry import Intrinsics
 from coursekit.simulation.raycast import is_lit, nearest_hit, texture_factor
-from coursekit.simulation.scenes import TEXTURES, Scene, box_table, check_scene, rays
+from coursekit.simulation.scenes import TEXTURES, Scene, box_table, check_scene
 
 FloatImage = NDArray[np.float32]  # (H, W)
 
@@ -419,7 +418,7 @@ SPECKLE_SIGMA_PX = 0.6
 LENS_SIGMA_PX = 0.5  # blur
 GREY_PER_MS = 100.0  # exposed to unit light
 LONGEST_MS = 33.0  # auto exposure ends where the next frame begins
-METERED = (0.25, 99.8)  # auto exposure: this part of the width and height, and this percentile
+METERED = (0.375, 0.625), 99.8  # auto exposure: from, to of width and height; this percentile
 BRIGHT_GREY = 235.0  # ... of the left image come to this
 BLACK_GREY = 4.0
 PRNU, DSNU_GREY = 0.01, 0.5  # fixed pattern: std of the pixels' gain and of their offset
@@ -507,7 +506,7 @@ class StereoFrame:
 class RigView:
     """A rig in front of a scene that stands still.
 
-    exposure_ms: of every frame, ms. truth_m: the exact depth.
+    exposure_ms: of every frame, ms.
     """
 
     def __init__(self, rig: Rig, scene: Scene) -> None:
@@ -552,15 +551,6 @@ class RigView:
         """
         return counts(frame.disparity, self.rig.left.fx, self.rig.baseline_m, depth_scale_m)
 
-    @cached_property
-    def truth_m(self) -> Floats:
-        """The exact Z (H, W) of what the left eye's pixel centres see, m, 0 where there is none."""
-        left = self.rig.left
-        truth, index = np.empty(left.size[::-1]), np.empty(left.size[::-1], np.int16)
-        boxes = box_table(self.scene, None)
-        raycast.render_depth(boxes, rays(left, pixel_grid(*left.size)), truth, index)
-        return truth
-
 
 def counts(
     disparity: FloatImage, fx: float, baseline_m: float, depth_scale_m: float
@@ -601,11 +591,9 @@ def _light(scene: Scene, rig: Rig) -> list[tuple[FloatImage, FloatImage]]:
 
 def _metered(radiance: FloatImage) -> float:
     """The exposure in ms that makes the dots in the middle bright and hardly saturated."""
-    part, percentile = METERED
-    rows, columns = (
-        slice(round((1 - part) / 2 * n), round((1 + part) / 2 * n)) for n in radiance.shape
-    )
-    bright = float(np.percentile(radiance[rows, columns], percentile))
+    (low, high), percentile = METERED
+    middle = tuple(slice(round(low * n), round(high * n)) for n in radiance.shape)
+    bright = float(np.percentile(radiance[middle], percentile))
     return min(LONGEST_MS, BRIGHT_GREY / (GREY_PER_MS * bright)) if bright > 0 else LONGEST_MS
 
 
@@ -640,9 +628,8 @@ def _grain(size: int = 512, levels: int = 6) -> FloatImage:
     spectrum = np.fft.rfft2(rng.standard_normal((size, size)))
     spectrum /= np.where(frequency > 0, frequency, np.inf)
     blurs = [0.4 * 2**level if level else 0.0 for level in range(levels)]
-    tiles = [
-        np.fft.irfft2(spectrum * np.exp(-2 * (np.pi * frequency * blur) ** 2)) for blur in blurs
-    ]
+    decays = (np.exp(-2 * (np.pi * frequency * blur) ** 2) for blur in blurs)
+    tiles = [np.fft.irfft2(spectrum * decay) for decay in decays]
     return (np.stack(tiles) / tiles[0].std()).astype(np.float32)
 
 

@@ -2,7 +2,7 @@
 
 By day through notebook 01, which has each kind of widget: what of the others is shown, answered and
 drawn is tested without a browser (nbval, tests/notebooks, test_lessons.py). COURSEKIT_NIGHTLY=1
-goes through all, and puts screenshots of the pages into build/screenshots/.
+goes through all.
 """
 
 import json
@@ -27,7 +27,6 @@ pytestmark = pytest.mark.browser
 
 NAMES = [f"{number:02d}_{lesson}" for number, lesson in enumerate(ck.lessons.LESSONS, start=1)]
 NAMES = NAMES if NIGHTLY else NAMES[:1]
-SCREENSHOTS = build_notebooks.ROOT / "build" / "screenshots"
 SETTINGS = {
     "@jupyterlab/apputils-extension:notification": {"fetchNews": "false", "checkForUpdates": False},
     "@jupyterlab/notebook-extension:tracker": {"windowingMode": "none"},  # all cells are in the DOM
@@ -123,23 +122,6 @@ def page(opened, name):
     expect(prompt).to_have_text("[*]:")
     expect(prompt).to_have_text(re.compile(r"\[\d+\]:"))
     return opened
-
-
-def photograph(page, name):
-    """The whole notebook as a student sees it, a screenful a file."""
-    SCREENSHOTS.mkdir(parents=True, exist_ok=True)
-    for old in SCREENSHOTS.glob(f"{name}-*.png"):
-        old.unlink()
-    scroller = page.locator(".jp-WindowedPanel-outer").first
-    screenful = scroller.evaluate("e => e.clientHeight")
-    height = page.locator(".jp-Cell").last.evaluate(
-        """e => e.getBoundingClientRect().bottom
-              + e.closest(".jp-WindowedPanel-outer").scrollTop"""
-    )
-    for number, top in enumerate(range(0, int(height), screenful - 40), 1):
-        scroller.evaluate("(e, top) => { e.scrollTop = top }", top)
-        page.wait_for_timeout(150)
-        page.screenshot(path=SCREENSHOTS / f"{name}-{number:02}.png")
 
 
 def cell_with(page, source):
@@ -251,8 +233,6 @@ def shown(image):
 def test_on_the_next_day_every_answer_and_every_figure_is_there(browser, server_at, page, name):
     """The copy is saved, its kernel ended, and opened again: nothing runs in it."""
     drawn = cell_with(page, "ck.drag(").count()
-    if NIGHTLY:
-        photograph(page, name)
     with page.expect_response(lambda r: r.request.method == "PUT" and "/contents/" in r.url):
         page.keyboard.press("Control+s")
     stop_kernel(page)

@@ -1,9 +1,9 @@
 """Blank, right and wrong answers to every exercise of the notebooks get the verdict they should.
 
 And a notebook runs for somebody who leaves out every section marked deeper or studio.
-All right answers, in each style, are judged by day; of the wrong ones one for each verdict of an
-exercise. COURSEKIT_NIGHTLY=1 judges all, and runs the notebooks with all answers in them, the core
-alone and whole.
+All right answers, in each style, are judged by day; of the wrong ones one for every other verdict
+of an exercise. COURSEKIT_NIGHTLY=1 judges all, and runs the notebooks with all answers in them, the
+core alone and whole.
 """
 
 import nbformat
@@ -35,9 +35,9 @@ def parts_of(path):
 SOURCES = {name: parts for path in PATHS for name, parts in parts_of(path).items()}
 ANSWERS = [(name, answer) for name in EXERCISES for answer in attempts(name)]
 if not NIGHTLY:  # of wrong ones the last: those that are text were written without ours in view
-    ANSWERS = {
-        (name, a.name if a.verdict[0] == "right" else a.verdict): (name, a) for name, a in ANSWERS
-    }.values()
+    right = [(name, a) for name, a in ANSWERS if a.verdict[0] == "right"]
+    wrong = {(name, a.verdict): (name, a) for name, a in ANSWERS if a.verdict[0] != "right"}
+    ANSWERS = right + [*wrong.values()][::2]
 WRONG = [pytest.param(name, answer, id=f"{name}, {answer.name}") for name, answer in ANSWERS]
 
 

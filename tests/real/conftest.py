@@ -1,8 +1,6 @@
 """The real data that the tests here are made with, read once."""
 
 import json
-import os
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,13 +10,6 @@ from scipy.spatial.transform import Rotation
 from coursekit.boards import Board, Detection, Detections, detect_all
 from coursekit.geometry import Intrinsics
 from coursekit.hand_eye import HandEyeSession
-
-
-@pytest.fixture(scope="session")
-def real_data():
-    if not os.environ.get("COURSEKIT_REAL_DATA"):
-        pytest.skip("COURSEKIT_REAL_DATA is not set: it names the folder of real data")
-    return Path(os.environ["COURSEKIT_REAL_DATA"])
 
 
 @pytest.fixture(scope="session")

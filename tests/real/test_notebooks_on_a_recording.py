@@ -1,10 +1,5 @@
 """The notebooks, cell by cell, on a recording of a real D435 instead of the simulated camera."""
 
-from __future__ import annotations
-
-import os
-from pathlib import Path
-
 import nbformat
 import pytest
 from common import nightly
@@ -12,12 +7,7 @@ from common import nightly
 from tools import build_notebooks
 
 pytest.importorskip("pyrealsense2", reason="no pyrealsense2 for this platform")
-pytestmark = [
-    pytest.mark.real,
-    pytest.mark.skipif(
-        "COURSEKIT_REAL_DATA" not in os.environ, reason="COURSEKIT_REAL_DATA not set"
-    ),
-]
+pytestmark = pytest.mark.real
 PATHS = build_notebooks.find([])
 HONEST = {  # what two frames of one scene cannot give, by cell
     "02_depth_noise": {
@@ -33,8 +23,8 @@ HONEST = {  # what two frames of one scene cannot give, by cell
     [PATHS[0], *(pytest.param(path, marks=nightly) for path in PATHS[1:])],
     ids=lambda path: path.stem,
 )
-def test_every_cell_runs_on_the_recording_and_says_what_it_is(path: Path, tmp_path: Path) -> None:
-    bag = Path(os.environ["COURSEKIT_REAL_DATA"], "realsense_d435/single_depth_color_640x480.bag")
+def test_every_cell_runs_on_the_recording_and_says_what_it_is(path, real_data, tmp_path) -> None:
+    bag = real_data / "realsense_d435" / "single_depth_color_640x480.bag"
     environment = build_notebooks.kernel_environment(tmp_path) | {"COURSEKIT_CAMERA": str(bag)}
     notebook = nbformat.read(path, as_version=4)
     build_notebooks.execute(notebook, path.stem, path.parent, environment)

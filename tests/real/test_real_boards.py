@@ -1,7 +1,5 @@
 """Boards that other people photographed, with the answers that they published."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

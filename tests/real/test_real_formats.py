@@ -1,7 +1,5 @@
 """Files of others as they came: a robot's poses in mm and degrees, a lens, MoveIt's pairs."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

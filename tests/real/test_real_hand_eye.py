@@ -1,7 +1,5 @@
 """Hand-eye data that MoveIt publishes with its calibration plugin, and the answer in its tests."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """`diagnose` on MoveIt's fifty pose pairs: quiet as they are, and each mistake by its name."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 
@@ -55,14 +53,14 @@ def test_board_size(moveit_poses, factor: float) -> None:
 
 def test_the_other_way_round(moveit_poses) -> None:
     arm, seen = moveit_poses
-    inverted = (invert_transform(arm), seen)
-    for given in (inverted, (arm, invert_transform(seen), MOUNT), (arm, seen, "eye_in_hand")):
-        [finding] = diagnose(*given)
+    inverted = diagnose(invert_transform(arm), seen)
+    others = diagnose(arm, invert_transform(seen)), diagnose(arm, seen, "eye_in_hand")
+    for [finding] in (inverted, *others):
         assert finding.name == "inconsistent_convention"
         for number, name in enumerate(("arm poses", "board poses", "another mount"), 1):
             assert f"({number}) {name}" in finding.evidence
         assert "(0.659, -0.250, 0.830) m" in finding.evidence
-    assert "Only one is plausible: arm poses inverted" in diagnose(*inverted)[0].evidence
+    assert "Only one is plausible: arm poses inverted" in inverted[0].evidence
 
 
 def test_healthy_sessions_of_other_arms_get_no_finding(song_poses, doosan_poses) -> None:

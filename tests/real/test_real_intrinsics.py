@@ -1,7 +1,5 @@
 """OpenCV's own calibration pictures, against what its authors published and what it hides."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -181,9 +179,10 @@ def test_halves_differ_by_their_stated_sigmas_with_the_boards_shape(sessions, na
 
 
 def test_four_webcams_see_the_same_shape_of_the_same_board(sessions):
-    """Corner by corner to 0.05 mm, of a paper that is 0.5 mm from flat; corner 2 is dented."""
+    """Corner by corner to 0.05 mm, of a paper that is 0.5 mm from flat; corner 2 is dented. By day
+    two of them."""
     heights = []
-    for k in CAMS:
+    for k in CAMS if NIGHTLY else CAMS[:2]:
         views, board = sessions[f"cam{k}"]
         fit = intrinsics.fit_shape(intrinsics.calibrate(views, board))
         heights.append(fit.points[:, 2])

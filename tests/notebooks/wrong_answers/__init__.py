@@ -1,19 +1,13 @@
-"""Wrong answers to the exercises, written as students write them: `<lesson>_<exercise>.py`.
+"""Answers to the exercises, right and wrong, as texts that students write.
 
-A solution stands there once in each style that turns up (vectorised, loops over lists, matrix
-products); by_change.toml has what is replaced in its text, and what must be said then. Attempts
-that are no solution with a mistake in it are functions of their own, below a `@wrong(...)`, or
-stand as text in by_text.toml.
+solutions.toml has a right one in each style that turns up (vectorised, loops over lists, matrix
+products); by_change.toml has what is replaced in its text, and what must be said then. by_text.toml
+has attempts that are no solution with a mistake in it.
 
 What must be said is the name of a misconception, or a kind of verdict, or "no name" for an attempt
 that is wrong in a way that has none. All are written without a look at coursekit's wrong models.
 """
 
-from __future__ import annotations
-
-import importlib
-import inspect
-import math
 import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,10 +16,9 @@ from typing import Any
 
 import numpy as np
 
-Attempt = Callable[..., Any]
-BY_TEXT, BY_CHANGE = (
-    tomllib.loads(Path(__file__).with_name(name).read_text(encoding="utf-8"))
-    for name in ("by_text.toml", "by_change.toml")
+SOLUTIONS, BY_CHANGE, BY_TEXT = (
+    tomllib.loads(Path(__file__).with_name(f"{name}.toml").read_text(encoding="utf-8"))
+    for name in ("solutions", "by_change", "by_text")
 )
 
 
@@ -34,49 +27,39 @@ class WrongAnswer:
     """An attempt, and the verdict that it must get: (kind, name of the misconception)."""
 
     name: str
-    attempt: Attempt
+    attempt: Callable[..., Any]
     verdict: tuple[str, str | None]
 
 
-def expected(said: str) -> tuple[str, str | None]:
+def written(exercise: str, name: str, code: str, said: str, shared: str = "") -> WrongAnswer:
+    """The answer that a text defines, once what the exercise's texts share is run."""
+    namespace = {"np": np}
+    exec(shared, namespace)
+    exec(code, namespace)
     kinds = ("right", "core right", "raised", "not attempted")
-    return (said, None) if said in kinds else ("wrong", None if said == "no name" else said)
+    verdict = (said, None) if said in kinds else ("wrong", None if said == "no name" else said)
+    return WrongAnswer(name, namespace[exercise.rpartition(".")[2]], verdict)
 
 
-def wrong(said: str) -> Callable[[Attempt], Attempt]:
-    """Mark a function as an attempt of its own style."""
-
-    def mark(attempt: Attempt) -> Attempt:
-        attempt.wrong_answers = [WrongAnswer(attempt.__name__, attempt, expected(said))]
-        return attempt
-
-    return mark
-
-
-def changed(solution: Attempt, change: str, said: str) -> WrongAnswer:
+def changed(text: str, change: str) -> str:
     """A right solution with a mistake in it. Each old expression must stand exactly once in it."""
-    text = inspect.getsource(solution)
     for one in change.split(" and "):
         old, _, new = one.partition(" -> ")
-        assert text.count(old) == 1, f"{solution.__name__}: {old!r} of {change!r}"
+        assert text.count(old) == 1, f"{old!r} of {change!r}"
         text = text.replace(old, new)
-    namespace = {"math": math} | solution.__globals__
-    exec(text, namespace)
-    attempt = namespace[solution.__name__]
-    return WrongAnswer(f"{solution.__name__}, {change}", attempt, expected(said))
+    return text
 
 
 def attempts(exercise: str) -> list[WrongAnswer]:
     """The wrong answers to the exercise `lesson.function`, and the solutions they come from."""
-    module = importlib.import_module(f"wrong_answers.{exercise.replace('.', '_')}")
-    found = [one for f in vars(module).values() for one in getattr(f, "wrong_answers", ())]
-    for style, changes in BY_CHANGE.get(exercise, {}).items():
-        solution = getattr(module, style)
-        found.append(WrongAnswer(style, solution, expected("right")))
-        found += [changed(solution, one, said) for said, all_ in changes.items() for one in all_]
-    for written in BY_TEXT.get(exercise, ()):
-        namespace = {"np": np}
-        exec(written["code"], namespace)
-        attempt = namespace[exercise.rpartition(".")[2]]
-        found.append(WrongAnswer(written["what"], attempt, expected(written["named"])))
+    found, texts = [], dict(SOLUTIONS[exercise])
+    shared = texts.pop("shared", "")
+    for style, text in texts.items():
+        found.append(written(exercise, style, text, "right", shared))
+        for said, changes in BY_CHANGE[exercise].get(style, {}).items():
+            for one in changes:
+                name, code = f"{style}, {one}", changed(text, one)
+                found.append(written(exercise, name, code, said, shared))
+    for one in BY_TEXT.get(exercise, ()):
+        found.append(written(exercise, one["what"], one["code"], one["named"]))
     return found
