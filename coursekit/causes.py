@@ -42,7 +42,7 @@ does the rest. Twelve points that ought to lie on a line, on a parabola with one
 ...         yield Hypothesis("outlier", alone, at=worst, rows=[worst], tried=len(self.x))
 ...
 ...     def tested(self, hypotheses):
-...         return [self.projection.explains(h).tested() for h in hypotheses]
+...         return [self.projection.explains(h) for h in hypotheses]
 ...
 ...     def matters(self, test):
 ...         return abs(test.coefficients[0]) > 0.1
@@ -77,7 +77,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from coursekit.arrays import Floats, Mask, NDArray
+from coursekit.arrays import Floats, NDArray
 from coursekit.words import Finding
 
 IMITATED = 1e-10  # share of a column's squares that is left of it but for rounding errors
@@ -97,14 +97,12 @@ class Hypothesis:
     cause: str
     columns: Floats
     at: int = 0
-    rows: Sequence[int] | NDArray[np.intp] | None = None
+    rows: Sequence[int] | NDArray[np.intp] | slice = field(default_factory=lambda: slice(None))
     typical: float = 1.0
     tried: int = 1
 
     def dense(self, n: int) -> Floats:
         """The columns (n, k) on all n residuals."""
-        if self.rows is None:
-            return self.columns
         full = np.zeros((n, self.columns.shape[1]))
         full[self.rows] = self.columns
         return full
@@ -279,79 +277,58 @@ class Projection:
         total, dof = float(self.residuals @ self.residuals), len(self.residuals) - self.rank
         visible = values * hypothesis.typical**2 > total / dof
         directions = vectors[:, visible] / np.sqrt(values[visible])
-        coefficients = directions @ seen[visible]
+        coefficients, size = directions @ seen[visible], int(visible.sum())
         after = self.residuals - left @ coefficients
+        squares = float((seen[visible] ** 2).sum())
+        rest = max(total - squares, 1e-300) / max(dof - size, 1)
+        log_p = _log_f_tail(squares / max(size, 1) / rest, size, dof - size)
+        log_p = min(log_p + math.log(hypothesis.tried), 0.0)
+        width, gain = likeliest_size(values, seen, total, dof)
+        covariance = rest * directions @ directions.T
         return Explained(
-            hypothesis, values, seen, total, dof, visible, coefficients, directions, after
+            hypothesis, gain, log_p, gain, width, coefficients, covariance, rest, dof - size, after
         )
 
 
 @dataclass(frozen=True, eq=False)
-class Explained:
-    """Residuals along the directions of a hypothesis, and the F-test.
+class Explained(Tested):
+    """`Tested` by the F-test, of explained squares a column over the rest a degree of freedom.
 
-    strength (k,): squares that a coefficient of 1 along a direction would add. seen (k,): the
-    residuals along it. total: all squares; dof: their degrees of freedom. visible (k,): the
-    directions that are tested. coefficients (c,): what those amount to; directions (c, visible):
-    how, at noise 1. after (m,): the residuals without what they explain.
+    Size and strength are by restricted likelihood. rest: the variance of what is left, per degree
+    of freedom; dof: of those. after (m,): the residuals without what the hypothesis explains.
     """
 
-    hypothesis: Hypothesis
-    strength: Floats
-    seen: Floats
-    total: float
+    rest: float
     dof: int
-    visible: Mask
-    coefficients: Floats
-    directions: Floats
     after: Floats
 
-    @property
-    def rest(self) -> float:
-        """The variance of what is left, per degree of freedom."""
-        left = self.total - float((self.seen[self.visible] ** 2).sum())
-        return max(left, 1e-300) / max(self.dof - int(self.visible.sum()), 1)
 
-    @property
-    def covariance(self) -> Floats:
-        """Of the coefficients, (c, c)."""
-        return self.rest * self.directions @ self.directions.T
+def _log_f_tail(ratio: float, above: int, below: int) -> float:
+    """log P(F > ratio); 0 where no degrees of freedom are left."""
+    from scipy.stats import f
 
-    @property
-    def log_p(self) -> float:
-        """Of the F-test: explained squares a column over the rest a degree of freedom."""
-        from scipy.stats import f
+    if above < 1 or below < 1:
+        return 0.0
+    return math.log(max(float(f.sf(ratio, above, below)), 1e-300))
 
-        rank = int(self.visible.sum())
-        if rank < 1 or self.dof - rank < 1:
-            return 0.0
-        squares = float((self.seen[self.visible] ** 2).sum())
-        p_value = float(f.sf(squares / rank / self.rest, rank, self.dof - rank))
-        return min(math.log(max(p_value, 1e-300)) + math.log(self.hypothesis.tried), 0.0)
 
-    def tested(self) -> Tested:
-        """The hypothesis with its F-test; size and strength by restricted likelihood."""
-        size, gain = self.best_size()
-        return Tested(
-            self.hypothesis, gain, self.log_p, gain, size, self.coefficients, self.covariance
-        )
+def likeliest_size(strength: Floats, seen: Floats, total: float, dof: int) -> tuple[float, float]:
+    """The most likely rms of the coefficients, and twice the log-likelihood that it gains.
 
-    def best_size(self) -> tuple[float, float]:
-        """The most likely rms of the coefficients, and twice the log-likelihood that it gains.
-
-        Coefficients are taken as drawn from a normal distribution of that width (restricted
-        maximum likelihood): then three columns and ninety are compared on equal terms, one width
-        each.
-        """
-        if not len(self.strength):
-            return 0.0, 0.0
-        ratios = np.concatenate([[0.0], np.geomspace(1e-3, 1e8, 200) / self.strength.max()])
-        spread = 1.0 + ratios[:, None] * self.strength
-        squares = self.total - (self.seen**2 * (1.0 - 1.0 / spread)).sum(axis=1)
-        squares = np.maximum(squares, 1e-300)
-        deviance = self.dof * np.log(squares / self.total) + np.log(spread).sum(axis=1)
-        best = int(deviance.argmin())
-        return float(np.sqrt(ratios[best] * squares[best] / self.dof)), float(-deviance[best])
+    strength (k,): squares that a coefficient of 1 along a direction of a hypothesis would add; seen
+    (k,): the residuals along it. total: all squares; dof: their degrees of freedom. Coefficients
+    are taken as drawn from a normal distribution of that width (restricted maximum likelihood):
+    then three columns and ninety are compared on equal terms, one width each.
+    """
+    if not len(strength):
+        return 0.0, 0.0
+    ratios = np.concatenate([[0.0], np.geomspace(1e-3, 1e8, 200) / strength.max()])
+    spread = 1.0 + ratios[:, None] * strength
+    squares = total - (seen**2 * (1.0 - 1.0 / spread)).sum(axis=1)
+    squares = np.maximum(squares, 1e-300)
+    deviance = dof * np.log(squares / total) + np.log(spread).sum(axis=1)
+    best = int(deviance.argmin())
+    return float(np.sqrt(ratios[best] * squares[best] / dof)), float(-deviance[best])
 
 
 def _basis(columns: Floats) -> Floats:
@@ -392,8 +369,7 @@ def likelihood_ratios(
         deviance = 2.0 * float(np.log(np.diag(root)).sum()) + float(residuals @ seen)
         plain = min(plain, deviance)
         for number, hypothesis in enumerate(hypotheses):
-            rows = slice(None) if hypothesis.rows is None else hypothesis.rows
-            block = hypothesis.columns
+            rows, block = hypothesis.rows, hypothesis.columns
             right = block.T @ seen[rows]
             inner = block.T @ left[rows][:, rows] @ block
             own = np.asarray(np.linalg.pinv(inner, rcond=1e-9, hermitian=True), np.float64)

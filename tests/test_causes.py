@@ -25,7 +25,7 @@ def test_the_f_test_and_the_likelihood_ratio_are_the_textbooks() -> None:
     before, after = rest(J), rest(full)
     wanted = f_distribution.sf((before - after) / 2 / (after / 35), 2, 35)
     solution, inverse = np.linalg.lstsq(full, r, rcond=None)[0], np.linalg.inv(full.T @ full)
-    test = Projection(r, J).explains(replace(hypothesis, typical=1e3)).tested()
+    test = Projection(r, J).explains(replace(hypothesis, typical=1e3))
     assert test.p_value == pytest.approx(wanted, rel=1e-9)
     assert test.coefficients == pytest.approx(solution[3:], rel=1e-9)
     assert test.covariance == pytest.approx(after / 35 * inverse[3:, 3:], rel=1e-9)

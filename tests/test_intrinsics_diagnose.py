@@ -215,7 +215,8 @@ def test_the_size_of_a_cause_is_the_restricted_maximum_likelihood() -> None:
     best = minimize_scalar(deviance, bounds=(-20, 5), method="bounded")
     V = np.eye(len(z)) + np.exp(best.x) * K @ K.T
     sigma = np.sqrt(z @ np.linalg.solve(V, z) / len(z))
-    size, gain = model.plain.explains(hypothesis).best_size()
+    test = model.plain.explains(hypothesis)
+    size, gain = test.size, test.gain
     assert size == pytest.approx(np.exp(best.x / 2) * sigma, rel=0.1)  # the grid's step is 13 %
     assert gain == pytest.approx(deviance(-60.0) - best.fun, abs=0.2)
 

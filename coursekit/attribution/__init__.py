@@ -3,11 +3,4 @@
 from __future__ import annotations
 
 from coursekit.attribution.ledger import Entry, Ledger
-from coursekit.attribution.verdict import (
-    Attribution,
-    Blame,
-    SimulatedMisses,
-    attribute,
-    four_sets,
-    simulate_misses,
-)
+from coursekit.attribution.verdict import Attribution, attribute, four_sets, simulate_misses

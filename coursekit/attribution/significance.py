@@ -181,15 +181,10 @@ def pose_test(misses: Floats, columns: Floats, shuffles: int = SHUFFLES) -> Pose
     left = (total - explained) / (3 * (len(misses) - 1) - k)
     by_chance = _explained(basis, centred[_orders(len(misses), shuffles - 1)])
     as_good = np.count_nonzero(by_chance >= explained * (1 - 1e-9))
-    return PoseTest(
-        p_value=(1 + as_good) / shuffles,
-        columns=k,
-        part_m=float(np.sqrt(max(explained - k * left, 0.0) / len(misses))),
-        shares={
-            name: float(_explained(_basis(columns[:, :, part]), centred[None])[0]) / total
-            for name, part in POSE_CAUSES.items()
-        },
-    )
+    part_m = float(np.sqrt(max(explained - k * left, 0.0) / len(misses)))
+    bases = {name: _basis(columns[:, :, part]) for name, part in POSE_CAUSES.items()}
+    alone = {name: float(_explained(b, centred[None])[0]) / total for name, b in bases.items()}
+    return PoseTest((1 + as_good) / shuffles, k, part_m, alone)
 
 
 @lru_cache(maxsize=32)

@@ -300,12 +300,9 @@ class Attribution:
         mean = seen.mean
         t2 = "" if mean.t2 is None else f"; T² = {mean.t2:.1f}, alone {_p(mean.p_t2)}"
         find = f"; power to find {1e3 * self.matters_m:.0f} mm: "
-        constant = seen.constant.power(self.matters_m, seen.n)
-        lines = [
-            f"mean miss {axes} mm (95 %)",
-            f"scatter of one trial {scatter} mm along x, y, z",
-            f"mean of zero: {_p(mean.p_value)}{t2}{find}{constant:.0%}",
-        ]
+        power = seen.constant.power(self.matters_m, seen.n)
+        means = {"axes": axes, "scatter": scatter, "p": _p(mean.p_value), "t2": t2}
+        lines = say("attribution.mean", find=find, power=power, **means).splitlines()
         if pose is not None:
             shares = [f"{name} {share:.0%}" for name, share in pose.shares.items()]
             alone = f"; of the scatter, alone: {', '.join(shares)}" if shares else ""

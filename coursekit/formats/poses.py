@@ -102,8 +102,11 @@ class PoseTable:
         return PoseRow(line, file, values, T)
 
 
-def turned_by(turn: Sequence[float], rotation: str | None) -> Rotation:
-    """The rotation of a quaternion (4) or, as `rotation` names it, of three angles in rad."""
+def turned_by(turn: Sequence[float] | Floats, rotation: str | None) -> Rotation:
+    """The rotation of a quaternion (4) or, as `rotation` names it, of three angles in rad.
+
+    Or of many, (n, 4) or (n, 3).
+    """
     if rotation is None:
         return Rotation.from_quat(turn)
     if rotation == "rotation_vector":

@@ -227,10 +227,7 @@ class StudyPoint:
     translation_mm: float
 
     def __repr__(self) -> str:
-        return (
-            f"{self.poses} poses, +-{self.range_deg:g} deg about {self.axes} axes: "
-            f"{self.rotation_deg:.2f} deg, {self.translation_mm:.2f} mm"
-        )
+        return say("hand_eye.study", point=self)
 
 
 def error_study(

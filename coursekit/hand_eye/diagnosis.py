@@ -38,6 +38,7 @@ VIDEO_STEP_M, VIDEO_STEP_RAD = 0.1, np.radians(20.0)  # at most, for velocities 
 # What paper that is not flat does to the focal length of a session's images, besides their scatter:
 # 5 % in one of 60 simulated sessions, 2 % on real webcams.
 FOCAL_SPREAD, FOREIGN_SIGMAS = 0.02, 3.0
+DRIFTING = ("the camera on its mount", "the board on its stand")
 FAR_FROM_MIDDLE = 0.12  # of the image: no camera's principal point is so far off
 
 
@@ -146,16 +147,13 @@ class _Case:
         """Degrees in q, by size alone; and the arm poses that were computed from them."""
         if self.q is None or np.abs(self.q).max() <= 2 * np.pi:
             return
-        given = self.pairs.fit
-        largest, computed = float(np.abs(self.q).max()), self.session.arm.forward(self.q)
+        given, largest = self.pairs.fit, float(np.abs(self.q).max())
+        computed = self._off_joints(self.pairs.T_base_gripper, self.q) < AS_COMPUTED_M
         self.q = np.radians(self.q)
-        mended = given
-        if np.abs(computed - self.pairs.T_base_gripper).max() < AS_COMPUTED_M:
+        if computed:
             self.pairs = replace(self.pairs, T_base_gripper=self.session.arm.forward(self.q))
-            mended = self.pairs.fit
-        most = f"no joint turns by more than {2 * np.pi:.1f}"
-        evidence = f"joint angles up to {largest:.0f}, where {most}"
-        self.add("degrees", evidence=evidence, how="", **_change(given, mended))
+        evidence = f"joint angles up to {largest:.0f}, where no joint turns by more than 6.3"
+        self.add("degrees", evidence=evidence, how="", **_change(given, self.pairs.fit))
 
     # --- poses ---
 
@@ -253,7 +251,7 @@ class _Case:
     def ambiguous_boards(self) -> None:
         """Of the two poses that an image may allow, the one that the arm expects."""
         boards = self.session.board_poses
-        if not any(pose.ambiguous for pose in boards):
+        if all(pose.other is None for pose in boards):
             return
         fit = self.pairs.fit
         expected = camera_board(self.pairs.T_base_gripper, fit.X, fit.Y[0], self.pairs.mount)
@@ -373,9 +371,6 @@ def _figures(
         size = np.degrees(model.offsets[test.at])
         return {"joint": test.at, "size": size, "half": np.degrees(half)}
     turn, shift = causes.turn_and_shift(test)
-    figures = {"turn": np.degrees(turn), "shift": 1e3 * shift}
-    if test.cause == causes.STEADY:
-        what = ("the camera on its mount", "the board on its stand")[test.at]
-        return figures | {"what": what}
-    # the odd one, or the first after
-    return figures | {"name": session.names[step.before.fit.pairs.view[test.at]]}
+    views = step.before.fit.pairs.view  # the odd one, or the first after
+    name = DRIFTING[test.at] if test.cause == causes.STEADY else session.names[views[test.at]]
+    return {"name": name, "turn": np.degrees(turn), "shift": 1e3 * shift}

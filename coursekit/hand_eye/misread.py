@@ -45,10 +45,8 @@ TEXT_ORDER = "sorted as text, img_10 before img_2"
 MOST_FIT = 0.8  # of the images, for the name of an order
 FEWEST_OF_HALF = 5  # pairs, to find X with
 ROTATION_VECTOR = "rotation_vector"
-FIXED, MOVING = (
-    ("xyz", "zyx", "xzy", "yxz", "yzx", "zxy"),
-    ("ZYX", "XYZ", "YZX", "ZXY", "XZY", "YXZ"),
-)
+FIXED = ("xyz", "zyx", "xzy", "yxz", "yzx", "zxy")
+MOVING = ("ZYX", "XYZ", "YZX", "ZXY", "XZY", "YXZ")
 TWICE = ("ZYZ", "ZXZ", "zyz", "zxz")  # about the first axis once more
 CAMERA_ON_GRIPPER_M = 0.4  # no wrist carries a camera farther away
 BOARD_IN_GRIPPER_M = 0.5  # nor a board
@@ -91,7 +89,7 @@ def other_rotations(pairs: PosePairs, expected: Floats) -> Reading | None:
     orders = ([1, 2, 3, 0], [3, 0, 1, 2])
     slips = [*(Rotation.from_quat(R.as_quat()[:, order]) for order in orders), R.inv()]
     named = zip(SENTENCES.words["other_rotations"], slips, strict=True)
-    found = [Reading("notation", w, with_rotations(pairs, R.as_matrix()).fit) for w, R in named]
+    found = [Reading("notation", w, with_rotations(pairs, S.as_matrix()).fit) for w, S in named]
     clear = [r for r in found if clearly_better(r.fit, pairs.fit, ROTATION_SHIFT_LEFT)]
     return best(clear) or undo_notation(pairs, expected)
 
@@ -244,51 +242,46 @@ def places(pairs: PosePairs) -> tuple[Floats, float] | None:
 # --- three numbers read as another three ---
 
 
-@dataclass(frozen=True)
-class Notation:
+class Notation(str):
     """How three numbers mean a rotation: SciPy's orders of Euler angles, or a rotation vector.
 
     Small letters are axes that stay, capitals those that turn with the body.
     """
 
-    order: str
-
     def rotations(self, numbers: Floats) -> Floats:
         """Rotations (m, 3, 3) of numbers (m, 3), rad."""
-        return np.asarray(turned_by(numbers, self.order).as_matrix())
+        return np.asarray(turned_by(numbers, self).as_matrix())
 
     def numbers(self, R: Floats) -> Floats:
         """The numbers (m, 3) of rotations (m, 3, 3), rad, as drivers give them."""
         turns = Rotation.from_matrix(R, assume_valid=True)
-        if self.order == ROTATION_VECTOR:
+        if self == ROTATION_VECTOR:
             return turns.as_rotvec()
-        return np.asarray(turns.as_euler(self.order, suppress_warnings=True))
+        return np.asarray(turns.as_euler(self, suppress_warnings=True))
 
     def same(self, numbers: Floats) -> Floats:
         """The two triples (2, m, 3) that mean the same but for whole turns."""
         first, second, third = np.moveaxis(numbers, -1, 0)
-        if self.order == ROTATION_VECTOR:
+        if self == ROTATION_VECTOR:
             length = np.linalg.norm(numbers, axis=-1, keepdims=True)
             return np.stack([numbers, numbers - 2 * np.pi * numbers / np.maximum(length, 1e-12)])
-        middle = -second if self.order[0].lower() == self.order[2].lower() else np.pi - second
+        middle = -second if self[0].lower() == self[2].lower() else np.pi - second
         return np.stack([numbers, np.stack([first + np.pi, middle, third + np.pi], axis=-1)])
 
     def inside(self, numbers: Floats) -> NDArray[np.bool_]:
         """(m,): whether drivers give such numbers."""
-        if self.order == ROTATION_VECTOR:
+        if self == ROTATION_VECTOR:
             return np.linalg.norm(numbers, axis=-1) < ROUNDED * np.pi
         middle = numbers[..., 1]
-        if self.order[0].lower() == self.order[2].lower():
+        if self[0].lower() == self[2].lower():
             middle = middle - np.pi / 2
         ends = np.abs(numbers[..., ::2]).max(axis=-1)
         return np.asarray((ends < ROUNDED * np.pi) & (np.abs(middle) < ROUNDED * np.pi / 2))
 
     def call(self, degrees: bool) -> str:
         """The code that reads such numbers."""
-        unit = ", degrees=True" * degrees
-        if self.order == ROTATION_VECTOR:
-            return f"Rotation.from_rotvec(v{unit})"
-        return f"Rotation.from_euler({self.order!r}, v{unit})"
+        how = "rotvec(" if self == ROTATION_VECTOR else f"euler({self!r}, "
+        return f"Rotation.from_{how}v{', degrees=True' * degrees})"
 
 
 @dataclass(frozen=True)
@@ -312,13 +305,12 @@ class Misreading:
     def says(self) -> str:
         """What was done, and what fits."""
         read, written = self.read.call(self.factor < 1), self.written.call(self.factor > 1)
-        what = "rotation vectors" if self.written.order == ROTATION_VECTOR else "Euler angles"
-        if self.written.order != ROTATION_VECTOR:
-            what += f" {self.written.order!r}"
+        vector = self.written == ROTATION_VECTOR
+        what = "rotation vectors" if vector else f"Euler angles {self.written!r}"
         what += " in degrees" * (self.factor > 1) + " in radians" * (self.factor < 1)
         line = f"{what} read by {read}; the data fit {written}"
-        orders = self.written.order, self.read.order
-        if ROTATION_VECTOR not in orders and len(set(orders)) == 2:
+        orders = self.written, self.read
+        if ROTATION_VECTOR not in orders and self.written != self.read:
             twins = "{!r} in place of {!r}".format(*(order[::-1].swapcase() for order in orders))
             line += f" (or, with the three numbers in reverse, {twins})"
         return line
@@ -330,7 +322,7 @@ class Misreading:
         """
         wanted = self.written.numbers(R)
         all_wanted = wanted[None]
-        if self.written.order == ROTATION_VECTOR:  # near pi the other one is as likely
+        if self.written == ROTATION_VECTOR:  # near pi the other one is as likely
             all_wanted = self.written.same(wanted)
         best, least = wanted, np.full(len(wanted), np.inf)
         for want in self.factor * all_wanted:
@@ -343,7 +335,7 @@ class Misreading:
 
     def _turns(self, numbers: Floats, off: Floats) -> Floats:
         """The whole turns (m, 3) nearest to `off` that leave the rotation of numbers as it is."""
-        if self.read.order != ROTATION_VECTOR:
+        if self.read != ROTATION_VECTOR:
             return np.asarray(2 * np.pi * np.round(off / (2 * np.pi)))
         axis = numbers / np.maximum(np.linalg.norm(numbers, axis=-1, keepdims=True), 1e-12)
         along = np.einsum("mi,mi->m", axis, off)
@@ -355,7 +347,7 @@ class Misreading:
         turns = 2 * np.pi * np.arange(-most, most + 1)
         found = []
         for same in self.read.same(given[None])[:, 0]:
-            if self.read.order == ROTATION_VECTOR:
+            if self.read == ROTATION_VECTOR:
                 axis = same / max(np.linalg.norm(same), 1e-12)
                 tried = same + turns[:, None] * axis
             else:
@@ -413,8 +405,8 @@ def misreadings() -> Iterator[Misreading]:
     Fixed axes in one order are moving ones in the reverse order, with the numbers in reverse too,
     so that half of the pairs of two Euler notations tell nothing new.
     """
-    vector, fixed = Notation(ROTATION_VECTOR), [Notation(order) for order in FIXED]
-    moving, twice = ([Notation(o) for o in orders] for orders in (MOVING, TWICE))
+    vector, twice = Notation(ROTATION_VECTOR), [*map(Notation, TWICE)]
+    fixed, moving = [*map(Notation, FIXED)], [*map(Notation, MOVING)]
     for factor in (1.0, 1 / PER_RADIAN):
         for euler in (*fixed, *moving):
             yield Misreading(vector, euler, factor)

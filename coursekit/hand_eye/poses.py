@@ -31,7 +31,7 @@ from scipy.spatial.transform import Rotation
 from coursekit.arrays import ArrayLike, Floats
 from coursekit.checks import array, choice, transform, transforms, want
 from coursekit.geometry import cross_matrix, invert_transform, make_transform
-from coursekit.words import wrapped
+from coursekit.words import say, wrapped
 
 Mount = Literal["eye_in_hand", "eye_to_hand"]
 MOUNTS: tuple[Mount, ...] = ("eye_in_hand", "eye_to_hand")
@@ -164,12 +164,9 @@ class Observability:
         free = "; ".join(self.free)  # of what is free nothing is known, whatever the poses' noise
         sizes = {"rotation": f"{deg} deg", "translation": f"{mm} mm"}
         determined = [size for what, size in sizes.items() if what not in free]
-        lines = (
-            f"{self.poses} poses, turned by {turns} deg (rms) about three axes, at most "
-            f"{self.largest_turn_deg:.0f} deg between two",
-            f"X would be known to {' and '.join(determined) or 'nothing'} (1 sigma, worst axis)",
-            f"NOT determined: {free}." if free else "All of X is determined.",
-        )
+        facts = {"turns": turns, "sizes": " and ".join(determined) or "nothing"}
+        left = f"NOT determined: {free}." if free else "All of X is determined."
+        lines = say("hand_eye.observable", known=self, left=left, **facts).splitlines()
         return "\n".join(map(wrapped, lines))
 
 

@@ -43,20 +43,8 @@ from coursekit.checks import array, choice, instance, settle, transform, want
 from coursekit.formats import poses as pose_files
 from coursekit.formats.poses import JOINTS, PLACE, THREE, TURN, VELOCITIES, PoseRow
 from coursekit.geometry import Intrinsics, cross_matrix, pose_difference
-from coursekit.hand_eye import refinement, views
+from coursekit.hand_eye import poses, refinement, views
 from coursekit.hand_eye.closed_form import CLOSED_FORMS, FEWEST_POSES, closed_form
-from coursekit.hand_eye.poses import (
-    FRAMES,
-    LEVER_M,
-    MOUNTS,
-    Mount,
-    base_gripper,
-    camera_board,
-    check_poses,
-    mean_pose,
-    observability,
-    stand_board,
-)
 from coursekit.results import write_bytes
 from coursekit.words import Estimate, say, wrapped
 
@@ -84,7 +72,7 @@ class HandEyeSession:
     Raises ValueError that names the argument, and the index, for what does not belong together.
     """
 
-    mount: Mount
+    mount: poses.Mount
     T_base_gripper: Floats
     seen: Detections | Floats
     board: Board | None = None
@@ -97,9 +85,9 @@ class HandEyeSession:
     arm: Arm = field(default_factory=widowx)
 
     def __post_init__(self) -> None:
-        choice("mount", self.mount, MOUNTS)
-        poses, seen = check_poses("T_base_gripper", self.T_base_gripper), self.seen
-        n = len(poses)
+        choice("mount", self.mount, poses.MOUNTS)
+        arm, seen = poses.check_poses("T_base_gripper", self.T_base_gripper), self.seen
+        n = len(arm)
         if isinstance(seen, (list, tuple)) and any(isinstance(one, Detection) for one in seen):
             seen = Detections(seen)
         if isinstance(seen, Detections):
@@ -107,10 +95,10 @@ class HandEyeSession:
                 given = getattr(self, name)
                 want(given is not None, name, given, "it: detections need board and intrinsics")
         else:
-            seen = check_poses("seen", seen)
+            seen = poses.check_poses("seen", seen)
         one_each = f"{n}, one for each arm pose (an image without a board takes its pose with it)"
         want(len(seen) == n, "seen", len(seen), one_each)
-        checked: dict[str, Any] = {"T_base_gripper": poses, "seen": seen}
+        checked: dict[str, Any] = {"T_base_gripper": arm, "seen": seen}
         for name, columns in OPTIONAL.items():
             if getattr(self, name) is not None:
                 shape = (n,) if name == "times" else (n, len(columns))
@@ -180,10 +168,8 @@ class HandEyeSession:
     def pick(self, which: Sequence[int] | Integers) -> HandEyeSession:
         """The pairs with these numbers, in this order."""
         which = np.asarray(which, int)
-        rows: dict[str, Any] = {
-            name: None if getattr(self, name) is None else getattr(self, name)[which]
-            for name in ("T_base_gripper", *OPTIONAL)
-        }
+        known = [n for n in ("T_base_gripper", *OPTIONAL) if getattr(self, n) is not None]
+        rows: dict[str, Any] = {name: getattr(self, name)[which] for name in known}
         seen = self.seen.pick(which) if isinstance(self.seen, Detections) else self.seen[which]
         names = tuple(self.names[i] for i in which)
         return replace(self, seen=seen, names=names, **rows)
@@ -245,7 +231,7 @@ class HandEyeSession:
     def from_folder(
         cls,
         folder: str | os.PathLike[str],
-        mount: Mount | None = None,
+        mount: poses.Mount | None = None,
         board: Board | None = None,
         intrinsics: Intrinsics | None = None,
         progress: bool = True,
@@ -318,24 +304,17 @@ class HandEyeSession:
         for name in self.names:
             write_bytes(place / name, images[name])
         write_bytes(place / POSES, self._csv().encode())
-        card = {
-            "mount": self.mount,
-            "board": asdict(self.board) | {"squares": list(self.board.squares)},
-            "intrinsics": self.intrinsics.to_dict(),
-            **(about or {}),
-        }
+        card: dict[str, object] = {"mount": self.mount, "board": asdict(self.board)}
+        card |= {"intrinsics": self.intrinsics.to_dict(), **(about or {})}
         write_bytes(place / SESSION, (json.dumps(card, indent=1) + "\n").encode())
 
     def _csv(self) -> str:
         turns = Rotation.from_matrix(self.T_base_gripper[:, :3, :3]).as_quat(canonical=True)
-        columns = [*PLACE, *TURN]
-        blocks = [self.T_base_gripper[:, :3, 3], turns]
-        for name, names in OPTIONAL.items():
-            if getattr(self, name) is not None:
-                columns += names
-                blocks.append(getattr(self, name).reshape(len(self), -1))
-        lines = [",".join(["file", *columns])]
-        for name, row in zip(self.names, np.hstack(blocks), strict=True):
+        known = [name for name in OPTIONAL if getattr(self, name) is not None]
+        blocks = [self.T_base_gripper[:, :3, 3], turns, *(getattr(self, name) for name in known)]
+        columns = ["file", *PLACE, *TURN, *(one for name in known for one in OPTIONAL[name])]
+        lines = [",".join(columns)]
+        for name, row in zip(self.names, np.column_stack(blocks), strict=True):
             lines.append(",".join([name, *(f"{value + 0.0:.8g}" for value in row)]))
         return "\n".join(lines) + "\n"
 
@@ -427,7 +406,7 @@ def _check_columns(columns: set[str]) -> None:
         raise ValueError(say("hand_eye.no_pose_column", **facts))
 
 
-def _stacked(rows: Sequence[PoseRow]) -> tuple[Floats, dict[str, Floats]]:
+def _stacked(rows: Sequence[PoseRow]) -> tuple[Floats, dict[str, Any]]:
     """T_base_gripper (n, 4, 4) of the rows of a table, and of `OPTIONAL` what it has."""
     known = {
         name: np.squeeze([[row.values[one] for one in names] for row in rows])
@@ -479,7 +458,7 @@ def solve(
     output is no rotation (OpenCV's Park can return a reflection, its Tsai the identity).
 
     >>> arm = widowx().forward([[0, 1.2, 1.0, 0.2, a, b] for a, b in ((0, 0), (0.5, 0), (0, 0.5))])
-    >>> seen = camera_board(arm, np.eye(4), np.eye(4), "eye_to_hand")
+    >>> seen = poses.camera_board(arm, np.eye(4), np.eye(4), "eye_to_hand")
     >>> solve(HandEyeSession("eye_to_hand", arm, seen), "park").X.round(6)[:3, 3] + 0.0
     array([0., 0., 0.])
     """
@@ -499,7 +478,7 @@ def solve(
     session = session.once
     if fk == "upright":
         want(not session.has_its_joints, "fk", fk, "'usual': the joint angles are known")
-        free = observability(session.T_base_gripper, session.mount).free
+        free = poses.observability(session.T_base_gripper, session.mount).free
         want(not free, "fk", fk, "None: the poses leave X free, and tell nothing of the arm")
     n = len(session)
     want(n >= FEWEST_POSES, "T_base_gripper", n, f"at least {FEWEST_POSES} poses that differ")
@@ -527,11 +506,10 @@ def _first(
     arm, mount, measured = session.T_base_gripper, session.mount, session.T_camera_board
     for _ in range(2):
         if guess is not None:
-            X, Y = guess, mean_pose(stand_board(arm, measured, guess, mount))
+            X, Y = guess, poses.mean_pose(poses.stand_board(arm, measured, guess, mount))
         else:
             X, Y = closed_form(arm, measured, mount, method)
-        expected = camera_board(arm, X, Y, mount)
-        before, measured = measured, session.T_camera_board
+        before, expected = measured, poses.camera_board(arm, X, Y, mount)
         if session.board_poses:
             measured = views.nearer(session.board_poses, expected)
         if np.array_equal(before, measured):
@@ -603,7 +581,7 @@ class HandEyeResult(Estimate):
     refined: refinement.Refined | None = None
 
     @property
-    def mount(self) -> Mount:
+    def mount(self) -> poses.Mount:
         """ "eye_in_hand" or "eye_to_hand"."""
         return self.session.mount
 
@@ -681,7 +659,7 @@ class HandEyeResult(Estimate):
     @cached_property
     def T_camera_board(self) -> Floats:
         """Where the camera should see the board, (n, 4, 4)."""
-        return camera_board(self.T_base_gripper, self.X, self.Y, self.mount)
+        return poses.camera_board(self.T_base_gripper, self.X, self.Y, self.mount)
 
     @cached_property
     def residuals(self) -> tuple[Floats, ...]:
@@ -716,14 +694,14 @@ class HandEyeResult(Estimate):
         Each pose puts the board somewhere on its stand (base or gripper): T X T_camera_board.
         """
         seen = views.enlarged(self.measured, self.scale)
-        places = stand_board(self.T_base_gripper, seen, self.X, self.mount)[:, :3, 3]
+        places = poses.stand_board(self.T_base_gripper, seen, self.X, self.mount)[:, :3, 3]
         return 1e3 * views.rms_length(places - places.mean(axis=0))
 
     @property
     def gripper_twists(self) -> Floats:
         """From where the arm says the gripper is to where the camera implies, (n, 6), rad and m."""
         seen = views.enlarged(self.measured, self.scale)
-        implied = base_gripper(seen, self.X, self.Y, self.mount)
+        implied = poses.base_gripper(seen, self.X, self.Y, self.mount)
         return pose_difference(self.T_base_gripper, implied)
 
     @property
@@ -741,12 +719,12 @@ class HandEyeResult(Estimate):
     @cached_property
     def free(self) -> tuple[str, ...]:
         """What the arm poses leave undetermined, in words; solvers return something anyway."""
-        return observability(self.session.T_base_gripper, self.mount).free
+        return poses.observability(self.session.T_base_gripper, self.mount).free
 
     @cached_property
     def judgement(self) -> Trust:
         """How far to trust X, and why; of a closed form only what its poses and residuals say."""
-        known, says = observability(self.session.T_base_gripper, self.mount), SENTENCES.words
+        known, says = poses.observability(self.session.T_base_gripper, self.mount), SENTENCES.words
         weak = [f"{direction}: the poses do not determine it." for direction in known.free]
         weak += [f"{self.session.repeated}."] * bool(self.session.repeated)
         if known.poses < GOOD_POSES:
@@ -755,7 +733,7 @@ class HandEyeResult(Estimate):
             weak.append(says["narrow"].format(turned=known.turns_deg[1]))
         if self.refined is not None and self.refined.alike:
             weak.append(says["alike"].format(alike=self.refined.alike))
-        ahead = (0.0, 0.0, LEVER_M)
+        ahead = (0.0, 0.0, poses.LEVER_M)
         worst = self.quantile() * self.sigma_at_mm(ahead) if self.refined else math.inf
         return Trust(worst, tuple(weak), self._disagreement(), tuple(self._broken()))
 
@@ -782,7 +760,7 @@ class HandEyeResult(Estimate):
             yield SENTENCES.words["odd"].format(names=names, times=FAR_OUT)
 
     def __repr__(self) -> str:
-        name_X, name_Y = FRAMES[self.mount]
+        name_X, name_Y = poses.FRAMES[self.mount]
         detections, fit = self.session.detections, self.refined
         corners = pixels = ""
         if detections is not None:
@@ -840,8 +818,8 @@ class HandEyeResult(Estimate):
 
     @property
     def _untold(self) -> str:
-        poses, least = len(self.session), refinement.FEWEST_TOLD
-        return f"how far off it is cannot be told from {poses} poses, {least} is the least"
+        n, least = len(self.session), refinement.FEWEST_TOLD
+        return f"how far off it is cannot be told from {n} poses, {least} is the least"
 
     def verdict(self) -> str:
         """In words: how far to trust X, and what to do about what is weak."""
@@ -861,8 +839,8 @@ class HandEyeResult(Estimate):
             return f"{judged.grade}: the intervals hold for sessions without such faults only."
         if math.isinf(judged.worst_mm):
             return f"{judged.grade} how good it is: {self._untold}."
-        reaches = SENTENCES.words["reaches"].format(ahead=1e3 * LEVER_M, worst=judged.worst_mm)
-        return f"{judged.grade}: {reaches}"
+        reaches, ahead = SENTENCES.words["reaches"], 1e3 * poses.LEVER_M
+        return f"{judged.grade}: {reaches.format(ahead=ahead, worst=judged.worst_mm)}"
 
     def sigma_at_mm(self, point: ArrayLike) -> float:
         """Standard deviation, mm, worst direction, of where X puts a point (3,), m, of the camera.

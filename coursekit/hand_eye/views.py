@@ -140,18 +140,13 @@ class BoardPose:
     T_camera_board (4, 4), m. covariance (6, 6): of its twist (omega, v) in the camera's axes, rad
     and m, from the residuals of this image. rms_px: of the residual vectors (2-D). other: the
     second pose of a flat board, its normal mirrored about the line of sight, where the image cannot
-    tell the two apart (`ambiguous`); None where it can.
+    tell the two apart; None where it can.
     """
 
     T_camera_board: Floats
     covariance: Floats
     rms_px: float
     other: Floats | None = None
-
-    @property
-    def ambiguous(self) -> bool:
-        """Whether a second pose explains the image about as well."""
-        return self.other is not None
 
 
 def board_poses(

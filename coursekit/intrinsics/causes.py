@@ -373,11 +373,11 @@ class Calibration:
         all do.
         """
         fields = engine.Hypothesis("smooth", self._by_view(self._fields), typical=PRIOR_PX)
-        return self.plain.explains(fields).tested().strength
+        return self.plain.explains(fields).strength
 
     def tested(self, hypotheses: Sequence[engine.Hypothesis]) -> list[engine.Tested]:
         """The test of each hypothesis; the fair p-value only of those that can be accepted."""
-        tests = [self.plain.explains(hypothesis).tested() for hypothesis in hypotheses]
+        tests = [self.plain.explains(hypothesis) for hypothesis in hypotheses]
         physical = sorted(t.strength for t in tests if t.cause in PHYSICAL)
         least = max(physical[-FAIR:][0] if physical else math.inf, 0.0)
         fair = [t.cause in PHYSICAL and t.strength >= least for t in tests]
@@ -390,11 +390,10 @@ class Calibration:
         itself does not pass for noise; with noisier views (blur) the plain F would be too large
         too often.
         """
-        explained = self.plain.explains(hypothesis)
-        test = explained.tested()
+        test = self.plain.explains(hypothesis)
         if test.cause not in PHYSICAL:
             return test
-        fair = self.projection(self._noise_weights(explained))
+        fair = self.projection(self._noise_weights(test))
         return replace(test, log_p=fair.explains(hypothesis).log_p)
 
     def matters(self, test: engine.Tested) -> bool:
@@ -452,7 +451,7 @@ class Calibration:
     def _noise_weights(self, explained: engine.Explained) -> Floats:
         """1 / sigma of each corner (N,), from the residuals of its view, shrunk to the common."""
         squares = (explained.after.reshape(-1, 2) ** 2).sum(axis=1)
-        dof = max(explained.dof - int(explained.visible.sum()), 1)
+        dof = max(explained.dof, 1)
         common, own_dof = squares.sum() / dof, np.bincount(self.index) * dof / len(squares)
         own = np.bincount(self.index, squares)
         variance = (own + SHRINK_DOF * common) / (own_dof + SHRINK_DOF)
@@ -852,7 +851,7 @@ def fit_shape(result: IntrinsicsResult) -> IntrinsicsResult:
     want(model.shows_shape, "result", f"{len(model.views)} views and {sights:.1f} sights", wanted)
     for cause in (STRETCH, HEIGHTS, PRINT, HEIGHTS):  # the heights again, with the print known
         less = without(model, (cause,))
-        model = less.with_cause(less.plain.explains(less.hypothesis(cause)).tested())
+        model = less.with_cause(less.plain.explains(less.hypothesis(cause)))
     return shaped(model, result)
 
 

@@ -259,7 +259,7 @@ def _wrong_lens(start: Calibration) -> Finding | None:
         model = start
         if start.shows_shape:  # paper that is no plane passes for a lens, and the reverse
             heights = start.plain.explains(start.hypothesis(causes.HEIGHTS))
-            model = start.with_cause(heights.tested())
+            model = start.with_cause(heights)
         rival, p_value = causes.as_fisheye(model)
         gain = model.left_px**2 - rival.left_px**2
         held = max(model.left_px**2 - model.noise_px**2, 0.0)

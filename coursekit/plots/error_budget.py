@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.patches import Ellipse, Rectangle
 
 from coursekit.arrays import ArrayLike
-from coursekit.attribution import SimulatedMisses
+from coursekit.attribution.verdict import SimulatedMisses
 from coursekit.budget import ErrorBudget, Gripper, Target
 from coursekit.plots.style import COLORS, LessonFigure, panels, single
 

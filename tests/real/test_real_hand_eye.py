@@ -55,4 +55,4 @@ def test_the_published_pose_of_the_board_has_the_old_origin(real_data, old_origi
     away = np.linalg.norm(pose.T_camera_board[:3, 3] - BOARD_M)
     assert away == pytest.approx(off_m, abs=2e-3)
     assert pose.rms_px < 0.4
-    assert not pose.ambiguous
+    assert pose.other is None
