@@ -210,10 +210,12 @@ def submit(
     )
     data = bundle_bytes(whole)  # Refused for what no bundle can hold
     path = (Path(folder) if folder else results.folder()) / bundle_name(name)
-    if name and path.exists() and not overwrite:
-        there = f"{relative(path)} is there already and stays as it is."
-        return Handed(None, f"{there} To replace it: `overwrite=True` (or --overwrite).")
     says = shortcomings(whole)
+    if name and path.exists() and not overwrite:
+        there = f"{relative(path)} is there already and stays as it is, with what you said before. "
+        there += "To replace it: `overwrite=True` (or --overwrite)."
+        there += " Of what you say now the grader would say:" if says else ""
+        return Handed(None, there, says)
     if not name:
         headline = "Nothing is written yet: a bundle needs your name (`student`)."
         headline += " This is what the grader would say:" if says else ""
