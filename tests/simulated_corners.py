@@ -24,7 +24,7 @@ LENSES = [
     Intrinsics(848, 480, 425, 426, 424, 238, "brown_conrady", (-0.05, 0.06, 5e-4, 3e-4, -0.02)),
     Intrinsics(1280, 720, 918, 917, 642, 362, "brown_conrady", (0.12, -0.25, 8e-4, 4e-4, 0.1)),
 ]
-BOARDS = [Board("charuco", (9, 6), 0.025), Board("checkerboard", (10, 7), 0.025)]
+BOARDS = [CHARUCO, CHECKERBOARD]
 # Fisheyes of 120 to 160 degrees across the diagonal, and wide lenses that are a quotient of two
 # polynomials, which grows all the way: five coefficients leave two to eight times the noise.
 QUOTIENT = {"model": "brown_conrady", "coeffs": (0.12, 0.0, 0.0, 0.0, 0.0)}

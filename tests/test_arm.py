@@ -7,12 +7,10 @@ from scipy.linalg import block_diag
 
 from coursekit import arm as arms
 from coursekit.arm import ArmErrors, SimulatedArm, fk_covariance, widowx
-from coursekit.boards import Board
 from coursekit.geometry import pose_difference
 
 UNITS = 400 if NIGHTLY else 60
 NONE = ArmErrors(0.0, 0.0, 0.0, 0.0)
-BOARD = Board("charuco", (9, 6), 0.025)
 
 
 @pytest.fixture(scope="module")

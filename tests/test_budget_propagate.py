@@ -89,7 +89,7 @@ def test_displacements_are_those_of_the_composed_transforms(mount: str) -> None:
 @pytest.mark.parametrize("Z", [0.25, 0.45, 0.8])
 def test_first_order_over_the_working_volume(mount: str, Z: float) -> None:
     """Every variance within 3 % for turns of 1 degree about each axis, over the whole image."""
-    for u, v in CORNERS:
+    for u, v in CORNERS if NIGHTLY else CORNERS[::2]:
         check = eb.check_first_order(chain(mount, LESSON_CAMERA, Z, u, v), errors(Z, 1.0), SAMPLES)
         assert check.worst < 0.03, (u, v, check)
 
@@ -127,11 +127,11 @@ def bare(Z: float, turn_deg: float) -> eb.Covariances:
 def test_where_first_order_fails() -> None:
     """Along the axis a turn shortens by theta²/2, whatever its sign: not in the first order."""
     near = chain("eye_to_hand", LESSON_CAMERA, 0.25, 424.0, 240.0)
-    good = eb.check_first_order(near, bare(0.25, 1 / math.sqrt(3)), 300_000)  # 1 degree in all
+    good = eb.check_first_order(near, bare(0.25, 1 / math.sqrt(3)), 100_000)  # 1 degree in all
     assert good.worst < 0.03
-    poor = eb.check_first_order(near, bare(0.25, 1.0), 300_000)
+    poor = eb.check_first_order(near, bare(0.25, 1.0), 100_000)
     assert 0.05 < poor.worst < 0.2
-    bad = eb.check_first_order(near, bare(0.25, 5.0), 300_000)
+    bad = eb.check_first_order(near, bare(0.25, 5.0), 100_000)
     assert bad.ratio[2] < 0.2
     # E(omega_x² + omega_y²) / 2 = sigma²: the mean rises towards the camera by Z sigma²
     assert bad.mean_m[2] == pytest.approx(0.25 * math.radians(5) ** 2, rel=0.02)

@@ -15,10 +15,10 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from common import EXPECTED, NIGHTLY
+from common import CHARUCO, CHECKERBOARD, EXPECTED, NIGHTLY
 from scipy.spatial.transform import Rotation
 
-from coursekit.boards import Board, Detection, detect, detect_all
+from coursekit.boards import Detection, detect, detect_all
 from coursekit.cameras import Camera, CameraError, Frame, simulated
 from coursekit.cameras import capture as module
 from coursekit.cameras.capture import LiveImage, Screen, Sight, capture, guidance, is_still, outline
@@ -27,8 +27,6 @@ from coursekit.geometry import Intrinsics, make_transform, project, transform_po
 from coursekit.simulation.board_images import render_board
 from coursekit.simulation.corner_sessions import corner_session
 
-BOARD = Board("charuco", (9, 6), 0.025)
-CHECKERS = Board("checkerboard", (10, 7), 0.025)
 LENS = Intrinsics(640, 480, 613.2, 613.4, 319.9, 239.2)
 DEPTH = np.zeros((480, 848), np.uint16)
 
@@ -37,7 +35,7 @@ def kind(board):
     return board.kind
 
 
-def pose(angles_deg, at_m, board=BOARD):
+def pose(angles_deg, at_m, board=CHARUCO):
     R = Rotation.from_euler("xyz", angles_deg, degrees=True)
     return make_transform(R, np.array(at_m) - R.apply(board.middle))
 
@@ -75,7 +73,7 @@ def same_pictures_once():
 def picture(pose_bytes, velocity):
     """A noisy picture, rendered once for all tests."""
     T, rng = np.frombuffer(pose_bytes).reshape(4, 4), np.random.default_rng(zlib.crc32(pose_bytes))
-    return render_board(BOARD, T, LENS, rng, velocity=velocity)
+    return render_board(CHARUCO, T, LENS, rng, velocity=velocity)
 
 
 class HeldBoard(Camera):
@@ -136,7 +134,7 @@ def same(one, two):
 
 
 def test_the_simulated_camera_is_moved_and_says_so(tmp_path, capsys):
-    seen = capture(SimulatedCamera(), BOARD, 4, tmp_path / "views")
+    seen = capture(SimulatedCamera(), CHARUCO, 4, tmp_path / "views")
     assert capsys.readouterr().out == (
         "4 views of the Simulated D435 in views: there is no board to hold, so the simulated "
         "camera was moved.\n"
@@ -144,13 +142,13 @@ def test_the_simulated_camera_is_moved_and_says_so(tmp_path, capsys):
     assert pictures(tmp_path / "views") == [view.name for view in seen]
     assert [view.name for view in seen] == [f"view_{number:03d}.png" for number in range(4)]
     assert all(len(view) >= 16 for view in seen)
-    same(detect_all(tmp_path / "views", BOARD, progress=False), seen)
+    same(detect_all(tmp_path / "views", CHARUCO, progress=False), seen)
     assert list((tmp_path / "views").glob("*.part")) == []
     card = json.loads((tmp_path / "views" / "session.json").read_text(encoding="utf-8"))
     assert (card["serial"], card["board"]["squares"]) == ("seed-7", [9, 6])
 
 
-@pytest.mark.parametrize("board", [BOARD, *([CHECKERS] if NIGHTLY else [])], ids=kind)
+@pytest.mark.parametrize("board", [CHARUCO, *([CHECKERBOARD] if NIGHTLY else [])], ids=kind)
 def test_twenty_guided_views_lack_nothing_and_determine_the_lens(board, tmp_path):
     camera = SimulatedCamera()
     seen = capture(camera, board, 20, tmp_path)
@@ -184,32 +182,32 @@ def interrupt_after(monkeypatch, views):
 def test_ctrl_c_keeps_what_came_and_the_next_call_goes_on(tmp_path, monkeypatch, capsys):
     with monkeypatch.context() as patch:
         interrupt_after(patch, 2)
-        seen = capture(SimulatedCamera(), BOARD, 4, tmp_path / "stopped")
+        seen = capture(SimulatedCamera(), CHARUCO, 4, tmp_path / "stopped")
     assert len(seen) == 2
     assert capsys.readouterr().out.startswith("2 of 4 views of the Simulated D435 in stopped")
     assert pictures(tmp_path / "stopped") == ["view_000.png", "view_001.png"]
-    went_on = capture(SimulatedCamera(), BOARD, 4, tmp_path / "stopped")
-    same(went_on, capture(SimulatedCamera(), BOARD, 4, tmp_path / "at once"))
+    went_on = capture(SimulatedCamera(), CHARUCO, 4, tmp_path / "stopped")
+    same(went_on, capture(SimulatedCamera(), CHARUCO, 4, tmp_path / "at once"))
     for name in pictures(tmp_path / "at once"):
         stored = [(tmp_path / folder / name).read_bytes() for folder in ("stopped", "at once")]
         assert stored[0] == stored[1]
-    other_unit = capture(SimulatedCamera(seed=8), BOARD, 1, tmp_path / "other")
+    other_unit = capture(SimulatedCamera(seed=8), CHARUCO, 1, tmp_path / "other")
     assert (other_unit[0].pixels[0] != went_on[0].pixels[0]).all()
 
 
 def test_ctrl_c_before_the_first_view_is_passed_on(tmp_path, monkeypatch):
     interrupt_after(monkeypatch, 0)
     with pytest.raises(KeyboardInterrupt):
-        capture(SimulatedCamera(), BOARD, 4, tmp_path)
+        capture(SimulatedCamera(), CHARUCO, 4, tmp_path)
     assert pictures(tmp_path) == []
 
 
 def test_a_camera_that_dies_half_way_leaves_its_views(tmp_path):
     dying = HeldBoard(POSES[:2], then=CameraError("the Stub D435 stopped giving frames"))
     with pytest.raises(CameraError, match=r"stopped giving frames\. 2 views are kept in .*views"):
-        capture(dying, BOARD, 3, tmp_path / "views")
+        capture(dying, CHARUCO, 3, tmp_path / "views")
     assert pictures(tmp_path / "views") == ["view_000.png", "view_001.png"]
-    seen = capture(HeldBoard(POSES), BOARD, 3, tmp_path / "views")
+    seen = capture(HeldBoard(POSES), CHARUCO, 3, tmp_path / "views")
     assert len(seen) == 3
 
 
@@ -218,27 +216,27 @@ def test_a_picture_is_there_whole_or_not_at_all(tmp_path, monkeypatch):
         Path.open(self, "wb").close()
         raise OSError(28, "No space left on device")
 
-    capture(SimulatedCamera(), BOARD, 1, tmp_path)
+    capture(SimulatedCamera(), CHARUCO, 1, tmp_path)
     monkeypatch.setattr(Path, "write_bytes", full_disk)
     with pytest.raises(OSError, match="No space left"):
-        capture(SimulatedCamera(), BOARD, 2, tmp_path)
+        capture(SimulatedCamera(), CHARUCO, 2, tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["session.json", "view_000.png"]
 
 
 def test_a_damaged_picture_is_named_and_another_one_taken(tmp_path):
-    capture(SimulatedCamera(), BOARD, 2, tmp_path)
+    capture(SimulatedCamera(), CHARUCO, 2, tmp_path)
     (tmp_path / "view_000.png").write_bytes(b"not a picture")
-    seen = capture(SimulatedCamera(), BOARD, 2, tmp_path)
+    seen = capture(SimulatedCamera(), CHARUCO, 2, tmp_path)
     assert [view.name for view in seen] == ["view_001.png", "view_002.png"]
     assert [skip.name for skip in seen.skipped] == ["view_000.png"]
 
 
 @pytest.mark.parametrize("other", ["camera", "board", "nobody"])
 def test_a_folder_of_something_else_is_left_alone(other, tmp_path):
-    capture(SimulatedCamera(), BOARD, 1, tmp_path)
+    capture(SimulatedCamera(), CHARUCO, 1, tmp_path)
     before = (tmp_path / "view_000.png").read_bytes()
     camera = SimulatedCamera(seed=8) if other == "camera" else SimulatedCamera()
-    board = CHECKERS if other == "board" else BOARD
+    board = CHECKERBOARD if other == "board" else CHARUCO
     if other == "nobody":
         (tmp_path / "session.json").unlink()
     with pytest.raises(ValueError, match=r"^folder: .* holds 1 views of .* overwrite=True"):
@@ -253,48 +251,48 @@ def test_a_folder_of_something_else_is_left_alone(other, tmp_path):
 
 def test_a_view_is_taken_of_each_pose_that_is_held_and_of_none_on_the_way(tmp_path, capsys):
     camera = HeldBoard(POSES)
-    seen = capture(camera, BOARD, 10, tmp_path / "views")
+    seen = capture(camera, CHARUCO, 10, tmp_path / "views")
     assert capsys.readouterr().out == "3 of 10 views of the Stub D435 in views.\n"
     assert camera.locked == 1
     for view, T in zip(seen, POSES, strict=True):
-        expected = project(transform_points(T, BOARD.points[view.ids]), LENS.K)
+        expected = project(transform_points(T, CHARUCO.points[view.ids]), LENS.K)
         assert np.sqrt(((view.pixels - expected) ** 2).mean()) < 0.25  # the hand trembles
         image = cv2.imread(str(tmp_path / "views" / view.name), cv2.IMREAD_UNCHANGED)
         assert image.shape == (480, 640)
-        np.testing.assert_array_equal(detect(image, BOARD).pixels, view.pixels)
+        np.testing.assert_array_equal(detect(image, CHARUCO).pixels, view.pixels)
 
 
 def test_it_stops_as_soon_as_there_are_enough_views(tmp_path):
     camera = HeldBoard(POSES)
-    assert len(capture(camera, BOARD, 1, tmp_path)) == 1
+    assert len(capture(camera, CHARUCO, 1, tmp_path)) == 1
     assert len(camera.shown) == 3 + module.STILL_FRAMES
-    assert len(capture(camera, BOARD, 1, tmp_path)) == 1
+    assert len(capture(camera, CHARUCO, 1, tmp_path)) == 1
     assert camera.streams == 1  # the folder holds enough
 
 
 def test_a_pose_is_not_taken_twice_nor_when_it_is_not_held_long_enough(tmp_path):
     short = HeldBoard(POSES, held=module.STILL_FRAMES - 1)
-    assert len(capture(short, BOARD, 10, tmp_path)) == 0
-    assert len(capture(HeldBoard((POSES[0], POSES[1], POSES[0])), BOARD, 10, tmp_path)) == 2
+    assert len(capture(short, CHARUCO, 10, tmp_path)) == 0
+    assert len(capture(HeldBoard((POSES[0], POSES[1], POSES[0])), CHARUCO, 10, tmp_path)) == 2
 
 
 def test_it_gives_up_when_no_view_comes(tmp_path):
     with pytest.raises(CameraError, match=r"no still, new and sharp view .* within 0.5 s.*1 views"):
-        capture(HeldBoard((POSES[0],) * 5), BOARD, 10, tmp_path, timeout_s=0.5)
+        capture(HeldBoard((POSES[0],) * 5), CHARUCO, 10, tmp_path, timeout_s=0.5)
 
 
 def test_a_camera_without_colour_is_refused(tmp_path):
     with pytest.raises(CameraError, match="gave an image without colour"):
-        capture(HeldBoard(POSES, color=False), BOARD, 3, tmp_path)
+        capture(HeldBoard(POSES, color=False), CHARUCO, 3, tmp_path)
     grey = HeldBoard(POSES)
     grey.color = None
     with pytest.raises(CameraError, match="has no colour stream"):
-        capture(grey, BOARD, 3, tmp_path)
+        capture(grey, CHARUCO, 3, tmp_path)
 
 
 @pytest.mark.parametrize(("change", "message"), EXPECTED["bad_captures"])
 def test_refuses_bad_arguments_before_any_work(change, message, tmp_path):
-    given = {"board": BOARD, "folder": tmp_path / "new"} | change
+    given = {"board": CHARUCO, "folder": tmp_path / "new"} | change
     with pytest.raises(ValueError, match=message):
         capture(SimulatedCamera(), **given)
     assert not (tmp_path / "new").exists()
@@ -306,7 +304,7 @@ def test_refuses_bad_arguments_before_any_work(change, message, tmp_path):
 def moving(px_per_frame, frames, noise_px=0.05, seed=0):
     """Detections of a board that moves by so much a frame."""
     rng = np.random.default_rng(seed)
-    pixels = project(transform_points(POSES[0], BOARD.points), LENS.K)
+    pixels = project(transform_points(POSES[0], CHARUCO.points), LENS.K)
     ids, views = np.arange(len(pixels)), []
     for step in np.outer(np.arange(frames), px_per_frame):
         seen = pixels + step + noise_px * rng.standard_normal(pixels.shape)
@@ -330,7 +328,7 @@ def test_a_slow_motion_is_not_still():
 # --- what to take next ---
 
 
-def session(poses, board=BOARD):
+def session(poses, board=CHARUCO):
     """Noiseless detections of a board in these poses, corners outside the image left out."""
     views = []
     for T in poses:
@@ -340,7 +338,7 @@ def session(poses, board=BOARD):
     return views
 
 
-@pytest.mark.parametrize("board", [BOARD, CHECKERS], ids=kind)
+@pytest.mark.parametrize("board", [CHARUCO, CHECKERBOARD], ids=kind)
 def test_an_empty_session_lacks_everything_and_the_first_view_is_one_that_can_be_taken(board):
     guide = guidance([], board, LENS)
     kinds = [text.split(":")[0] for text in guide.missing]
@@ -351,7 +349,7 @@ def test_an_empty_session_lacks_everything_and_the_first_view_is_one_that_can_be
 
 def test_flat_views_lack_all_tilts():
     flat = [pose((0, 0, 10 * n), (0.02 * n - 0.05, 0.0, 0.3 + 0.05 * n)) for n in range(6)]
-    lacks = guidance(session(flat), BOARD, LENS).missing
+    lacks = guidance(session(flat), CHARUCO, LENS).missing
     assert [text for text in lacks if text.startswith("tilt")] == [
         f"tilt: {edge} edge away, 0 of 3 views" for edge in ("left", "right", "top", "bottom")
     ]
@@ -360,35 +358,35 @@ def test_flat_views_lack_all_tilts():
 @pytest.mark.parametrize("angles_deg", [(30, 0, 0), (-30, 0, 0), (0, 30, 0), (0, -30, 0)])
 def test_a_tilt_counts_for_the_edge_that_is_farther_away(angles_deg):
     T = pose(angles_deg, (0, 0, 0.45))
-    farthest = BOARD.points[transform_points(T, BOARD.points)[:, 2].argmax()] - BOARD.middle
+    farthest = CHARUCO.points[transform_points(T, CHARUCO.points)[:, 2].argmax()] - CHARUCO.middle
     axis = 0 if angles_deg[1] else 1
     away = (("left", "right"), ("top", "bottom"))[axis][int(farthest[axis] > 0)]
-    lacks = guidance(session([T] * 3), BOARD, LENS).missing
+    lacks = guidance(session([T] * 3), CHARUCO, LENS).missing
     lacking = {text.split()[1] for text in lacks if text.startswith("tilt")}
     assert lacking == {"left", "right", "top", "bottom"} - {away}
 
 
 def test_views_at_one_distance_and_in_one_corner_are_named():
     corner = [pose((5 * n, 0, 0), (-0.12, -0.09, 0.5)) for n in range(4)]
-    lacks = guidance(session(corner), BOARD, LENS).missing
+    lacks = guidance(session(corner), CHARUCO, LENS).missing
     assert "distance: all views between 0.50 and 0.50 m" in lacks
     (coverage,) = (text for text in lacks if text.startswith("coverage"))
     assert coverage.split("most ")[1] in ("at the bottom", "at the bottom right", "at the right")
 
 
 def test_blurred_views_are_named():
-    views, _ = corner_session(BOARD, LENS, seed=1, views=10)
+    views, _ = corner_session(CHARUCO, LENS, seed=1, views=10)
     blurs = [(0.4 + 4.0 * (number < 2)) * np.eye(2) for number in range(10)]
     views = [Detection(v.ids, v.pixels, v.size, blur=b) for v, b in zip(views, blurs, strict=True)]
-    lacks = guidance(views, BOARD, LENS).missing
+    lacks = guidance(views, CHARUCO, LENS).missing
     assert "sharpness: 2 of 10 views are blurred" in lacks
 
 
 def test_the_words_describe_the_target():
     seen = []
     for _ in range(12):
-        guide = guidance(session(seen), BOARD, LENS)
-        middle = transform_points(guide.target, BOARD.middle)
+        guide = guidance(session(seen), CHARUCO, LENS)
+        middle = transform_points(guide.target, CHARUCO.middle)
         assert f"{middle[2]:.2f} m from the camera" in guide.next
         u, v = project(middle, LENS.K)
         assert ("left" in guide.next.split(",")[0]) == (u < 640 / 3)
@@ -401,7 +399,7 @@ def test_the_words_describe_the_target():
 
 
 def test_the_outline_is_the_pattern_s_edge():
-    for board in (BOARD, CHECKERS):
+    for board in (CHARUCO, CHECKERBOARD):
         ring = outline(board, pose((0, 0, 0), (0, 0, 0.5), board), LENS)
         half = np.array(board.size_m) / 2 / 0.5 * [LENS.fx, LENS.fy]
         expected = [LENS.cx, LENS.cy] + half * [[-1, -1], [1, -1], [1, 1], [-1, 1]]
@@ -412,16 +410,16 @@ def test_the_outline_is_the_pattern_s_edge():
 
 
 def test_the_live_image_shows_what_is_seen_taken_and_wanted(capsys):
-    live = LiveImage(BOARD, LENS, 28)
+    live = LiveImage(CHARUCO, LENS, 28)
     assert capsys.readouterr() == ("", "")  # a widget that prints while it is built shows nothing
     views = session(POSES[:2])
-    guide = guidance(views[:1], BOARD, LENS)
+    guide = guidance(views[:1], CHARUCO, LENS)
     live.say("Locked exposure at 8 ms.")
     black = np.zeros((480, 640), np.uint8)
     live.show(Sight(black, views[1], guide, views[:1]))
     image = cv2.imdecode(np.frombuffer(live._image.value, np.uint8), cv2.IMREAD_COLOR)
     assert image.shape == (480, 640, 3)
-    ring = outline(BOARD, guide.target, LENS)
+    ring = outline(CHARUCO, guide.target, LENS)
     between = np.linspace(ring, np.roll(ring, -1, axis=0), 9).reshape(-1, 2)
     inside = between[((between > 4) & (between < np.array(LENS.size) - 5)).all(axis=1)]
     assert len(inside) > 12
@@ -442,7 +440,7 @@ def test_in_a_notebook_the_live_image_is_displayed_once(tmp_path, monkeypatch, c
     shown = []
     monkeypatch.setattr("IPython.get_ipython", lambda: SimpleNamespace(kernel="a kernel"))
     monkeypatch.setattr("IPython.display.display", shown.append)
-    capture(HeldBoard(POSES[:1]), BOARD, 1, tmp_path / "views")
+    capture(HeldBoard(POSES[:1]), CHARUCO, 1, tmp_path / "views")
     assert [type(one) for one in shown] == [LiveImage]
     assert "<b>0 of 1 views.</b> Locked exposure at 8 ms." in shown[0]._words.value
     assert capsys.readouterr() == ("1 views of the Stub D435 in views.\n", "")

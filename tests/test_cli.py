@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from common import EXPECTED
+from common import CHARUCO, EXPECTED
 from fake_realsense import real_library
 
 from coursekit import cli
@@ -21,7 +21,6 @@ from coursekit.specifications import DATA
 from coursekit.words import Estimate, Finding, Findings
 
 FINDINGS = Path(cli.__file__).with_name("findings.toml")
-CHARUCO = Board("charuco", (9, 6), 0.025)
 
 
 @pytest.mark.usefixtures("small_cameras")

@@ -640,7 +640,6 @@ def test_a_log_without_names_goes_in_order_only_if_told(few) -> None:
 OPTICAL = make_transform(Rotation.from_euler("xyz", [-np.pi / 2, 0, -np.pi / 2]), np.zeros(3))
 BESIDE = OPTICAL.copy()
 BESIDE[:3, 3] = -0.0005, 0.0149, 0.0002
-FROM = {"x": 0, "y": 1, "z": 2}
 POINT = np.array([0.03, -0.05, 0.4])
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from common import CHARUCO, CHECKERBOARD
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from simulated_corners import dense_jacobian
@@ -19,8 +20,6 @@ from coursekit.plots import intrinsics as figures
 from coursekit.simulation.corner_sessions import Effects, corner_session
 from tools import build_notebooks
 
-BOARD = ck.boards.Board("charuco", squares=(9, 6), square_m=0.025)
-CHECKERBOARD = ck.boards.Board("checkerboard", squares=(10, 7), square_m=0.025)
 LENS = ck.specifications.device("D435").unit.color
 PINHOLE = Intrinsics(640, 480, 600.0, 610.0, 322.0, 236.0)
 
@@ -120,12 +119,12 @@ def test_three_facts_give_f_and_its_sigma_goes_as_one_over_the_tilt_squared() ->
 def test_the_corners_of_p_accept_both_cameras_and_those_of_q_only_one() -> None:
     lens = ck.specifications.lens("moveit_camera").intrinsics
     of = {
-        "P": corner_session(BOARD, lens, seed=28, effects=Effects(max_tilt_deg=3))[0],
-        "Q": corner_session(BOARD, lens, seed=22)[0],
+        "P": corner_session(CHARUCO, lens, seed=28, effects=Effects(max_tilt_deg=3))[0],
+        "Q": corner_session(CHARUCO, lens, seed=22)[0],
     }
-    K = {name: ck.intrinsics.calibrate(views, BOARD) for name, views in of.items()}
+    K = {name: ck.intrinsics.calibrate(views, CHARUCO) for name, views in of.items()}
     rms = {
-        (k, c): ck.intrinsics.rms_under(K[k].intrinsics, of[c], BOARD.points)
+        (k, c): ck.intrinsics.rms_under(K[k].intrinsics, of[c], CHARUCO.points)
         for k in of
         for c in of
     }
@@ -139,7 +138,7 @@ def test_halves_tell_bow_and_shutter_from_noise_and_share_the_bias() -> None:
     rooms = {"bow": Effects(bow_m=1e-3), "shutter": Effects(readout_s=0.02, speed_m_s=0.1)}
     rooms |= {"healthy": Effects(), "blur": Effects(blur_px=3), "one": Effects(spoiled_px=3)}
     both = {
-        name: ck.intrinsics.halves(corner_session(BOARD, LENS, 5, effects=effects)[0], BOARD)
+        name: ck.intrinsics.halves(corner_session(CHARUCO, LENS, 5, effects=effects)[0], CHARUCO)
         for name, effects in rooms.items()
     }
     assert {name: h.noise_p_value < 1e-6 for name, h in both.items()} == {
@@ -176,7 +175,7 @@ def test_photographs_count_from_their_folder_to_the_file_that_is_kept(
     source = {c["id"]: build_notebooks.joined(c["source"]) for c in notebook["cells"]}
     own = source["capture"].replace("my_photos = None", f"my_photos = {str(folder)!r}")
     camera = ck.open_camera("simulated", seed=7)
-    names = {"ck": ck, "np": np, "camera": camera, "board": BOARD, "my_fx_px": (600, 620)}
+    names = {"ck": ck, "np": np, "camera": camera, "board": CHARUCO, "my_fx_px": (600, 620)}
     cells = map(source.get, ("views-figure", "fit", "factory-code", "reveal", "save"))
     for cell in (own, *cells):
         exec(str(cell), names)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from common import by_opencv
+from common import CHARUCO, by_opencv
 from matplotlib.colors import to_rgb
 from matplotlib.patches import Ellipse
 
@@ -216,7 +216,6 @@ def test_reciprocal_is_the_derivative() -> None:
 
 # --- notebook 03 ---
 
-BOARD = boards.Board("charuco", (9, 6), 0.025)
 SESSION = specifications.DATA / "intrinsics_session"
 
 
@@ -231,14 +230,14 @@ def toy(tilt_deg: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def intrinsics_figures() -> dict[str, plots.LessonFigure]:
-    found, _ = corner_session(BOARD, D435.color, seed=1, views=10)
-    flat, _ = corner_session(BOARD, D435.color, seed=1, views=10, effects=Effects(max_tilt_deg=8))
-    two = {"P": calibrate(flat, BOARD), "Q": calibrate(found, BOARD)}
+    found, _ = corner_session(CHARUCO, D435.color, seed=1, views=10)
+    flat, _ = corner_session(CHARUCO, D435.color, seed=1, views=10, effects=Effects(max_tilt_deg=8))
+    two = {"P": calibrate(flat, CHARUCO), "Q": calibrate(found, CHARUCO)}
     X, Y, seen = toy(30)
     shipped = [SESSION / f"view_0{n}.jpg" for n in (0, 1)]
     return {
         "best_fits": intrinsics.best_fits(X, Y, {"30 deg": seen}, 600.0),
-        "views": intrinsics.views(str(SESSION), boards.detect_all(shipped, BOARD, False)),
+        "views": intrinsics.views(str(SESSION), boards.detect_all(shipped, CHARUCO, False)),
         "coverage": intrinsics.coverage(two["Q"]),
         "residuals": intrinsics.residuals(two["Q"]),
         "uncertainty": intrinsics.uncertainty(two, 0.45),
@@ -251,10 +250,10 @@ def intrinsics_figures() -> dict[str, plots.LessonFigure]:
 
 
 def test_outlines_are_opencvs() -> None:
-    found, _ = corner_session(BOARD, D435.color, seed=1, views=10)
-    result = calibrate(found, BOARD)
+    found, _ = corner_session(CHARUCO, D435.color, seed=1, views=10)
+    result = calibrate(found, CHARUCO)
     T, lens = result.T_camera_board[3], result.intrinsics
-    rim = BOARD.points[[0, 7, 39, 32]]
+    rim = CHARUCO.points[[0, 7, 39, 32]]
     seen = by_opencv(rim, T, lens)
     assert intrinsics.outlines(result)[3] == pytest.approx(seen, abs=1e-6)
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from coursekit.arrays import Floats
+from coursekit.lessons import questions
 from coursekit.lessons.exercises import Exercise, Step, Steps
 
 # --- sensitivities ---
@@ -27,14 +28,6 @@ def _prices(u: float, Z: float, fx: float, cx: float, depth_error: float) -> Any
     return dX_du, dX_dZ, off / fx * depth_error
 
 
-def _prices_by_differences(u: float, Z: float, fx: float, cx: float, depth_error: float) -> Any:
-    step = 0.5
-    X = (u - cx) * Z / fx
-    dX_du = ((u + step - cx) * Z / fx - X) / step
-    dX_dZ = ((u - cx) * (Z + step) / fx - X) / step
-    return dX_du, dX_dZ, (u - cx) * (Z + depth_error) / fx - X
-
-
 SENSITIVITIES = Exercise.told(
     "error_budget.sensitivities",
     build=_sensitivities,
@@ -47,7 +40,7 @@ SENSITIVITIES = Exercise.told(
     describe=lambda args: (
         "u = {:g} px, Z = {:g} m, fx = {:g} px, cx = {:g} px, depth error {:g} m".format(*args)
     ),
-    styles=[_prices, _prices_by_differences],
+    styles=[_prices],
 )
 
 
@@ -115,18 +108,8 @@ def _beyond(z: float) -> float:
     return math.erfc(z / math.sqrt(2))
 
 
-def _tilted(degrees: float, sign: float = 1.0) -> tuple[float, float, float]:
-    return sign * math.sin(math.radians(degrees)), math.cos(math.radians(degrees)), 0.0
-
-
-LESSON_ROWS: Rows = [
-    (1.0, 1.0, None, "noise"),
-    (0.7, 0.7, None, "noise"),
-    (2.0, 6.0, None, "bias"),
-    (0.0, 3.9, None, "bias"),
-    (1.0, 2.0, None, "bias"),
-    (2.0, 4.0, None, "bias"),
-]
+def _row(low: float, high: float, kind: str, *toward: float) -> tuple[float, float, Any, str]:
+    return low, high, toward or None, kind
 
 
 def _sums_by_rows(rows: Rows, tolerance: float) -> Any:
@@ -165,18 +148,14 @@ ADD_UP = Exercise.told(
         "order": lambda *sums: np.array(sums),
     },
     cases=[
-        (LESSON_ROWS[1:4], 5.0),
-        (LESSON_ROWS, 7.0),
-        ([(0.6, 0.6, None, "noise"), (1.5, 1.5, _tilted(60, -1), "noise"),
-          (1.0, 4.0, _tilted(25, -1), "bias"), (1.0, 3.0, _tilted(40), "bias"),
-          (0.0, 2.0, None, "bias")], 3.0),
-        ([(2.0, 4.0, None, "bias"), (0.8, 0.8, _tilted(30), "noise"),
-          (0.5, 5.0, (0.6, 0.0, -0.8), "bias"), (0.4, 0.4, None, "noise")], 0.8),
+        ([_row(*row) for row in rows], tolerance)
+        for rows, tolerance in questions.lesson_texts("error_budget")["given"]["rigs"]
     ],
-    describe=lambda args: "; ".join(_row_in_words(row) for row in args[0])
-    + f"; tolerance {args[1]:g} mm",
+    describe=lambda args: (
+        "; ".join(_row_in_words(row) for row in args[0]) + f"; tolerance {args[1]:g} mm"
+    ),
     styles=[_sums_by_rows],
-)  # fmt: skip
+)
 
 
 def _row_in_words(row: tuple[float, float, Any, str]) -> str:

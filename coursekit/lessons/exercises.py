@@ -29,7 +29,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
 from types import CodeType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -87,10 +87,10 @@ class Exercise:
     `tolerance` (in `unit`) or a millionth of their size, as float32 does, and NaN with NaN. Where
     `nan_answers`, NaN is an answer like any other; otherwise a wrong model that comes to NaN or
     infinity has overflowed. ways: other right answers, what each does and the steps that do it;
-    `way` is what the model does. styles: the whole function as learners write it, for the device to
-    edit. An
-    attempt that leaves out what is beyond the `core` is judged by the core cases alone: by an
-    exercise that has only those, and is `part_of` this one.
+    `way` is what the model does, and `another_way` says that it is one of them. styles: the whole
+    function as learners write it, for the device to edit. An attempt that leaves out what is beyond
+    the `core` is judged by the core cases alone: by an exercise that has only those, and is
+    `part_of` the whole.
     """
 
     name: str
@@ -162,19 +162,13 @@ class Exercise:
             model = model if mistake.step else mistake.wrong(model)
         return model
 
-    def check(self, function: Callable[..., Any]) -> Verdict:
-        """The verdict on a learner's function; never raises, and notes the attempt."""
-        return questions.noted(self.judge(function))
-
     def judge(self, function: Callable[..., Any]) -> Verdict:
-        """The verdict on a learner's function, without noting it."""
+        """The verdict on a learner's function; never raises."""
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            verdicts = [exercise._verdict(function) for exercise in (*self._others, self)]
+            verdicts = [one._verdict(function) for one in (self, *reversed(self._others))]
         known = ("right", *(m.name for m in self.mistakes))
-        return min(
-            verdicts[::-1], key=lambda v: (v.kind != "right", (v.named or v.kind) not in known)
-        )
+        return min(verdicts, key=lambda v: (v.kind != "right", (v.named or v.kind) not in known))
 
     @cached_property
     def _others(self) -> list[Exercise]:
@@ -576,8 +570,7 @@ FOUND = questions.lesson_texts("exercises")
 IN_PLACE, TRANSPOSED, RANDOM = (Mistake(name, *texts) for name, texts in FOUND["formal"].items())
 
 
-@dataclass(frozen=True)
-class Run:
+class Run(NamedTuple):
     """One call of a function on copies of its arguments."""
 
     value: Any

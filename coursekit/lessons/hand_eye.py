@@ -161,14 +161,6 @@ def _quarter_turns() -> Pair:
     return A.as_matrix(), (X.inv() * A * X).as_matrix()
 
 
-def _half_by_kabsch(R_A: Floats, R_B: Floats) -> Any:
-    a = Rotation.from_matrix(R_A).as_rotvec()
-    b = Rotation.from_matrix(R_B).as_rotvec()
-    U, _, Vt = np.linalg.svd(a.T @ b)
-    sign = np.linalg.det(U @ Vt)
-    return U @ np.diag([1, 1, sign]) @ Vt
-
-
 def _half_by_null_space(R_A: Floats, R_B: Floats, row: int = -1) -> Any:
     eye = np.eye(3)
     M = np.vstack([np.kron(A, eye) - np.kron(eye, B.T) for A, B in zip(R_A, R_B, strict=True)])
@@ -201,7 +193,7 @@ ROTATION_HALF = Exercise.told(
         else f"{len(args[0])} motions" + ", the first two about one axis" * _parallel(args[0])
     ),
     show=lambda R: "; ".join(" ".join(f"{v:.3f}" for v in row) for row in np.atleast_2d(R)),
-    styles=[_half_by_kabsch, _half_by_null_space],
+    styles=[_half_by_null_space],
 )
 
 

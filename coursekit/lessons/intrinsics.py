@@ -93,8 +93,7 @@ for _step in ("axis", "shown"):  # whether or not the 2-D number is made of them
         (_step, "mean_absolute", lambda e, *_: np.mean(np.abs(e), axis=0)),
         (_step, "signed_mean", lambda e, *_: np.mean(e, axis=0)),
         (_step, "mean_before_square", lambda e, *_: np.abs(np.mean(e, axis=0))),
-        (_step, "first_only", lambda e, *_: np.abs(e[0]) / math.sqrt(len(e))),
-        (_step, "first_only", lambda e, *_: np.abs(e[0])),
+        (_step, "first_only", lambda e, *_: abs(e[0]) / len(e) ** 0.5, lambda e, *_: abs(e[0])),
         (_step, "first_column_twice", lambda e, *_: np.sqrt(np.mean(e**2, axis=0))[[0, 0]]),
         (_step, "no_root", lambda e, *_: np.mean(e**2, axis=0)),
         (_step, "summed", lambda e, *_: np.sqrt(np.sum(e**2, axis=0))),
@@ -138,25 +137,6 @@ def _least_squares(seed: int, rows: int, columns: int, sigma: float) -> tuple[Fl
     return J, noise - J @ np.linalg.lstsq(J, noise, rcond=None)[0]
 
 
-def _sigma_by_covariance(J: Floats, residuals: Floats) -> Any:
-    M, P = J.shape
-    covariance = np.linalg.inv(J.T @ J) * np.sum(residuals**2) / (M - P)
-    return np.sqrt(covariance[0, 0])
-
-
-def _sigma_by_root(J: Floats, residuals: Floats) -> Any:
-    M, P = J.shape
-    sigma = np.linalg.norm(residuals) / np.sqrt(M - P)
-    return sigma * np.sqrt(np.linalg.inv(J.T @ J)[0, 0])
-
-
-def _sigma_by_pinv(J: Floats, residuals: Floats) -> Any:
-    M, P = J.shape
-    variance = np.sum(residuals**2) / (M - P)
-    gain = np.linalg.pinv(J)[0]
-    return np.sqrt(variance * np.sum(gain**2))
-
-
 FOCAL_SIGMA = Exercise.told(
     "intrinsics.focal_sigma",
     build=_focal_sigma,
@@ -178,7 +158,6 @@ FOCAL_SIGMA = Exercise.told(
         f"J is {args[0].shape[0]}x{args[0].shape[1]}"
         + (f" with rows {args[0].tolist()}, residuals {args[1].tolist()}" * (len(args[0]) < 7))
     ),
-    styles=[_sigma_by_covariance, _sigma_by_root, _sigma_by_pinv],
 )
 
 
@@ -196,8 +175,7 @@ FOCAL_SIGMA.add_mistakes(
     ("noise", "noise_not_squared", lambda e, freedom: np.linalg.norm(e) / freedom),
     ("scale", "noise_outside_the_root", lambda noise, first: noise**2 * first),
     ("noise", "noise_summed", lambda e, freedom: e @ e),
-    ("noise", "spread_of_residuals", lambda residuals, freedom: np.var(residuals)),
-    ("noise", "spread_of_residuals", lambda residuals, freedom: np.var(residuals, ddof=1)),
+    ("noise", "spread_of_residuals", lambda e, _: np.var(e), lambda e, _: np.var(e, ddof=1)),
     ("noise", "mean_taken_off", lambda e, freedom: len(e) * np.var(e) / freedom),
     ("noise", "divided_twice", lambda e, freedom: np.mean(e**2) / freedom),
     ("noise", "square_of_the_sum", lambda e, freedom: np.sum(e) ** 2 / freedom),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from coursekit import results
 from coursekit.lessons import depth_noise, error_budget, hand_eye, intrinsics, pinhole
@@ -48,7 +48,7 @@ def check(name: str, function: Callable[..., Any]) -> Verdict:
     >>> check("pinhole.project", lambda points, K, dist=None: None)
     project: not attempted yet: it returns None.
     """
-    return _find("name", "exercise", name, EXERCISES).check(function)
+    return record.noted(_find("name", "exercise", name, EXERCISES).judge(function))
 
 
 def evidence(lesson: str) -> Evidence:
@@ -103,8 +103,7 @@ def _state(attempts: list[dict[str, str]]) -> str:
     return STANDING_WORDS.get(kinds[-1], kinds[-1]) if kinds else ""
 
 
-@dataclass(frozen=True)
-class Standing:
+class Standing(NamedTuple):
     """One notebook: how many checkpoints and exercises it has, and how the student's stand.
 
     first_try, later: checkpoints answered rightly; exercises: those that are right, and all.

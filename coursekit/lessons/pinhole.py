@@ -98,10 +98,9 @@ PROJECT = Exercise.told(
 )
 
 
-def _tangential_after_radial(
-    x: Floats, y: Floats, k1: float, k2: float, p1: float, p2: float, k3: float
-) -> Any:
+def _tangential_after_radial(x: Floats, y: Floats, *dist: float) -> Any:
     """The tangential terms of the point that is bent already, as librealsense has them."""
+    k1, k2, p1, p2, k3 = dist
     r2 = x**2 + y**2
     a, b = _bend(x, y, k1, k2, 0.0, 0.0, k3)
     return a + 2 * p1 * a * b + p2 * (r2 + 2 * a**2), b + p1 * (r2 + 2 * b**2) + 2 * p2 * a * b
@@ -124,9 +123,7 @@ def _bent_last(points: Floats, normalise: Step, bend: Step, to_pixels: Step) -> 
     return bend(*to_pixels(*normalise(*points)))
 
 
-def _bent_last_about_the_centre(
-    points: Floats, normalise: Step, bend: Step, to_pixels: Step
-) -> Any:
+def _bent_about_the_centre(points: Floats, normalise: Step, bend: Step, to_pixels: Step) -> Any:
     centre = np.reshape(to_pixels(0.0, 0.0, 1.0), (2, 1))
     return centre + bend(*np.subtract(to_pixels(*normalise(*points)), centre))
 
@@ -163,7 +160,7 @@ PROJECT.add_mistakes(
     *_CAMERA,
     ("bend", "one_missing", lambda x, y, *dist: np.subtract(_bend(x, y, *dist), (x, y))),
     ("image", "bent_before_division", _bent_first),
-    ("image", "distortion_in_pixels", _bent_last, _bent_last_about_the_centre),
+    ("image", "distortion_in_pixels", _bent_last, _bent_about_the_centre),
 )
 
 

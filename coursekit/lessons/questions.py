@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, NamedTuple
 
 from coursekit import checks, results, words
 
@@ -26,8 +26,7 @@ LETTERS = "ABCDEFGH"
 OTHERWISE = "*If you answered otherwise*"
 
 
-@dataclass(frozen=True)
-class Option:
+class Option(NamedTuple):
     """One option of a choice: its text and why it is right or wrong."""
 
     text: str
@@ -35,16 +34,14 @@ class Option:
     right: bool = False
 
 
-@dataclass(frozen=True)
-class Classic:
+class Classic(NamedTuple):
     """A wrong number that a known slip leads to, and what that slip is."""
 
     value: float
     why: str
 
 
-@dataclass(frozen=True)
-class Objective:
+class Objective(NamedTuple):
     """What a student can do after a lesson, and the checkpoints and exercises that show it."""
 
     text: str
@@ -194,17 +191,13 @@ class Number(Checkpoint):
         if self._close(number, self.value):
             others = [f"{c.value:g} {self.unit}: {c.why}" for c in self.classics]
             return Verdict(self.name, "right", f"{said}: right.", (self.why, *others))
-        for classic in self.classics:
-            if self._close(number, classic.value):
-                lines = (classic.why, "Think again, and try another number.")
-                return Verdict(
-                    self.name, "wrong", f"{said}: not this.", lines, named=f"{classic.value:g}"
-                )
-        if any(self._close(number * factor, self.value) for factor in (1e-3, 1e3)):
+        slip = next((c for c in self.classics if self._close(number, c.value)), None)
+        if not slip and any(self._close(number * factor, self.value) for factor in (1e-3, 1e3)):
             say = f"The digits are right. The answer is wanted in {self.unit}."
             return Verdict(self.name, "not attempted", say)
-        lines = (self.hint, "Think again, and try another number.")
-        return Verdict(self.name, "wrong", f"{said}: not this.", lines)
+        lines = (slip.why if slip else self.hint, "Think again, and try another number.")
+        named = f"{slip.value:g}" if slip else None
+        return Verdict(self.name, "wrong", f"{said}: not this.", lines, named)
 
     def _meant(self, readings: list[float]) -> float | None:
         """The only reading, or else the one that is right or a known slip."""
@@ -286,7 +279,7 @@ def panel(checkpoint: Checkpoint, say: Callable[[str], None]) -> Any:
 
 @cache
 def lesson_texts(lesson: str) -> dict[str, Any]:
-    """What the TOML file of a lesson holds: checkpoints, objectives and mistakes."""
+    """What the TOML file of a lesson holds: checkpoints, objectives, exercises and mistakes."""
     text = Path(__file__).with_name(f"{lesson}.toml").read_text(encoding="utf-8")
     return tomllib.loads(text)
 

@@ -8,7 +8,6 @@ from coursekit.boards import Board, BoardNotFound, detect, detect_all
 
 pytestmark = pytest.mark.real
 
-CHECKERBOARD = Board("checkerboard", (10, 7), 0.025)
 CHARUCO = Board("charuco", (5, 7), 0.04, 0.02, "DICT_6X6_250")
 
 

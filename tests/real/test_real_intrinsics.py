@@ -6,14 +6,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from common import NIGHTLY, nightly
+from common import CHECKERBOARD, NIGHTLY, nightly
 
 from coursekit import intrinsics
 from coursekit.boards import Board, Detection, Detections, detect_all
 
 pytestmark = pytest.mark.real
 
-CHESSBOARD = Board("checkerboard", (10, 7), 0.025)
 CHARUCO = Board("charuco", (5, 7), 0.04, 0.02, "DICT_6X6_250")
 PUBLISHED = {"f": 535.91573, "cx": 342.28315, "cy": 235.57083}
 PUBLISHED_RMS_PX = 0.39259
@@ -30,7 +29,7 @@ def published_corners(real_data) -> Detections:
     views = []
     for path in sorted((real_data / "opencv_chessboard").glob("left*.jpg")):
         image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        found, corners = cv2.findChessboardCorners(image, CHESSBOARD.corners)
+        found, corners = cv2.findChessboardCorners(image, CHECKERBOARD.corners)
         assert found
         corners = cv2.cornerSubPix(image, corners, (11, 11), (-1, -1), criteria)[:, 0]
         views.append(Detection(np.arange(54), corners, image.shape[::-1], path.name))
@@ -39,7 +38,7 @@ def published_corners(real_data) -> Detections:
 
 @pytest.fixture(scope="module")
 def published(published_corners) -> intrinsics.IntrinsicsResult:
-    return intrinsics.calibrate(published_corners, CHESSBOARD, same_focal=True)
+    return intrinsics.calibrate(published_corners, CHECKERBOARD, same_focal=True)
 
 
 def test_the_published_fit_comes_out_with_the_published_settings(published):
@@ -54,7 +53,7 @@ def test_the_published_fit_comes_out_with_the_published_settings(published):
 def test_the_window_moves_f_by_more_than_independent_corners_would(published, checkerboards):
     """With windows as wide as the corners allow, view 02 is as good as any and f is another."""
     assert len(checkerboards) == 13
-    ours = intrinsics.calibrate(checkerboards, CHESSBOARD, same_focal=True)
+    ours = intrinsics.calibrate(checkerboards, CHECKERBOARD, same_focal=True)
     assert published.per_view_rms_px[1] > 1.1
     assert ours.per_view_rms_px.max() < 0.3
     assert ours.rms_px == pytest.approx(0.195, abs=0.02)
@@ -66,12 +65,12 @@ def test_the_window_moves_f_by_more_than_independent_corners_would(published, ch
 
 
 def test_halves_agree_in_the_middle_and_differ_by_pixels_at_the_edge(checkerboards):
-    both = intrinsics.halves(checkerboards, CHESSBOARD)
+    both = intrinsics.halves(checkerboards, CHECKERBOARD)
     length = both.length_px
     assert length[10:20, 15:25].max() < 0.15
     assert 5 < length.max() < 40
     assert both.expected_px.max() > 5  # and the covariance says so
-    verdict = intrinsics.calibrate(checkerboards, CHESSBOARD).verdict()
+    verdict = intrinsics.calibrate(checkerboards, CHECKERBOARD).verdict()
     assert verdict.startswith("Not good enough: in 95 % of the image")
     assert "no corners in the outer tenth" in verdict
 
@@ -91,7 +90,7 @@ def test_four_charuco_views_do_not_determine_k(charuco_views):
 
 def test_diagnose_names_the_artefact_in_view_02(published_corners):
     """A refinement window wider than the corners' spacing took in a neighbour."""
-    found = {f.name: f for f in intrinsics.diagnose(published_corners, CHESSBOARD)}
+    found = {f.name: f for f in intrinsics.diagnose(published_corners, CHECKERBOARD)}
     assert "left02" in found["spoiled_view"].evidence
     assert "window" in found["spoiled_view"].remedy
 
@@ -118,10 +117,10 @@ def sessions(real_data, checkerboards) -> dict[str, tuple[Detections, Board]]:
     found = {f"cam{k}": (corners_of(cams / f"intrinsic_corners_cam{k}.npz"), four) for k in CAMS}
     doosan = real_data / "jpjp_doosan_d435" / "intrinsic_corners_28.npz"
     found["doosan"] = corners_of(doosan), Board("charuco", (7, 5), 0.03, 0.022)
-    found["opencv"] = checkerboards, CHESSBOARD
+    found["opencv"] = checkerboards, CHECKERBOARD
     if NIGHTLY:  # their corners take long to find
         photographs = real_data / "udacity_chessboard"
-        found["udacity"] = detect_all(photographs, CHESSBOARD, progress=False), CHESSBOARD
+        found["udacity"] = detect_all(photographs, CHECKERBOARD, progress=False), CHECKERBOARD
     return found
 
 
