@@ -26,6 +26,7 @@ from coursekit.plots.style import (
 from coursekit.simulation.arm_poses import Setup
 
 VIEW_M = 0.16  # how far the camera's pyramid is drawn
+AXES_M = 0.12  # the gripper's, as drawn
 SPACE_M = ((-0.30, 0.66), (-0.36, 0.36), (0.0, 0.84))  # x, y, z of the base that is shown
 CLEAR_PX = 13.0  # around a letter
 
@@ -42,7 +43,7 @@ def mounts(
     fig.set_layout_engine("none")  # the 3-D axes reserve far more room than they use
     texts = []
     for k, (name, setup) in enumerate(setups.items()):
-        ax: Any = fig.add_axes((k / len(setups), 0.0, 0.98 / len(setups), 1.0), projection="3d")
+        ax: Any = fig.add_axes((k / len(setups), 0.0, 0.96 / len(setups), 1.0), projection="3d")
         limits = dict(zip(("xlim", "ylim", "zlim"), SPACE_M, strict=True))
         ax.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)", **limits)
         ax.set_box_aspect(np.ptp(SPACE_M, axis=1), zoom=0.96)
@@ -63,6 +64,9 @@ def _rig(ax: Any, setup: Setup, q: Floats) -> dict[str, float]:
     links = setup.arm.link_frames(q)[:, :3, 3]
     chain = np.concatenate([np.zeros((1, 3)), links, gripper[None, :3, 3]])
     ax.plot(*chain.T, "o-", color=COLORS["block"], lw=5, ms=7)
+    for axis, end in zip("xyz", transform_points(gripper, AXES_M * np.eye(3)), strict=True):
+        ax.plot(*np.stack([gripper[:3, 3], end]).T, color=COLORS["ink"], lw=1.2)
+        ax.text(*end, axis, fontsize=9)
     rim = transform_points(board, setup.board.outline)
     sheet = rim[[[0, 1], [3, 2]]]
     ax.plot_surface(*np.moveaxis(sheet, 2, 0), color=COLORS["cube"], alpha=0.5, shade=False)
