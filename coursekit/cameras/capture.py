@@ -610,7 +610,8 @@ class LiveImage(Screen):
 
     def close(self) -> None:
         """The last image stays."""
-        self._words.value = "The last image. Rings: the board; dots: the views before."
+        legend = "The last image. Rings: the board; dots: the views before it."
+        self._words.value = f"{html.escape(self._said)} {legend}"
 
     def __repr__(self) -> str:
         return "The live image appears here while the cell runs."

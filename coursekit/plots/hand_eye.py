@@ -64,9 +64,10 @@ def _rig(ax: Any, setup: Setup, q: Floats) -> dict[str, float]:
     links = setup.arm.link_frames(q)[:, :3, 3]
     chain = np.concatenate([np.zeros((1, 3)), links, gripper[None, :3, 3]])
     ax.plot(*chain.T, "o-", color=COLORS["block"], lw=5, ms=7)
-    for axis, end in zip("xyz", transform_points(gripper, AXES_M * np.eye(3)), strict=True):
-        ax.plot(*np.stack([gripper[:3, 3], end]).T, color=COLORS["ink"], lw=1.2)
-        ax.text(*end, axis, fontsize=9)
+    axes = transform_points(gripper, AXES_M * np.kron(np.eye(3), [[0], [1]])).reshape(3, 2, 3)
+    for axis, line in zip("xyz", axes, strict=True):
+        ax.plot(*line.T, color=COLORS["ink"], lw=1.2)
+        ax.text(*line[1], axis, fontsize=9)
     rim = transform_points(board, setup.board.outline)
     sheet = rim[[[0, 1], [3, 2]]]
     ax.plot_surface(*np.moveaxis(sheet, 2, 0), color=COLORS["cube"], alpha=0.5, shade=False)
@@ -84,8 +85,8 @@ def _rig(ax: Any, setup: Setup, q: Floats) -> dict[str, float]:
         "C": (camera, board, "truth"),
     }
     ends = [np.stack([start[:3, 3], end[:3, 3]]) for start, end, _ in arrows.values()]
-    taken = [_on_page(ax, line) for line in (chain, rim[[0, 1, 2, 3, 0]], view, *ends)]
-    for (name, (*_, color)), line in zip(arrows.items(), taken[3:], strict=True):
+    taken = [_on_page(ax, line) for line in (chain, rim[[0, 1, 2, 3, 0]], view, *axes, *ends)]
+    for (name, (*_, color)), line in zip(arrows.items(), taken[-3:], strict=True):
         place = _arrow(ax, name, line[0], line[-1], COLORS[color], np.concatenate(taken))
         taken.append(place)
     lengths = [float(np.linalg.norm(end - start)) for start, end in ends]
