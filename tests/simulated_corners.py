@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import cache
 
+import cv2
 import numpy as np
 from common import CHARUCO, CHECKERBOARD, NIGHTLY
 
@@ -12,7 +13,7 @@ from coursekit.boards import Board, Detections
 from coursekit.geometry import Intrinsics
 from coursekit.hand_eye.session import HandEyeSession
 from coursekit.simulation.arm_sessions import HandEyeMistakes, HandEyeTruth, hand_eye_session
-from coursekit.simulation.corner_sessions import Effects, Truth, corner_session, ordinary
+from coursekit.simulation.corner_sessions import Truth, corner_session, ordinary
 
 __all__ = ["CHARUCO", "CHECKERBOARD", "LENS", "NIGHTLY", "fit"]
 LENS = Intrinsics(
@@ -28,12 +29,26 @@ BOARDS = [CHARUCO, CHECKERBOARD]
 # Fisheyes of 120 to 160 degrees across the diagonal, and wide lenses that are a quotient of two
 # polynomials, which grows all the way: five coefficients leave two to eight times the noise.
 QUOTIENT = {"model": "brown_conrady", "coeffs": (0.12, 0.0, 0.0, 0.0, 0.0)}
+
+
+def fisheye(points: np.ndarray, lens: Intrinsics) -> np.ndarray:
+    """Pixels of an image that grows with the angle."""
+    still = np.zeros(3)
+    return cv2.fisheye.projectPoints(points[:, None], still, still, lens.K, np.zeros(4))[0][:, 0]
+
+
+def quotient(points: np.ndarray, lens: Intrinsics) -> np.ndarray:
+    """Pixels by OpenCV's rational model, k4 = 0.4 after the lens's own coefficients."""
+    dist, still = np.concatenate([lens.dist, [0.4, 0.0, 0.0]]), np.zeros(3)
+    return cv2.projectPoints(points[:, None], still, still, lens.K, dist)[0][:, 0]
+
+
 BEYOND = [
-    (replace(LENSES[1], fx=300, fy=300), Effects(fisheye=True)),
-    (replace(LENSES[1], fx=250, fy=251), Effects(fisheye=True)),
-    (Intrinsics(1280, 720, 520, 521, 642, 362), Effects(fisheye=True)),
-    (replace(LENSES[1], fx=300, fy=300, **QUOTIENT), Effects(rational=(0.4, 0.0, 0.0))),
-    (Intrinsics(1280, 720, 560, 561, 642, 362, **QUOTIENT), Effects(rational=(0.4, 0.0, 0.0))),
+    (replace(LENSES[1], fx=300, fy=300), fisheye),
+    (replace(LENSES[1], fx=250, fy=251), fisheye),
+    (Intrinsics(1280, 720, 520, 521, 642, 362), fisheye),
+    (replace(LENSES[1], fx=300, fy=300, **QUOTIENT), quotient),
+    (Intrinsics(1280, 720, 560, 561, 642, 362, **QUOTIENT), quotient),
 ]
 
 
@@ -45,7 +60,7 @@ def fit(board: Board, seed: int, **session) -> intrinsics.IntrinsicsResult:
 
 def dense_jacobian(result: intrinsics.IntrinsicsResult) -> np.ndarray:
     """Of a fit's residuals by the shared parameters and by six numbers of each view."""
-    shared, poses = result.jacobian
+    shared, poses = result.equations.shared, result.equations.poses
     whole = np.zeros((len(shared), shared.shape[1] + 6 * len(poses)))
     whole[:, : shared.shape[1]] = shared
     for i, (block, rows) in enumerate(zip(poses, result.equations.slices, strict=True)):
@@ -68,8 +83,8 @@ def ordinary_session(seed: int, **more) -> tuple[Detections, Truth, Board]:
 
 def beyond_session(seed: int) -> tuple[Detections, Truth, Board]:
     """A session, ordinary otherwise, through a lens that five coefficients do not describe."""
-    board, (lens, effects) = BOARDS[seed % 2], BEYOND[(seed // 2) % len(BEYOND)]
-    street = replace(ordinary(seed), fisheye=effects.fisheye, rational=effects.rational)
+    board, (lens, see) = BOARDS[seed % 2], BEYOND[(seed // 2) % len(BEYOND)]
+    street = replace(ordinary(seed), see=see)
     return *corner_session(board, lens, seed, 20 + (7 * seed) % 21, 0.08, street), board
 
 

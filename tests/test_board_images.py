@@ -19,7 +19,7 @@ from coursekit.cameras.capture import see
 from coursekit.geometry import Intrinsics, make_transform, project, transform_points
 from coursekit.intrinsics import calibrate
 from coursekit.simulation import board_images
-from coursekit.simulation.board_images import as_taken, board_scene, render_board
+from coursekit.simulation.board_images import board_scene, render_board
 from coursekit.simulation.corner_sessions import Effects, bowed, rolling_shutter, view_poses
 from tools import make_data
 
@@ -255,6 +255,15 @@ def test_light_falls_off_to_the_right_and_into_the_corners():
     assert corner < left - 0.05
 
 
+def as_taken(picture, quality):
+    """As a cheap camera stores it: red, green and blue seen by every second or fourth pixel only,
+    sharpened, a JPEG with colours at half size."""
+    colours = cv2.cvtColor(picture, cv2.COLOR_BayerRGGB2BGR)
+    sharp = cv2.addWeighted(colours, 2.0, cv2.GaussianBlur(colours, (0, 0), 1.0), -1.0, 0)
+    _, stored = cv2.imencode(".jpg", sharp, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return np.asarray(cv2.imdecode(stored, cv2.IMREAD_GRAYSCALE), np.uint8)
+
+
 @pytest.mark.parametrize("quality", [60, 75, 95])
 def test_a_cheap_cameras_jpeg_adds_to_the_corners_noise_and_shifts_none(quality):
     """Corners of two views, mosaic and sharpening included: unbiased, under 0.15 px; what the
@@ -263,8 +272,7 @@ def test_a_cheap_cameras_jpeg_adds_to_the_corners_noise_and_shifts_none(quality)
     for view in (NEAR, TILTED):
         T = pose(CHECKERS, view)
         picture = render_board(CHECKERS, T, LENS, rng, uneven=0.3)
-        assert np.abs(as_taken(picture).astype(int) - picture).max() <= 3
-        found = detect(as_taken(picture, quality, sharpen=1.0, mosaic=True), CHECKERS)
+        found = detect(as_taken(picture, quality), CHECKERS)
         errors.append(found.pixels - by_opencv(CHECKERS.points, T, LENS)[found.ids])
     errors = np.concatenate(errors)
     assert 0.02 < errors.std() < 0.15

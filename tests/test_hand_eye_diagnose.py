@@ -150,7 +150,7 @@ def test_candidates_are_listed_and_the_true_one_has_the_true_X(seed: int, kind: 
     fit = replace(PosePairs.of(given), T_base_gripper=inverted).fit
     options = misread.candidates(fit, given, "inverted")
     [mine] = [option for option in options if option.name.startswith(words[kind])]
-    assert mine.mount == truth.mount
+    assert mine.mount == truth.setup.mount
     assert not mine.against
     off = pose_difference(truth.X, mine.X)
     assert np.abs(off[3:]).max() < 5e-4
@@ -163,7 +163,7 @@ def test_two_inversions_that_cancel_are_named_by_what_they_imply() -> None:
     [finding] = diagnose(given)
     assert finding.name == "inconsistent_convention"
     assert "arm poses and board poses both inverted" in finding.evidence
-    assert truth.mount == "eye_in_hand"
+    assert truth.setup.mount == "eye_in_hand"
 
 
 ALL_WAYS = [(order, way) for order in ("xyz", "XYZ", "zyx") for way in ("degrees", "radians")]

@@ -165,7 +165,7 @@ def test_shipped_sessions_are_what_make_data_makes(shipped) -> None:
         assert session.skipped == ()
         assert sum(path.stat().st_size for path in folder.iterdir()) < 1.6e6
         truth = truth_of(folder)
-        assert truth.mount == session.mount
+        assert truth.setup.mount == session.mount
         seed = make_data.HAND_EYE_SEED
         assert session_folder(session.mount, seed, folder) == folder
         made, _ = hand_eye_session(session.mount, seed, len(session), 0.0, ArmErrors())

@@ -18,7 +18,7 @@ from scipy.stats import binom, kstest
 from simulated_corners import BOARDS, LENSES
 
 from coursekit.boards import Board, Detection, Detections, Skipped
-from coursekit.causes import CauseSearch
+from coursekit.causes import CauseSearch, search
 from coursekit.geometry import Intrinsics
 from coursekit.intrinsics import causes
 from coursekit.intrinsics.causes import Calibration, CornerTable, Linear
@@ -109,7 +109,7 @@ def test_the_stored_power_is_what_is_measured(cause: str) -> None:
 
 def searched(detections: Detections) -> CauseSearch[Calibration]:
     start = causes.refit(Calibration.of(calibrate(detections, CHECKERBOARD)))
-    return causes.search_residuals(start)
+    return search(start, causes.CHANCE_LEVEL)
 
 
 def test_two_causes_are_both_named_and_measured() -> None:

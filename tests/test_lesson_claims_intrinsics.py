@@ -162,7 +162,7 @@ def test_i4_rms_is_no_quality() -> None:
     useful = fits(CHECKERBOARD, noise_px=0.1)
     for one, other in zip(useless, useful, strict=True):
         assert one.rms_px < 0.15  # better than "careful"
-        assert one.rms_px == pytest.approx(math.hypot(one.rms_u_px, one.rms_v_px))
+        assert one.rms_px == pytest.approx(math.hypot(*one.rms_uv_px))
         assert one.rms_px == pytest.approx(other.rms_px, rel=0.02)
         assert one.verdict().startswith("Not good enough")
         assert not other.verdict().startswith("Not")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from common import by_opencv, named, refusals
 from scipy.optimize import brentq
-from simulated_corners import CHARUCO, CHECKERBOARD, LENS
+from simulated_corners import CHARUCO, CHECKERBOARD, LENS, fisheye, quotient
 
 from coursekit.boards import Board
 from coursekit.geometry import Intrinsics, project
@@ -171,9 +171,10 @@ def test_neighbours_share_a_part_of_their_errors_and_the_detector_says_less() ->
     assert {round(view.noise_px, 12) for view in found} == {0.01}
 
 
-def test_a_fisheye_grows_with_the_angle_and_a_rational_lens_is_opencvs() -> None:
+def test_a_session_looks_through_another_lens() -> None:
+    """A fisheye, which grows with the angle, and a quotient of polynomials."""
     lens = Intrinsics(640, 480, 250.0, 251.0, 322.0, 238.0)
-    found, truth = corner_session(CHECKERBOARD, lens, 2, 12, 0.0, Effects(fisheye=True))
+    found, truth = corner_session(CHECKERBOARD, lens, 2, 12, 0.0, Effects(see=fisheye))
     for view, T in zip(found, truth.T_camera_board, strict=True):
         x, y, z = (truth.points[view.ids] @ T[:3, :3].T + T[:3, 3]).T
         across = np.hypot(x, y)
@@ -182,12 +183,12 @@ def test_a_fisheye_grows_with_the_angle_and_a_rational_lens_is_opencvs() -> None
         assert np.abs(view.pixels - expected).max() < 1e-6
     assert np.degrees(max(np.arctan2(np.hypot(*p[:2]), p[2]) for p in rays_of(truth))) > 55
     bent = replace(LENS, fx=300.0, fy=300.0)
-    found, truth = corner_session(CHARUCO, bent, 2, 6, 0.0, Effects(rational=(0.3, 0.05, 0.0)))
+    found, truth = corner_session(CHARUCO, bent, 2, 6, 0.0, Effects(see=quotient))
     for view, T in zip(found, truth.T_camera_board, strict=True):
         x, y, z = (truth.points[view.ids] @ T[:3, :3].T + T[:3, 3]).T
         x, y, (k1, k2, p1, p2, k3) = x / z, y / z, bent.coeffs
         r2 = x * x + y * y
-        radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + 0.3 * r2 + 0.05 * r2**2)
+        radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + 0.4 * r2)
         u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
         v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
         expected = np.column_stack([300 * u + bent.cx, 300 * v + bent.cy])
@@ -205,7 +206,7 @@ FAR, FAST = np.array([[0.0, 0.1, 0.5]]), np.array([0.0, 500.0, 0.0])
 test_what_cannot_be_is_refused = refusals(
     *named(Effects, focus_drift=[-0.1], bow_m=[float("nan")], max_tilt_deg=[80.0]),
     *named(Effects, inner_only=[0.4], blur_share=[1.5], square_scale=[0.0], wave_reach=[0.0]),
-    *named(Effects, rational=[(0.1, 0.2)], wave_m=[-1e-3], shared=[-1.0]),
+    *named(Effects, wave_m=[-1e-3], shared=[-1.0]),
     *named(session, views=[0], noise_px=[-1]),
     ("board: 3.000 x 2.100 m does not fit", lambda: session(replace(CHECKERBOARD, square_m=0.3))),
     (

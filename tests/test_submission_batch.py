@@ -265,10 +265,10 @@ def test_what_failed_is_tried_again(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(batch.report, "grade_file", misbehave)
         first = graded(folder, out)
-    assert (first.failed, first.graded) == (1, 0)
+    assert (first.counts["failed"], first.counts["graded"]) == (1, 0)
     assert "1 not graded (time, memory or a crash)" in str(first)
     again = graded(folder, out, overwrite=True)
-    assert (again.failed, again.graded, again.kept) == (0, 1, 1)
+    assert (again.counts["failed"], again.counts["graded"], again.kept) == (0, 1, 1)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C goes another way there")
@@ -308,7 +308,7 @@ def test_a_ctrl_c_that_nobody_heard_still_stops(tmp_path, monkeypatch):
         for bundle in bundles:
             with contextlib.suppress(KeyboardInterrupt):
                 signal.raise_signal(signal.SIGINT)
-            yield bundle, batch._failed(bundle, "error", "Not tried.")
+            yield bundle, batch._failed(bundle, "error", error="Not tried.")
 
     monkeypatch.setattr(batch, "work_through", run)
     with pytest.raises(batch.Stopped, match="stopped after 1 of 3 bundles"):
@@ -340,7 +340,7 @@ def test_what_is_kept_of_a_bundle_may_go_and_the_report_says_so(in_process, tmp_
     real, out = batch._load, tmp_path / "out"
     monkeypatch.setattr(batch, "_load", lambda out, b: None if b.name == "a.zip" else real(out, b))
     summary = graded(quick(tmp_path / "in", "ab"), out)
-    assert (summary.graded, summary.failed) == (1, 1)
+    assert (summary.counts["graded"], summary.counts["failed"]) == (1, 1)
     assert [row["status"] for row in table(out)] == ["not graded: lost", "graded"]
 
 
@@ -355,7 +355,7 @@ def test_a_folder_in_a_folder_a_thousand_times(in_process, tmp_path, capsys):
             os.chdir(part)
         Path("deep.zip").write_bytes(bundle_bytes(ZOE))
     try:
-        assert graded(folder, tmp_path / "out").graded == 2
+        assert graded(folder, tmp_path / "out").counts["graded"] == 2
     finally:  # which pytest could not
         subprocess.run(["rm", "-rf", str(folder)], check=True)
     assert cli.main(["grade", str(tmp_path / "lms.zip"), "--out", str(tmp_path / "two")]) == 1
@@ -369,7 +369,7 @@ def test_names_of_files_are_never_paths_or_code(in_process, tmp_path):
     names = [b"=1+1", b"<b>", b"a\nb", b"\xff\xfe", b"?", b"\xff", b"\xfe"]
     for name in names:
         (folder / os.fsdecode(name + b".zip")).write_bytes(data)
-    assert graded(folder, out).graded == len(names)
+    assert graded(folder, out).counts["graded"] == len(names)
     assert len({row["file"] for row in table(out)}) == len(names)
     assert [path.parent for path in out.rglob("*.html")].count(out / "students") == len(names)
     for path in (out / "students").iterdir():
@@ -547,7 +547,7 @@ def test_own_points_survive_a_regrade_which_says_what_changed(in_process, tmp_pa
     assert summary.changes == (
         ("a", f"{float(first['points']):g}", first["total"], "your own points changed"),
     )
-    assert summary.kept == before.graded == 2
+    assert summary.kept == before.counts["graded"] == 2
     assert own.read_bytes() == kept
     assert all(path.exists() for path in foreign)
     (edited,) = out.glob("grades_edited_*.csv")

@@ -78,7 +78,10 @@ def test_there_are_as_many_kinds_as_ever_and_every_reason_has_one():
     accepted = [name for name, (reason, _) in KINDS.items() if not reason]
     assert accepted == ["junk behind the stream", "a number of 5,000 digits"]
     source = Path(bundle_format.__file__).read_text(encoding="utf-8")
-    codes = set(re.findall(r'Refused\(\s*"(\w+)"', source))
+    assert set(re.findall(r'_refused\(\s*"([\w.]+)"', source)) == set(
+        bundle_format.WORDS["refused"]
+    )
+    codes = {key.partition(".")[0] for key in bundle_format.WORDS["refused"]}
     assert codes - {reason for reason, _ in KINDS.values()} == {"not_a_file", "unreadable"}
     assert len(codes) > 10
 

@@ -222,6 +222,13 @@ def test_an_empty_class_has_a_page():
     assert report.grades_csv([]).count("\n") == 1
 
 
+def test_points_are_those_that_the_instructor_gave():
+    line = line_of(GOOD)
+    text = report.class_page([line, replace(line, file="b.zip", own={"overrule": "12,5"})])
+    assert "Median 56 % of the points, from 12 to 100 %." in text
+    assert "Students by points: 1 from 10 to 20 %, 1 from 90 to 100 %." in text
+
+
 def test_everybody_with_a_mistake_is_named_and_linked_once():
     """Though it was made at three distances."""
     wrong = WRONG["sign"][1]
@@ -250,7 +257,7 @@ def test_what_most_got_wrong_comes_first_and_what_is_left_out_is_no_mistake():
     left_out = line_of(replace(GOOD, student="Silent", stacks=(), plot=None), "silent.zip")
     text = check_page(report.class_page([wrong["std"], *[wrong["bias"]] * 2, left_out])).text
     assert "What went wrong, and with how many of 4 students" in text
-    assert re.findall(r"[1-9] \(\d+ %\)", text) == ["2 (50 %)", "1 (25 %)"]  # bias, then std
+    assert re.findall(r"\d+ \(\d+ %\)", text) == ["2 (50 %)", "1 (25 %)"]  # bias, then std
     table, _, rest = text.partition("Left out, and in no row above:")
     assert "Silent" not in table.partition("What went wrong")[2]
     assert "Silent" in rest.partition("Everybody")[0]

@@ -75,5 +75,6 @@ def test_every_sentence_is_there_used_and_gets_its_facts(function: str) -> None:
                 assert {field.split(".")[0].split("[")[0] for field in fields} <= facts, text
     strings = {node.value for node in nodes if isinstance(node, ast.Constant)}
     chosen = {"boards.no_charuco", "boards.no_checkerboard"}  # by the board's kind
-    chosen |= {f"boards.{word}" for word in strings if isinstance(word, str)}
+    said = [word for word in strings if isinstance(word, str)]
+    chosen |= {f"{room}.{word}" for word in said for room in ("boards", "plots")}
     assert SENTENCES[function].keys() <= strings | chosen

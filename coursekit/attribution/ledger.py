@@ -10,8 +10,6 @@ from __future__ import annotations
 import contextlib
 import csv
 import io
-import sys
-from collections.abc import Iterator
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -19,7 +17,7 @@ from typing import Any
 from coursekit import checks
 from coursekit.attribution.verdict import Attribution
 from coursekit.checks import want
-from coursekit.results import folder, now, write_bytes
+from coursekit.results import folder, locked, now, write_bytes
 from coursekit.words import counted
 
 FORMULA_SIGNS = tuple("=+-@＝＋－＠")  # what a spreadsheet takes as a formula
@@ -101,7 +99,7 @@ class Ledger:
         """
         checks.instance("entry", entry, Entry)
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        with _locked(self.path.with_name(f".{self.path.name}.lock")):
+        with locked(self.path.with_name(f".{self.path.name}.lock")):
             rows = [*self.read(), entry]
             text = io.StringIO(newline="")
             writer = csv.writer(text, lineterminator="\n")
@@ -163,18 +161,3 @@ def _value(name: str, cell: str) -> Any:
     with contextlib.suppress(ValueError):
         return int(cell) if name == "trials" else float(cell)
     return cell or None
-
-
-@contextlib.contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    """Held by one writer at a time; given back when the writer ends, however it ends."""
-    with path.open("a+", encoding="utf-8") as file:
-        if sys.platform == "win32":
-            import msvcrt
-
-            msvcrt.locking(file.fileno(), msvcrt.LK_LOCK, 1)  # waits up to ten seconds
-        else:
-            import fcntl
-
-            fcntl.flock(file, fcntl.LOCK_EX)
-        yield  # closing the file unlocks it

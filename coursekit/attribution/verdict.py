@@ -14,7 +14,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
@@ -160,14 +160,7 @@ class MissEvidence:
 # --- the decision ---
 
 
-class Decision(NamedTuple):
-    """verdict, says: why. more_trials: that would settle it, 0 if it is, None beyond 500. remedy:
-    what to do."""
-
-    verdict: Blame
-    says: str
-    more_trials: int | None
-    remedy: str
+Decision = tuple[Blame, str, int | None, str]  # the first four of `Attribution`
 
 
 def decide(seen: MissEvidence, length_m: float, matters_m: float) -> Decision:
@@ -205,7 +198,7 @@ def decide(seen: MissEvidence, length_m: float, matters_m: float) -> Decision:
     if seen.places is not None:
         rest = f", nor a difference of {of_size} between the places"
     says = f"scatter: no constant of {of_size}{rest} would have hidden"
-    return Decision("perception", says, 0, REMEDY["perception"])
+    return "perception", says, 0, REMEDY["perception"]
 
 
 def _pose_dependent(seen: MissEvidence) -> Decision:
@@ -217,7 +210,7 @@ def _pose_dependent(seen: MissEvidence) -> Decision:
         says = say("attribution.places_differ", part=part, scatter=scatter)
         if places.p_follows is None or places.p_follows >= TEST_LEVEL:
             remedy = say("attribution.by_place")
-    return Decision("pose_dependent", says, 0, remedy)
+    return "pose_dependent", says, 0, remedy
 
 
 def _constant(seen: MissEvidence, length_m: float) -> Decision:
@@ -236,7 +229,7 @@ def _constant(seen: MissEvidence, length_m: float) -> Decision:
         says = f"{share}, but as likely because few places with errors of their own were tried"
         return _undecided(n, says, [partial(of_places.shows, length_m)], ELSEWHERE)
     if seen.spread is None or not seen.pose_may_hide(length_m, seen.spread):
-        return Decision("calibration", f"{share} in one direction", 0, REMEDY["calibration"])
+        return "calibration", f"{share} in one direction", 0, REMEDY["calibration"]
     pose = [partial(seen.by_pose.shows, length_m, level=SUSPECT_LEVEL)]
     if seen.spread and seen.pose_may_hide(length_m, 1.0):
         says = f"{share}, but too few trials rule out that they follow the pose"
@@ -259,7 +252,7 @@ def _undecided(
     totals, first = range(MOST_TRIALS + 1), max(n + 1, least)
     total = bisect_left(totals, True, first, key=lambda n: all(shows(n) for shows in needed))
     more = total - n if total <= MOST_TRIALS else None
-    return Decision("cannot_tell_yet", says, more, remedy)
+    return "cannot_tell_yet", says, more, remedy
 
 
 # --- the answer ---

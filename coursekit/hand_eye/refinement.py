@@ -97,15 +97,18 @@ class Problem:
         names = [*TWIST, *(f"Y.{part}" for part in TWIST)]
         names += ["scale"] if self.free_scale else []
         names += [f"offset_{joint}" for joint in range(6)] if self.arm is not None else []
-        if self.fk is not None:
-            names += [self.fk.names[column] for column in self._columns]
-        return tuple(names)
+        return (*names, *(self._fk.names[column] for column in self._columns))
+
+    @cached_property
+    def _fk(self) -> FkErrors:
+        """The arm's errors that are stated; without any, none that poses share and none of each."""
+        n = len(self.T_base_gripper)
+        return self.fk or FkErrors(np.zeros((n, 6, 0)), np.zeros(0), (), np.zeros((n, 6, 6)))
 
     @cached_property
     def _columns(self) -> list[int]:
         """The shared errors of the arm that are unknowns; joint offsets are not counted twice."""
-        assert self.fk is not None
-        names = enumerate(self.fk.names)
+        names = enumerate(self._fk.names)
         return [k for k, name in names if self.arm is None or not name.startswith(JOINT_OFFSET)]
 
     @cached_property
@@ -113,18 +116,14 @@ class Problem:
         """The priors (6,) of joint offsets, rad; none where they are not asked for."""
         if self.arm is None:
             return np.zeros(0)
-        if self.fk is None:
-            return np.full(6, OFFSET_SIGMA_RAD)
-        known = dict(zip(self.fk.names, self.fk.sigma, strict=True))
+        known = dict(zip(self._fk.names, self._fk.sigma, strict=True))
         names = (JOINT_OFFSET + joint for joint in self.arm.joints)
         return np.array([known.get(name, OFFSET_SIGMA_RAD) for name in names])
 
     @cached_property
     def shared(self) -> Floats:
         """(n, 6, k): what one standard deviation of each shared error does at each pose."""
-        if self.fk is None:
-            return np.zeros((len(self.T_base_gripper), 6, 0))
-        return self.fk.shared[..., self._columns] * self.fk.sigma[self._columns]
+        return self._fk.shared[..., self._columns] * self._fk.sigma[self._columns]
 
     @cached_property
     def prior(self) -> Floats:
@@ -185,9 +184,7 @@ class Problem:
         halves = [by_arm[..., :3], by_arm[..., 3:]]
         if isinstance(self.views, PoseViews):  # a shift of the board is one of the gripper
             halves.append(np.broadcast_to(np.eye(6, 3), by_arm[..., :3].shape))
-        stated = np.zeros_like(by_arm)
-        if self.fk is not None:
-            stated = by_arm @ self.fk.each @ np.swapaxes(by_arm, 1, 2)
+        stated = by_arm @ self._fk.each @ np.swapaxes(by_arm, 1, 2)
         return stated, np.stack([half @ np.swapaxes(half, 1, 2) for half in halves])
 
     def with_prior(self, state: State) -> Floats:
@@ -224,8 +221,7 @@ class Problem:
         columns = [by_X_and_Y(*given), np.zeros((n, 6, int(self.free_scale)))]
         if self.arm is not None and self.q is not None:
             columns.append(by_arm @ self.arm.jacobian(self.q + state.offsets))
-        if self.fk is not None:
-            columns.append(by_arm @ _growing(self.arm_twists(state)) @ self.shared)
+        columns.append(by_arm @ _growing(self.arm_twists(state)) @ self.shared)
         own = self.own_twists(state)
         by_pose = np.concatenate(columns, axis=2)
         by_pose[:, :3] = Rotation.from_rotvec(own[:, :3]).as_matrix() @ by_pose[:, :3]

@@ -20,7 +20,6 @@ asked for, by the joint refinement. The result says how well X is known and what
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -39,13 +38,13 @@ from coursekit.boards import Board, Detection, Detections, detect_all
 from coursekit.boards.board import Skipped, why_unused
 from coursekit.boards.detector import SESSION, natural
 from coursekit.causes import DiagnosisTexts
-from coursekit.checks import array, choice, instance, settle, transform, want
+from coursekit.checks import array, choice, settle, transform, want
 from coursekit.formats import poses as pose_files
 from coursekit.formats.poses import JOINTS, PLACE, THREE, TURN, VELOCITIES, PoseRow
 from coursekit.geometry import Intrinsics, cross_matrix, pose_difference
 from coursekit.hand_eye import poses, refinement, views
 from coursekit.hand_eye.closed_form import CLOSED_FORMS, FEWEST_POSES, closed_form
-from coursekit.results import write_bytes
+from coursekit.results import read_json, write_bytes, write_json
 from coursekit.words import Estimate, say, wrapped
 
 SENTENCES = DiagnosisTexts.of("hand_eye")
@@ -262,7 +261,7 @@ class HandEyeSession:
             arm, seen, mount_ = pose_files.read_samples(place, mount)
             return cls("eye_in_hand" if mount_ == "eye_in_hand" else "eye_to_hand", arm, seen)
         want(place.is_dir(), "folder", os.fspath(folder), "a folder that exists")
-        card = _card(place)
+        card = read_json(place / SESSION) if (place / SESSION).is_file() else {}
         mount = mount or _from_card(card, "mount")
         board = board or _board(_from_card(card, "board"))
         intrinsics = intrinsics or Intrinsics.from_dict(_from_card(card, "intrinsics"))
@@ -306,7 +305,7 @@ class HandEyeSession:
         write_bytes(place / POSES, self._csv().encode())
         card: dict[str, object] = {"mount": self.mount, "board": asdict(self.board)}
         card |= {"intrinsics": self.intrinsics.to_dict(), **(about or {})}
-        write_bytes(place / SESSION, (json.dumps(card, indent=1) + "\n").encode())
+        write_json(place / SESSION, card)
 
     def _csv(self) -> str:
         turns = Rotation.from_matrix(self.T_base_gripper[:, :3, :3]).as_quat(canonical=True)
@@ -320,18 +319,6 @@ class HandEyeSession:
 
 
 # --- reading a folder ---
-
-
-def _card(folder: Path) -> dict[str, Any]:
-    """What session.json says, {} where there is none."""
-    path = folder / SESSION
-    if not path.is_file():
-        return {}
-    try:
-        card = json.loads(path.read_text("utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"folder: {SESSION} is no JSON ({error})") from error
-    return instance(SESSION, card, dict)
 
 
 def _from_card(card: dict[str, Any], key: str) -> Any:

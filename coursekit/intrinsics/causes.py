@@ -463,11 +463,6 @@ def _free(cause: str, rows: NDArray[np.intp], at: int = 0, tried: int = 1) -> en
     return engine.Hypothesis(cause, np.eye(len(rows)), at, rows, TYPICAL[cause], tried)
 
 
-def search_residuals(start: Calibration) -> engine.CauseSearch[Calibration]:
-    """The causes that the residuals of a fit speak for, the strongest first."""
-    return engine.search(start, CHANCE_LEVEL)
-
-
 def as_fisheye(model: Calibration) -> tuple[Calibration, float]:
     """The same views through a fisheye with three coefficients, fitted from the same poses.
 
@@ -873,14 +868,5 @@ def shaped(model: Calibration, result: IntrinsicsResult) -> IntrinsicsResult:
     extra = {f"{c} {k}": moves[c][:, :, k] for c in sizes for k in range(moves[c].shape[2])}
     held = _prior(replace(model, sizes=sizes), own=False)
     weights, off = (part[model.estimated.shape[1] :] for part in held)
-    return evaluate(
-        model.camera,
-        model.poses,
-        result.detections,
-        result.board,
-        model.board + model.shape,
-        result.names,
-        result.model,
-        extra,
-        (weights, off),
-    )
+    given = result.detections, result.board, model.board + model.shape, result.names, result.model
+    return evaluate(model.camera, model.poses, *given, extra, (weights, off))

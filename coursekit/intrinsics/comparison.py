@@ -18,17 +18,8 @@ from coursekit.arrays import ArrayLike, Floats
 from coursekit.boards import Board, Detection
 from coursekit.checks import want
 from coursekit.geometry import Intrinsics, deproject, moved, project
-from coursekit.intrinsics import derivatives
-from coursekit.intrinsics.fit import (
-    MAP_SHAPE,
-    IntrinsicsResult,
-    calibrate,
-    folded_text,
-    image_grid,
-    points_at,
-    projection_columns,
-    worst_direction,
-)
+from coursekit.intrinsics import derivatives, fit
+from coursekit.intrinsics.fit import MAP_SHAPE, IntrinsicsResult
 from coursekit.words import p_text, say
 
 _GAUSS_NEWTON_STEPS = 20
@@ -71,14 +62,13 @@ class HalvesDifference:
         p = {"views": p_text(self.p_value), "noise": p_text(self.noise_p_value)}
         facts = {"views": views, "range_m": self.range_m, "px": px, "sigma": sigma, "p": p}
         lines = [say("intrinsics.halves", alone=alone, **facts)]
-        return "\n".join([*lines, *folded_text(float(np.isnan(length).mean()))])
+        return "\n".join([*lines, *fit.folded_text(float(np.isnan(length).mean()))])
 
 
 def halves(
     detections: Sequence[Detection],
     board: Board,
     model: str = "brown_conrady",
-    same_focal: bool = False,
     range_m: float | None = None,
     shape: tuple[int, int] = MAP_SHAPE,
     points: ArrayLike | None = None,
@@ -95,23 +85,21 @@ def halves(
     """
     if len(detections) < 6:
         raise ValueError(f"detections: got {len(detections)} views, halves need at least 6")
-    first, second = both = [
-        calibrate([detections[i] for i in part], board, model, same_focal, points=points)
-        for part in (range(0, len(detections), 2), range(1, len(detections), 2))
-    ]
+    parts = detections[::2], detections[1::2]
+    first, second = both = [fit.calibrate(part, board, model, points=points) for part in parts]
     range_m = first.board_range_m if range_m is None else float(range_m)
-    grid = image_grid(first.intrinsics, shape).reshape(-1, 2)
+    grid = fit.image_grid(first.intrinsics, shape).reshape(-1, 2)
     weights = 1.0 / np.hypot(*(r.uncertainty_map(range_m, shape).ravel() for r in both))
     weights[~np.isfinite(weights)] = 0.0  # where a half's distortion has no inverse
     difference = difference_px(first.intrinsics, second.intrinsics, grid, range_m, weights)
     difference[weights == 0] = np.nan
-    columns = projection_columns(first.intrinsics, grid, range_m, first.names)
+    columns = fit.projection_columns(first.intrinsics, grid, range_m, first.names)
     spread = _without_motion(columns, weights)
     total = first.covariance + second.covariance
     apart = np.array([second.value(name) - first.value(name) for name in first.names])
     known = len(apart)
     noise = [r.sigma_px**2 * r.equations.shared_covariance[:known, :known] for r in both]
-    expected = worst_direction(spread @ total @ np.swapaxes(spread, -1, -2)).reshape(shape)
+    expected = fit.worst_direction(spread @ total @ np.swapaxes(spread, -1, -2)).reshape(shape)
     p_value = _wald(apart, total, min(first.dof, second.dof))
     noise_p_value = _wald(apart, noise[0] + noise[1], min(r.equations.dof for r in both))
     maps = difference.reshape(*shape, 2), expected
@@ -132,7 +120,7 @@ def difference_px(
     pixel's residual; None weighs all alike. Gauss-Newton. NaN where the first camera's distortion
     has no inverse.
     """
-    points = points_at(pixels, range_m, first)
+    points = fit.points_at(pixels, range_m, first)
     weights = np.ones(len(pixels)) if weights is None else weights
     known = np.isfinite(points).all(axis=1) & (weights > 0)
     weight = weights[known, None]
@@ -215,7 +203,7 @@ class Comparison:
         px, mm, sigma = ({"median": np.nanmedian(m), "worst": np.nanmax(m)} for m in maps)
         facts = {"p": p_text(self.p_value), "range_m": self.range_m, "px": px, "mm": mm}
         lines.append(say("intrinsics.apart", sigma=sigma, **facts))
-        lines += folded_text(float(np.isnan(self.shift_m).mean()))
+        lines += fit.folded_text(float(np.isnan(self.shift_m).mean()))
         return "\n".join(lines)
 
 
@@ -242,7 +230,7 @@ def compare(
     """
     ours, names = result.intrinsics, result.names
     want(factory.size == ours.size, "factory", factory.size, f"the fit's size, {ours.size} px")
-    grid = image_grid(ours, shape).reshape(-1, 2)
+    grid = fit.image_grid(ours, shape).reshape(-1, 2)
     weights = 1.0 / result.uncertainty_map(range_m, shape).ravel()
     pixels = difference_px(ours, factory, grid, range_m, weights).reshape(*shape, 2)
     depth = np.full(len(grid), float(range_m))

@@ -18,21 +18,13 @@ import numpy as np
 from coursekit.arrays import ArrayLike, Floats
 from coursekit.boards import Board, Detection, Detections, Skipped
 from coursekit.boards.board import by_reason
-from coursekit.causes import Accepted, CauseSearch, DiagnosisTexts
+from coursekit.causes import Accepted, CauseSearch, DiagnosisTexts, search
 from coursekit.checks import array, want
 from coursekit.geometry import fold_radius
-from coursekit.intrinsics import causes
+from coursekit.intrinsics import causes, fit
 from coursekit.intrinsics.causes import Calibration
 from coursekit.intrinsics.comparison import halves
-from coursekit.intrinsics.fit import (
-    MIN_CORNERS,
-    MIN_VIEWS,
-    CalibrationFailed,
-    IntrinsicsResult,
-    calibrate,
-    coverage,
-    tilts,
-)
+from coursekit.intrinsics.fit import MIN_CORNERS, MIN_VIEWS, CalibrationFailed, IntrinsicsResult
 from coursekit.results import read_json
 from coursekit.specifications import DATA
 from coursekit.words import Finding, Findings
@@ -94,8 +86,7 @@ def diagnose(
     if depth_m is not None:
         wanted = f"{len(detections)} views, each with its Z"
         want(len(depth_m) == len(detections), "depth_m", len(depth_m), wanted)
-        counts = [len(detection.ids) for detection in detections]
-        depths = [array(f"depth_m[{i}]", z, (counts[i],)) for i, z in enumerate(depth_m)]
+        depths = [array(f"depth_m[{i}]", z, (len(detections[i]),)) for i, z in enumerate(depth_m)]
     found, used = _images(detections, board)
     unseen = [] if depths else [_TEXTS.not_tested["squares"]]
     if all(detections[i].blur is None for i in used):
@@ -105,7 +96,7 @@ def diagnose(
     views = Detections([detections[i] for i in used])
     if result is None or len(used) < len(detections):
         try:
-            result = calibrate(views, board, model=model)
+            result = fit.calibrate(views, board, model=model)
         except CalibrationFailed as error:
             failed = _TEXTS.finding("not_converged", why=error)
             found += [f for f in (failed, _no_edge_corners(views)) if f]
@@ -144,10 +135,8 @@ def _images(detections: Sequence[Detection], board: Board) -> tuple[list[Finding
     common = max(set(sizes), key=sizes.count) if sizes else (0, 0)
     others = [d.name or f"view {i}" for i, d in enumerate(detections) if d.size != common]
     skipped: Sequence[Skipped] = getattr(detections, "skipped", ())
-    if others and sizes:
-        width, height = common
-        listed = _listed(others)
-        found.append(_TEXTS.finding("mixed_sizes", width=width, height=height, others=listed))
+    if others:
+        found.append(_TEXTS.finding("mixed_sizes", common=common, others=_listed(others)))
     used = [i for i, d in enumerate(detections) if d.size == common and len(d.ids) >= MIN_CORNERS]
     layout = _layout([detections[i] for i in used], board)
     refused = [s for s in skipped if s.kind == "other_board"]
@@ -208,12 +197,12 @@ def _lattice_misfit(detections: list[Detection], columns: int) -> float:
 
 def _residuals(start: Calibration, result: IntrinsicsResult, unseen: list[str]) -> list[Finding]:
     """What the residuals of a fit speak for; what could not be tested is added to `unseen`."""
-    search = causes.search_residuals(start)
-    model, steps = causes.explained(search), causes.named(search)
+    found_causes = search(start, causes.CHANCE_LEVEL)
+    model, steps = causes.explained(found_causes), causes.named(found_causes)
     found = []
     for alike, figures_of in _FIGURES:
         mine = [step for step in steps if step.test.cause in alike]
-        told = figures_of(search, mine, model) if mine else None
+        told = figures_of(found_causes, mine, model) if mine else None
         if told:
             key, figures = told
             if alike[0] in causes.PHYSICAL:
@@ -279,12 +268,10 @@ def _gain_px(steps: _Steps) -> float:
 
 
 def _spoiled_views(search: _Search, steps: _Steps, model: Calibration) -> _Told:
-    residuals = steps[-1].after.linear.residuals
-    return "spoiled_view", {
-        "names": _listed([search.model.names[step.test.at] for step in steps]),
-        "rms": ", ".join(f"{step.test.size:.2f}" for step in steps),
-        "others": math.sqrt(float(np.mean(residuals**2))),
-    }
+    others = math.sqrt(float(np.mean(steps[-1].after.linear.residuals ** 2)))
+    names = _listed([search.model.names[step.test.at] for step in steps])
+    rms = ", ".join(f"{step.test.size:.2f}" for step in steps)
+    return "spoiled_view", {"names": names, "rms": rms, "others": others}
 
 
 def _bad_corners(search: _Search, steps: _Steps, model: Calibration) -> _Told:
@@ -354,11 +341,8 @@ _FIGURES: tuple[tuple[tuple[str, ...], Callable[[_Search, _Steps, Calibration], 
     ((causes.SHUTTER,), _shutter),
     ((causes.LENS,), _lens),
 )
-_ENTRY = {
-    causes.HEIGHTS: "bowed_board",
-    causes.PRINT: "uneven_print",
-    causes.STRETCH: "uneven_print",
-}
+_OF_PRINT = (causes.PRINT, causes.STRETCH)
+_ENTRY = {causes.HEIGHTS: "bowed_board", **dict.fromkeys(_OF_PRINT, "uneven_print")}
 
 
 def _unexplained(model: Calibration, result: IntrinsicsResult, some: bool) -> Iterator[Finding]:
@@ -366,11 +350,11 @@ def _unexplained(model: Calibration, result: IntrinsicsResult, some: bool) -> It
     excess = math.sqrt(max(model.left_px**2 - model.noise_px**2, 0.0))
     if excess < max(UNEXPLAINED * model.noise_px, NORMAL_LENS_PX):
         return
-    fit = causes.shaped(model, result)
-    alone = fit.sigma_px**2 * np.diag(fit.equations.shared_covariance)
-    centre = [fit.names.index(name) for name in fit.names if name[0] in "fc"]
-    more = np.sqrt(np.maximum(np.diag(fit.covariance) - alone[: len(fit.names)], 0.0))
-    moved = fit.quantile() * float(more[centre].max())
+    shaped = causes.shaped(model, result)
+    alone = shaped.sigma_px**2 * np.diag(shaped.equations.shared_covariance)
+    centre = [shaped.names.index(name) for name in shaped.names if name[0] in "fc"]
+    more = np.sqrt(np.maximum(np.diag(shaped.covariance) - alone[: len(shaped.names)], 0.0))
+    moved = shaped.quantile() * float(more[centre].max())
     besides = " beside what was found" if some else ""
     figures = {"excess": _flat(excess), "noise": _flat(model.noise_px), "moved": moved}
     yield _TEXTS.finding("unexplained", besides=besides, **figures)
@@ -431,7 +415,7 @@ def _fronto_parallel(result: IntrinsicsResult) -> Finding | None:
     # same.
     fx = result.intrinsics.fx
     longest = min(1.0, float(np.hypot(*result.intrinsics.size)) / fx)
-    tilt = float(np.quantile(longest * tilts(result).total_deg, FLAT_VIEWS_SHARE))
+    tilt = float(np.quantile(longest * fit.tilts(result).total_deg, FLAT_VIEWS_SHARE))
     if tilt >= FLAT_TILT_DEG:
         return None
     sigma = 100 * result.sigma("fx") / fx
@@ -439,7 +423,7 @@ def _fronto_parallel(result: IntrinsicsResult) -> Finding | None:
 
 
 def _no_edge_corners(detections: Sequence[Detection]) -> Finding | None:
-    seen = coverage(detections)
+    seen = fit.coverage(detections)
     bare = [margin for margin in seen.margins if margin > BARE_MARGIN]
     if len(bare) < BARE_SIDES and max(seen.margins) < ONE_BARE_MARGIN:
         return None

@@ -127,14 +127,10 @@ class IntrinsicsResult(Estimate):
         return _rms(self._all_residuals)
 
     @property
-    def rms_u_px(self) -> float:
-        """Root mean square residual along u, px."""
-        return _rms(self._all_residuals[:, 0])
-
-    @property
-    def rms_v_px(self) -> float:
-        """Root mean square residual along v, px."""
-        return _rms(self._all_residuals[:, 1])
+    def rms_uv_px(self) -> tuple[float, float]:
+        """Root mean square residual along u and along v, px."""
+        u, v = self._all_residuals.T
+        return _rms(u), _rms(v)
 
     @property
     def per_view_rms_px(self) -> Floats:
@@ -163,15 +159,6 @@ class IntrinsicsResult(Estimate):
         return decrease < max(ARRIVED_SIGMAS**2 * of_sigma, 2 * self.corners * ARRIVED_PX**2)
 
     # --- what the parameters are known to ---
-
-    @property
-    def jacobian(self) -> tuple[Floats, tuple[Floats, ...]]:
-        """d predicted pixels / d parameters (2N, p), and / d pose of view i (2 N_i, 6).
-
-        Rows are u, v of each corner, view after view. Columns of a pose: (omega, v), rad and m,
-        of T <- exp(omega, v) T in the camera's frame.
-        """
-        return self.equations.shared[:, : len(self.names)], tuple(self.equations.poses)
 
     @cached_property
     def _scatter(self) -> derivatives.Scatter:
@@ -329,8 +316,7 @@ def folded_text(share: float) -> list[str]:
     if not share:
         return []
     where = "in its corners" if share < MOST_FOLDED else "from some distance to its centre on"
-    folds = "the fitted lens folds back: it has no figures"
-    return [f"in {100 * share:.1f} % of the image ({where}) {folds}"]
+    return [say("intrinsics.folds", percent=100 * share, where=where)]
 
 
 def rms_under(lens: Intrinsics, detections: Sequence[Detection], points: Floats) -> float:
@@ -409,7 +395,7 @@ def calibrate(
     fits: list[IntrinsicsResult] = []
     for start in starts:
         try:
-            lens, poses = _solve(corners, detections, model, same_focal, start)
+            lens, poses = _solve(corners, detections, names, start)
         except CalibrationFailed:
             if start is starts[-1] and not fits:
                 raise
@@ -462,27 +448,23 @@ def evaluate(
 
 
 def _solve(
-    corners: Floats,
-    detections: Sequence[Detection],
-    model: str,
-    same_focal: bool,
-    guess: Intrinsics | None,
+    corners: Floats, detections: Sequence[Detection], names: Sequence[str], guess: Intrinsics | None
 ) -> tuple[Intrinsics, Floats]:
-    """The camera and T_camera_board (n, 4, 4) of the least squares, by OpenCV.
+    """The camera and T_camera_board (n, 4, 4) of the least squares over `names`, by OpenCV.
 
     On one thread: on two, OpenCV adds sums in an order that changes from run to run. Raises
     CalibrationFailed where it gives up, runs away, or ends at a camera that cannot be.
     """
     import cv2
 
-    size, estimated = detections[0].size, MODELS[model]
+    size, same_focal = detections[0].size, "f" in names
     points = [corners[d.ids].astype(np.float32) for d in detections]
     pixels = [np.asarray(d.pixels, np.float32) for d in detections]
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, ITERATIONS, np.finfo(float).eps)
     flags = cv2.CALIB_FIX_ASPECT_RATIO if same_focal else 0
-    flags |= 0 if "p1" in estimated else cv2.CALIB_ZERO_TANGENT_DIST
+    flags |= 0 if "p1" in names else cv2.CALIB_ZERO_TANGENT_DIST
     for name in ("k1", "k2", "k3"):
-        flags |= 0 if name in estimated else getattr(cv2, f"CALIB_FIX_{name.upper()}")
+        flags |= 0 if name in names else getattr(cv2, f"CALIB_FIX_{name.upper()}")
     K0, dist0 = np.eye(3), np.zeros(5)
     if guess is not None:
         K0, dist0, flags = guess.K, np.array(guess.coeffs), flags | cv2.CALIB_USE_INTRINSIC_GUESS
@@ -510,7 +492,7 @@ def _solve(
     in_front = all((z > 0).all() for z in depths)
     if min(K[0, 0], K[1, 1]) < LEAST_FOCAL * size[0] or not in_front:
         raise CalibrationFailed(say("intrinsics.no_camera", fx=K[0, 0], fy=K[1, 1]))
-    kind = "brown_conrady" if estimated else "none"
+    kind = "brown_conrady" if "k1" in names else "none"
     coeffs = tuple(np.ravel(dist)[:5].tolist())
     return Intrinsics(*size, K[0, 0], K[1, 1], K[0, 2], K[1, 2], kind, coeffs), poses
 
@@ -653,11 +635,8 @@ def tilts(result: IntrinsicsResult) -> Tilts:
     """
     normals = result.T_camera_board[:, :3, 2]
     x, y, z = (normals * np.sign(normals[:, 2:])).T  # away from the camera, whatever the origin
-    return Tilts(
-        about_x_deg=np.degrees(np.arctan2(-y, z)),
-        about_y_deg=np.degrees(np.arctan2(x, z)),
-        total_deg=np.degrees(np.arccos(np.clip(z, -1.0, 1.0))),
-    )
+    about_x_deg, about_y_deg = np.degrees(np.arctan2(-y, z)), np.degrees(np.arctan2(x, z))
+    return Tilts(about_x_deg, about_y_deg, np.degrees(np.arccos(np.clip(z, -1.0, 1.0))))
 
 
 def _weaknesses(result: IntrinsicsResult) -> Iterator[str]:

@@ -54,10 +54,7 @@ def board_in_gripper(board: Board) -> Floats:
     The fingers close along the gripper's y axis, so that is the plate's normal; the plate sticks
     out forward (x), and with joint_5 at +90 degrees its pattern faces up.
     """
-    x, y, z = np.array([0.0, 0.0, 1.0]), np.array([-1.0, 0.0, 0.0]), np.array([0.0, -1.0, 0.0])
-    if board.old_origin:  # its y points up the pattern and its z out of it
-        y, z = -y, -z
-    R = np.column_stack([x, y, z])
+    R = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
     half = board.size_m[1] / 2
     return make_transform(R, np.array([FINGERS_M + half, 0.0, 0.0]) - R @ board.middle)
 
@@ -80,10 +77,10 @@ class Setup:
     """An arm, a camera and a board, and what of them is fixed to what.
 
     mount "eye_in_hand": X = T_gripper_camera and Y = T_base_board; "eye_to_hand": X = T_base_camera
-    and Y = T_gripper_board. share: how many of the board's corners the camera must see, 0 to 1.
-    turn_rad: how far the board may be turned from straight on and upright, about any axis; a
-    camera on its head would twist its cable off. Raises ValueError for another mount or
-    transforms that are not rigid.
+    and Y = T_gripper_board. board: none of the old origin. share: how many of its corners the
+    camera must see, 0 to 1. turn_rad: how far the board may be turned from straight on and upright,
+    about any axis; a camera on its head would twist its cable off. Raises ValueError for another
+    mount or transforms that are not rigid.
     """
 
     arm: Arm
@@ -130,14 +127,12 @@ class Setup:
 
     def upright(self, T_camera_board: Floats) -> Floats:
         """1 + 2 cos of the angle (n,) by which boards (n, 4, 4) are turned from upright."""
-        axes = np.array([1.0, -1.0, -1.0]) if self.board.old_origin else np.ones(3)
-        return np.einsum("nii,i->n", T_camera_board[:, :3, :3], axes)
+        return np.einsum("nii->n", T_camera_board[:, :3, :3])
 
     def _faces(self, T: Floats) -> Bools:
         """(n,): whether the board is in front, little enough turned, and its squares large."""
         middle = T[:, :3, :3] @ self.board.middle + T[:, :3, 3]
-        into = T[:, :3, 2] * (-1.0 if self.board.old_origin else 1.0)
-        facing = (middle * into).sum(axis=1) / np.linalg.norm(middle, axis=1)
+        facing = (middle * T[:, :3, 2]).sum(axis=1) / np.linalg.norm(middle, axis=1)
         focal = min(self.intrinsics.fx, self.intrinsics.fy)
         with np.errstate(divide="ignore"):
             side_px = focal * self.board.square_m * facing / middle[:, 2]

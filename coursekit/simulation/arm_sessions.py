@@ -36,7 +36,7 @@ from coursekit.hand_eye.session import HandEyeSession
 from coursekit.simulation import arm_poses
 from coursekit.simulation.arm_poses import Setup
 from coursekit.simulation.board_images import render_board
-from coursekit.simulation.corner_sessions import Effects, corner_noise, printed, with_street_errors
+from coursekit.simulation.corner_sessions import Effects, corner_errors, printed
 from coursekit.specifications import DATA, device
 from coursekit.words import counting, say
 
@@ -106,9 +106,9 @@ class HandEyeMistakes:
     scatter_tails: bool = False
 
     def __post_init__(self) -> None:
-        choice("design", self.design, get_args(Design))
-        choice("degrees", self.degrees, get_args(Degrees))
-        choice("millimetres", self.millimetres, get_args(Millimetres))
+        kinds = {"design": Design, "degrees": Degrees, "millimetres": Millimetres}
+        for name, kind in kinds.items():
+            choice(name, getattr(self, name), get_args(kind))
         signed = ("late_s", "joint_offset_deg")
         for field in fields(self):
             if field.type == "float":
@@ -122,7 +122,7 @@ class HandEyeMistakes:
 class HandEyeTruth:
     """What a simulated session really was.
 
-    setup: with the true X and Y. mount: the true one. T_base_gripper, T_camera_board (n, 4, 4):
+    setup: with the true mount, X and Y. T_base_gripper, T_camera_board (n, 4, 4):
     when the images were taken. Y (n, 4, 4): where the board was on its stand at each, as it may
     slip. slipped_at: the first view after that, None without. outliers: the views whose arm pose is
     wrong. joint: whose zero is off, None without. arm: the unit.
@@ -142,11 +142,6 @@ class HandEyeTruth:
     def X(self) -> Floats:
         """T_gripper_camera or T_base_camera, (4, 4)."""
         return self.setup.X
-
-    @property
-    def mount(self) -> Mount:
-        """How the camera was really mounted."""
-        return self.setup.mount
 
 
 @cache
@@ -195,22 +190,26 @@ def hand_eye_session(
     truth, q, dq = _poses(mount, seed, n, arm_errors, mistakes or HandEyeMistakes())
     board, effects, street = truth.setup.board, images or Effects(), _stream(seed, b"street")
     points = printed(board, effects, street) * truth.mistakes.square_scale
-    rng, ids, found = _stream(seed, b"corners"), np.arange(len(points)), []
-    for view in range(len(q)):
+    rngs, every, found = (_stream(seed, b"corners"), street), np.arange(len(points)), []
+    lens = truth.setup.intrinsics
+    for view, T in enumerate(truth.T_camera_board):
         sigma_px = corner_noise_px * np.exp(effects.noise_spread * street.normal())
-        noise = corner_noise(rng, len(points), sigma_px)
-        noise = with_street_errors(noise, sigma_px, board, ids, effects, street)
-        found.append(_corners(truth, view, points, noise, effects.claimed * sigma_px))
+        errors = corner_errors(board, every, sigma_px, effects, rngs)
+        pixels = project(transform_points(T, points), lens.K, lens.dist) + errors
+        ids = np.flatnonzero(seen(points, T, lens))
+        if len(ids) < FEWEST_CORNERS:
+            raise ValueError(
+                f"mistakes: the board leaves the image in view {view}; take smaller ones"
+            )
+        claimed_px = effects.claimed * sigma_px
+        found.append(Detection(ids, pixels[ids], lens.size, f"view_{view:02d}", claimed_px))
     return _reported(truth, q, dq, Detections(found)), truth
 
 
 def unknown_sessions(seed: int) -> dict[str, HandEyeSession]:
     """Three sessions with the camera on the wrist, each with one mistake for somebody to find."""
-    mistakes = {
-        "P": HandEyeMistakes(square_scale=1.05),
-        "Q": HandEyeMistakes(inverted_poses=True),
-        "R": HandEyeMistakes(slip_m=0.005),
-    }
+    larger, inverted = HandEyeMistakes(square_scale=1.05), HandEyeMistakes(inverted_poses=True)
+    mistakes = {"P": larger, "Q": inverted, "R": HandEyeMistakes(slip_m=0.005)}
     return {n: hand_eye_session("eye_in_hand", seed, mistakes=m)[0] for n, m in mistakes.items()}
 
 
@@ -284,7 +283,10 @@ def _poses(
 ) -> tuple[HandEyeTruth, Floats, Floats]:
     """The truth, and the joint angles and velocities (n, 6) that the encoders read."""
     rig, q = _placed(choice("mount", mount, MOUNTS), _stream(seed, b"poses"), n, mistakes.design)
-    offsets, joint = _joint_zero(seed, mistakes)
+    offsets, joint = np.zeros(6), None
+    if mistakes.joint_offset_deg:
+        joint = int(_stream(seed, b"zero").integers(1, 5))
+        offsets[joint] = np.radians(mistakes.joint_offset_deg)
     arm = SimulatedArm(seed, errors or ArmErrors(0.0, 0.0, 0.0, 0.0))
     dq = np.zeros_like(q)
     if mistakes.moving or mistakes.late_s:
@@ -298,7 +300,11 @@ def _poses(
     for view in outliers:  # the image was taken while the arm swung, or somebody leant on it
         true[view] = turned(true[view], _twist(bumps, mistakes.outlier_m, mistakes.outlier_deg))
     true = turned(true, _scatter(_stream(seed, b"scatter"), len(q), mistakes))
-    Y, slipped_at = _slipping(rig.Y, seed, len(q), mistakes)
+    Y, slipped_at = np.repeat(rig.Y[None], len(q), axis=0), None
+    if mistakes.slip_m or mistakes.slip_deg:
+        rng, third = _stream(seed, b"slip"), len(q) // 3
+        slipped_at = int(rng.integers(third, max(third + 1, 2 * len(q) // 3 + 1)))
+        Y[slipped_at:] = turned(rig.Y, _twist(rng, mistakes.slip_m, mistakes.slip_deg))
     T_camera_board = camera_board(true, rig.X, Y, rig.mount)
     bad = tuple(sorted(outliers.tolist()))
     truth = HandEyeTruth(rig, mistakes, true, T_camera_board, Y, slipped_at, bad, joint, arm)
@@ -340,27 +346,6 @@ def _placed(mount: Mount, rng: np.random.Generator, n: int, design: Design) -> t
     return default, arm_poses.careful_poses(default, rng, n) if design == "careful" else sets[0]
 
 
-def _joint_zero(seed: int, mistakes: HandEyeMistakes) -> tuple[Floats, int | None]:
-    """By how much each joint's zero is off, (6,) rad, and which one that is."""
-    offsets = np.zeros(6)
-    if not mistakes.joint_offset_deg:
-        return offsets, None
-    joint = int(_stream(seed, b"zero").integers(1, 5))
-    offsets[joint] = np.radians(mistakes.joint_offset_deg)
-    return offsets, joint
-
-
-def _slipping(Y: Floats, seed: int, n: int, mistakes: HandEyeMistakes) -> tuple[Floats, int | None]:
-    """Where the board is at each view, (n, 4, 4), and the first view after the slip."""
-    stands = np.repeat(Y[None], n, axis=0)
-    if not (mistakes.slip_m or mistakes.slip_deg):
-        return stands, None
-    rng = _stream(seed, b"slip")
-    at = int(rng.integers(n // 3, max(n // 3 + 1, 2 * n // 3 + 1)))
-    stands[at:] = turned(Y, _twist(rng, mistakes.slip_m, mistakes.slip_deg))
-    return stands, at
-
-
 def _scatter(rng: np.random.Generator, n: int, mistakes: HandEyeMistakes) -> Floats:
     """What each pose is off by on its own, twists (n, 6), rad and m."""
     std = np.repeat([np.radians(mistakes.scatter_deg), mistakes.scatter_m], 3)
@@ -374,21 +359,6 @@ def _twist(rng: np.random.Generator, shift_m: float, turn_deg: float) -> Floats:
     """A turn and a shift (6,) of these sizes about and along directions of their own."""
     turn, shift = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
     return np.concatenate([np.radians(turn_deg) * turn, shift_m * shift])
-
-
-def _corners(
-    truth: HandEyeTruth, view: int, points: Floats, noise: Floats, noise_px: float
-) -> Detection:
-    """What a detector reports of one view: all corners with room in the image.
-
-    points (N, 3): where the board's corners really are on it, m. noise (N, 2): their errors, px.
-    """
-    lens, T = truth.setup.intrinsics, truth.T_camera_board[view]
-    pixels = project(transform_points(T, points), lens.K, lens.dist) + noise
-    ids = np.flatnonzero(seen(points, T, lens))
-    if len(ids) < FEWEST_CORNERS:
-        raise ValueError(f"mistakes: the board leaves the image in view {view}; take smaller ones")
-    return Detection(ids, pixels[ids], lens.size, f"view_{view:02d}", noise_px)
 
 
 # --- what is reported ---
@@ -447,8 +417,9 @@ def touch_corners(truth: HandEyeTruth, corners: Sequence[int] = (0, 7, 39)) -> F
     >>> touch_corners(truth, [0, 39]).shape
     (2, 3)
     """
-    want(truth.mount == "eye_in_hand", "truth", truth.mount, "eye_in_hand: a board on the table")
-    places = transform_points(truth.setup.Y, truth.setup.board.points[list(corners)])
+    setup = truth.setup
+    want(setup.mount == "eye_in_hand", "truth", setup.mount, "eye_in_hand: a board on the table")
+    places = transform_points(setup.Y, setup.board.points[list(corners)])
     poses = np.stack([make_transform(_POINTS_DOWN, place) for place in places])
     return _reported_poses(truth.arm, poses, "corners")[:, :3, 3]
 
@@ -481,7 +452,7 @@ def shared_target(on_wrist: HandEyeTruth, over_shoulder: HandEyeTruth) -> Shared
     >>> bool(np.linalg.norm(near - far) < 2e-3)  # two cameras on one arm without errors
     True
     """
-    mounts = (on_wrist.mount, over_shoulder.mount)
+    mounts = on_wrist.setup.mount, over_shoulder.setup.mount
     wanted = "an eye_in_hand and an eye_to_hand session"
     want(mounts == ("eye_in_hand", "eye_to_hand"), "on_wrist, over_shoulder", mounts, wanted)
     rng = np.random.default_rng(0)

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from coursekit import checks
 from coursekit.arrays import ArrayLike, Floats, Grey, NDArray
 from coursekit.boards import Board
-from coursekit.geometry import Intrinsics, invert_transform, transform_points
+from coursekit.geometry import Intrinsics, invert_transform, make_transform, transform_points
 from coursekit.simulation.raycast import WOOD, texture_factor
 from coursekit.simulation.scenes import MAPLE, TABLE_THICK_M, WALL_PAINT, Box, Scene, corner_rays
 
@@ -257,36 +257,16 @@ def render_board(
     return _expose(blurred, ELECTRONS_PER_MS * exposure_ms * light, rng)
 
 
-def as_taken(picture: Grey, quality: int = 100, sharpen: float = 0.0, mosaic: bool = False) -> Grey:
-    """A grey picture (h, w) as it comes out of a cheap camera, and of the file it was stored in.
-
-    mosaic: red, green and blue are seen by every second or fourth pixel only and guessed between
-    them. sharpen: how much of what a blur of 1 px takes away is added, 0.5 to 1.5 in a webcam.
-    quality: of the JPEG, 1 to 100, its colours at half the resolution.
-    Raises ValueError for a number outside of that.
-    """
-    checks.number("quality", quality, "1 to 100", least=1, most=100)
-    checks.number("sharpen", sharpen, "0 to 3", least=0, most=3)
-    code = cv2.COLOR_BayerRGGB2BGR if mosaic else cv2.COLOR_GRAY2BGR
-    colours = cv2.cvtColor(picture, code)
-    soft = cv2.GaussianBlur(colours, (0, 0), 1.0)
-    sharp = cv2.addWeighted(colours, 1 + sharpen, soft, -sharpen, 0)
-    _, stored = cv2.imencode(".jpg", sharp, [cv2.IMWRITE_JPEG_QUALITY, int(quality)])
-    return np.asarray(cv2.imdecode(stored, cv2.IMREAD_GRAYSCALE), np.uint8)
-
-
 def board_scene(board: Board, T_scene_board: ArrayLike) -> Scene:
     """A plate of the printed sheet's size, without the print, on a table: "board", "table"."""
     T = checks.transform("T_scene_board", T_scene_board) @ board.T_board_sheet
     wide, high = board.size_m
     margin = 2 * MARGIN * board.square_m
-    into_plate, into_table = np.eye(4), np.eye(4)
-    into_plate[:3, 3] = wide / 2, high / 2, THICK_M / 2
-    into_table[:3, 3] = wide / 2, high / 2, THICK_M + TABLE_THICK_M / 2
-    return (
-        Box("board", np.array([wide + margin, high + margin, THICK_M]), T @ into_plate, WALL_PAINT),
-        Box("table", np.array([4.0, 4.0, TABLE_THICK_M]), T @ into_table, MAPLE, "wood"),
-    )
+    into_plate = T @ make_transform(np.eye(3), (wide / 2, high / 2, THICK_M / 2))
+    into_table = T @ make_transform(np.eye(3), (wide / 2, high / 2, THICK_M + TABLE_THICK_M / 2))
+    plate, table = (wide + margin, high + margin, THICK_M), (4.0, 4.0, TABLE_THICK_M)
+    board_box = Box("board", np.array(plate), into_plate, WALL_PAINT)
+    return board_box, Box("table", np.array(table), into_table, MAPLE, "wood")
 
 
 def check_pose(board: Board, T_camera_board: ArrayLike) -> Floats:

@@ -11,16 +11,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import Any
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coursekit.arrays import Bools, Floats, Integers
 from coursekit.boards import Board, Detection, Detections
 from coursekit.boards.board import BORDER_PX, seen, slide_into_view
-from coursekit.checks import array, number, positive, whole
+from coursekit.checks import number, positive, whole
 from coursekit.geometry import Intrinsics, project, transform_points
 from coursekit.words import say
 
@@ -56,9 +54,9 @@ class Effects:
     shared: std of errors that neighbouring corners of a view share, over the noise. corner_spread:
     as noise_spread, from corner to corner of a view, which makes the noise's tails heavy. shake_px:
     std of the length of the motion blur in every view. claimed: what the detector says of its
-    noise, over what it is. rational: k4, k5 and k6 of OpenCV's rational model, after the lens's own
-    coefficients; the image must grow all the way to its corners, which is not checked. fisheye: it
-    grows with the angle (equidistant) instead of its tangent, the lens's coefficients apart.
+    noise, over what it is. see: how a lens that five coefficients do not describe makes pixels
+    (N, 2) of points (N, 3) in its frame; the image must grow all the way to its corners, which is
+    not checked.
     """
 
     bow_m: float = 0.0
@@ -81,12 +79,10 @@ class Effects:
     corner_spread: float = 0.0
     shake_px: float = 0.0
     claimed: float = 1.0
-    rational: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    fisheye: bool = False
+    see: Callable[[Floats, Intrinsics], Floats] | None = None
 
     def __post_init__(self) -> None:
         most = {"max_tilt_deg": 60.0, "inner_only": 0.3, "blur_share": 1.0}
-        array("rational", self.rational, (3,), finite=True)
         for name in (field.name for field in fields(self) if field.type in ("float", "int")):
             least, highest = -np.inf if name == "bow_m" else 0.0, most.get(name, np.inf)
             wanted = f"a finite number from {least:g} to {highest:g}"
@@ -119,9 +115,9 @@ def ordinary(seed: int) -> Effects:
     reaches a square or two), printed some tenths of a per cent too wide, high or oblique (0.02 to
     0.64 %), corners whose noise differs from view to view (by 18 to 34 %) and of which neighbours
     share a part (correlation 0.08 to 0.42), of which the detector may state a thirtieth (real
-    photographs; of JPEGs from `board_images.as_taken` a quarter to the whole). A lens that breathes
-    0.03 % and a board held so still that it moves less than 0.1 mm while an image is read: nobody
-    could call that a fault.
+    photographs; of JPEGs as tests/test_board_images.py makes them a quarter to the whole). A lens
+    that breathes 0.03 % and a board held so still that it moves less than 0.1 mm while an image is
+    read: nobody could call that a fault.
 
     >>> ordinary(1).bow_m, 5e-5 <= ordinary(1).wave_m <= 5e-4
     (0.0, True)
@@ -189,11 +185,11 @@ def corner_session(
         shaken = effects.shake_px * street.normal() * draw.along[i]
         blur = blur + np.outer(shaken, shaken) / 12
         sigma_px = noise_px * draw.noise_scale[i]
-        noise = corner_noise(rng, len(ids), sigma_px, blur)
-        noise = with_street_errors(noise, sigma_px, board, ids, effects, street)
+        noise = corner_errors(board, ids, sigma_px, effects, (rng, street), blur)
         spoiled = effects.spoiled_px * (i == draw.spoiled_view)
         bad = np.isin(ids, [corner for view, corner in wrong if view == i])
-        wild = _directions(rng, ids.size) * np.where(bad, effects.bad_corner_px, spoiled)[:, None]
+        far_px = np.where(bad, effects.bad_corner_px, spoiled)
+        wild = _directions(rng, ids.size, 2 * np.pi) * far_px[:, None]
         measured = _measured_blur(rng, blur)
         found = pixels + noise + wild
         said_px = effects.claimed * sigma_px
@@ -216,7 +212,7 @@ def view_poses(
     azimuths = rng.permutation(views) / views * 2 * np.pi
     columns, rows = 4, 3
     cells = np.resize(rng.permutation(columns * rows), views)
-    aimed = _as_pinhole(lens, effects) if _beyond(effects) else lens
+    aimed = _as_pinhole(lens, effects) if effects.see else lens
     enough = partial(_enough, board, lens, effects=effects)
     poses: list[Floats] = []
     for azimuth, cell in zip(azimuths, cells, strict=True):
@@ -263,7 +259,7 @@ def _visible(points: Floats, lens: Intrinsics, T: Floats, effects: Effects) -> B
     As `seen`, through the session's own lens.
     """
     border_px = np.maximum(BORDER_PX, effects.inner_only * np.array(lens.size))
-    if not _beyond(effects):
+    if effects.see is None:
         return seen(points, T, lens, border_px)
     inside = transform_points(T, points)
     pixels, last = _through(lens, effects)(inside), np.array(lens.size) - 1 - border_px
@@ -287,8 +283,7 @@ class Drawn:
         direction = rng.normal(size=(views, 3))
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         self.velocity_m_s = effects.speed_m_s * direction
-        angle = rng.uniform(0, np.pi, views)
-        self.along = np.column_stack([np.cos(angle), np.sin(angle)])
+        self.along = _directions(rng, views, np.pi)
         order = rng.permutation(views)
         count = round(effects.blur_share * views) if effects.blur_px else 0
         self.blurred = tuple(sorted(order[:count].tolist()))
@@ -308,26 +303,10 @@ def _look(
     return ids, rolling_shutter(points, velocity, effects.readout_s, lens.height, see), points[:, 2]
 
 
-def _beyond(effects: Effects) -> bool:
-    """Whether the lens is none of the five coefficients'."""
-    return effects.fisheye or any(effects.rational)
-
-
 def _through(lens: Intrinsics, effects: Effects) -> Callable[[Floats], Floats]:
     """How points (N, 3) in front of the session's lens become pixels (N, 2)."""
-    if not _beyond(effects):
-        return lambda points: project(points, lens.K, lens.dist)
-    bent = np.zeros(5) if lens.dist is None else lens.dist
-    see: Any = cv2.projectPoints
-    dist = np.concatenate([bent, effects.rational])
-    if effects.fisheye:
-        see, dist = cv2.fisheye.projectPoints, np.zeros(4)
-
-    def pixels(points: Floats) -> Floats:
-        found, _ = see(points[:, None], np.zeros(3), np.zeros(3), lens.K, dist)
-        return np.asarray(found[:, 0], np.float64)
-
-    return pixels
+    see = effects.see or (lambda points, lens: project(points, lens.K, lens.dist))
+    return lambda points: see(points, lens)
 
 
 def printed(board: Board, effects: Effects, rng: np.random.Generator) -> Floats:
@@ -404,43 +383,35 @@ def rolling_shutter(
 # --- what the detector makes of it ---
 
 
-def corner_noise(
-    rng: np.random.Generator, count: int, noise_px: float, blur: Floats | None = None
-) -> Floats:
-    """Errors (count, 2) of detected corners, px.
-
-    noise_px: std of one coordinate in a sharp image. blur (2, 2): covariance, px^2, None for a
-    sharp image: it flattens the edges across its direction and adds noise there.
-    """
-    noise = noise_px * rng.normal(size=(count, 2))
-    if blur is None:
-        return noise
-    sharp = SHARP_BLUR_PX**2 * np.eye(2)
-    growth = np.eye(2) + BLUR_NOISE_GAIN * (blur - sharp) / SHARP_BLUR_PX**2
-    return noise @ np.linalg.cholesky(growth).T
-
-
-def with_street_errors(
-    noise: Floats,
-    sigma_px: float,
+def corner_errors(
     board: Board,
     ids: Integers,
+    sigma_px: float,
     effects: Effects,
-    rng: np.random.Generator,
+    rngs: tuple[np.random.Generator, np.random.Generator],
+    blur: Floats | None = None,
 ) -> Floats:
-    """A view's noise (N, 2), px, of this std, spread from corner to corner, and what they share.
+    """Errors (N, 2) of a view's corners ids (N,), px: each one's own, and what neighbours share.
 
-    effects: corner_spread and shared.
+    sigma_px: std of one coordinate in a sharp image. effects: corner_spread and shared. rngs: for
+    the noise and for these two. blur (2, 2): covariance, px^2, None for a sharp image: it flattens
+    the edges across its direction and adds noise there.
     """
+    rng, street = rngs
+    noise = sigma_px * rng.normal(size=(len(ids), 2))
+    if blur is not None:
+        sharp = SHARP_BLUR_PX**2 * np.eye(2)
+        growth = np.eye(2) + BLUR_NOISE_GAIN * (blur - sharp) / SHARP_BLUR_PX**2
+        noise = noise @ np.linalg.cholesky(growth).T
     squares = np.column_stack(np.divmod(ids, board.corners[0]))
-    shared = [wavy(squares, smooth_waves(rng, SHARED_SQUARES)) for _ in range(2)]
-    spread = np.exp(effects.corner_spread * rng.normal(size=(len(ids), 1)))
+    shared = [wavy(squares, smooth_waves(street, SHARED_SQUARES)) for _ in range(2)]
+    spread = np.exp(effects.corner_spread * street.normal(size=(len(ids), 1)))
     return noise * spread + effects.shared * sigma_px * np.column_stack(shared)
 
 
-def _directions(rng: np.random.Generator, count: int) -> Floats:
-    """Unit vectors (count, 2), each in a direction of its own."""
-    angle = rng.uniform(0, 2 * np.pi, count)
+def _directions(rng: np.random.Generator, count: int, most: float) -> Floats:
+    """Unit vectors (count, 2), each in a direction of its own, 0 to `most` rad from the x axis."""
+    angle = rng.uniform(0, most, count)
     return np.column_stack([np.cos(angle), np.sin(angle)])
 
 

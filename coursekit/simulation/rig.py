@@ -584,7 +584,8 @@ def _light(scene: Scene, rig: Rig) -> list[tuple[FloatImage, FloatImage]]:
     for eye, facing in ((0.0, np.eye(3)), (rig.baseline_m * (1 + rig.baseline_error), turn)):
         laser, room = (np.empty(left.size[::-1], np.float32) for _ in range(2))
         render_eye(boxes, skins, np.array([eye, 0.0, 0.0]), facing, lens, lamp, laser, room)
-        laser *= 1 + np.float32(SPECKLE) * _speckle(rng, laser.shape)
+        grains = _blurred(rng.standard_normal(left.size[::-1], np.float32), SPECKLE_SIGMA_PX)
+        laser *= 1 + np.float32(SPECKLE) * (grains / grains.std())
         eyes.append((_blurred(laser, LENS_SIGMA_PX), _blurred(room, LENS_SIGMA_PX)))
     return eyes
 
@@ -631,12 +632,6 @@ def _grain(size: int = 512, levels: int = 6) -> FloatImage:
     decays = (np.exp(-2 * (np.pi * frequency * blur) ** 2) for blur in blurs)
     tiles = [np.fft.irfft2(spectrum * decay) for decay in decays]
     return (np.stack(tiles) / tiles[0].std()).astype(np.float32)
-
-
-def _speckle(rng: np.random.Generator, shape: tuple[int, ...]) -> FloatImage:
-    """Noise (H, W) of unit std whose grains are as wide as the laser's speckle."""
-    noise = _blurred(rng.standard_normal(shape, np.float32), SPECKLE_SIGMA_PX)
-    return noise / noise.std()
 
 
 def _blurred(image: FloatImage, sigma_px: float) -> FloatImage:

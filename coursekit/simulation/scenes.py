@@ -18,6 +18,7 @@ from coursekit.checks import array, choice, instance, number, positive, settle, 
 from coursekit.geometry import Intrinsics, deproject, invert_transform, make_transform, pixel_grid
 from coursekit.simulation import raycast
 
+Three = tuple[float, float, float]
 TEXTURES = ("plain", "grid", "wood")
 
 WALL_PAINT = (0.86, 0.87, 0.84)
@@ -46,7 +47,7 @@ class Box:
     name: str
     size_m: Floats
     T_scene_box: Floats
-    color: tuple[float, float, float]
+    color: Three
     texture: str = "plain"
     specular: float = 0.0
 
@@ -77,14 +78,14 @@ def tabletop(distance_m: float = 0.45) -> Scene:
     ['wall', 'table', '60 mm block', '25 mm cube']
     """
     distance = positive("distance_m", distance_m, METRES)
-    top, turned = BLOCK_M / 2, Rotation.from_euler("y", 28, degrees=True)
+    top = BLOCK_M / 2
     front, back = min(0.20, 0.6 * distance), distance + WALL_BEHIND_M - 0.02
     table_size, table_middle = (2.00, TABLE_THICK_M, back - front), (back + front) / 2
     table = _box("table", table_size, (0.0, top + TABLE_THICK_M / 2, table_middle), MAPLE, "wood")
     block_at = (0.0, top - BLOCK_M / 2, distance + BLOCK_M / 2)
     block = _box("60 mm block", 3 * (BLOCK_M,), block_at, ALUMINIUM)
     cube_at = (0.075, top - CUBE_M / 2, distance + 0.015)
-    cube = _box("25 mm cube", 3 * (CUBE_M,), cube_at, ORANGE, rotation=turned)
+    cube = _box("25 mm cube", 3 * (CUBE_M,), cube_at, ORANGE, deg=28)
     return _wall(distance + WALL_BEHIND_M, 0.0), table, block, cube
 
 
@@ -112,14 +113,13 @@ def artefact_scene(distance_m: float = 0.60) -> Scene:
     distance = number("distance_m", distance_m, wanted, least=0.30)
     looks_down = Rotation.from_euler("x", 35, degrees=True)
     stage = make_transform(looks_down, (0.0, 0.0, distance))  # x right, y down, z along the table
-    turned = Rotation.from_euler("y", 28, degrees=True)
     block, cube, card = 3 * (BLOCK_M,), 3 * (CUBE_M,), (0.12, 0.002, 0.12)
     plate = _box("shiny plate", card, (0.20, -0.001, 0.02), ALUMINIUM)
     on_table = (
         _box("wall", (6.0, 4.0, 0.10), (0.0, 0.0, 0.45), WALL_PAINT, "grid"),
         _box("table", (1.4, TABLE_THICK_M, 0.88), (0.0, TABLE_THICK_M / 2, -0.05), MAPLE, "wood"),
         _box("60 mm block", block, (0.0, -BLOCK_M / 2, 0.0), ALUMINIUM),
-        _box("25 mm cube", cube, (0.09, -CUBE_M / 2, -0.05), ORANGE, rotation=turned),
+        _box("25 mm cube", cube, (0.09, -CUBE_M / 2, -0.05), ORANGE, deg=28),
         _box("tall box", (0.06, 0.20, 0.06), (0.33, -0.10, 0.02), WALL_PAINT),
         _box("dark card", card, (-0.17, -0.001, 0.0), DARK),
         replace(plate, specular=0.95),
@@ -135,18 +135,14 @@ def _wall(distance: float, tilt_deg: float) -> Box:
     turned, thick = Rotation.from_euler("y", -tilt_deg, degrees=True), 0.10
     center = np.array([0.0, 0.0, distance]) + turned.apply([0.0, 0.0, thick / 2])
     size = (8.0 * distance, 5.0 * distance, thick)
-    return _box("wall", size, tuple(center), WALL_PAINT, texture="grid", rotation=turned)
+    return _box("wall", size, tuple(center), WALL_PAINT, "grid", -tilt_deg)
 
 
 def _box(
-    name: str,
-    size_m: tuple[float, float, float],
-    center_m: tuple[float, float, float],
-    color: tuple[float, float, float],
-    texture: str = "plain",
-    rotation: Rotation | None = None,
+    name: str, size_m: Three, at_m: Three, color: Three, texture: str = "plain", deg: float = 0.0
 ) -> Box:
-    pose = make_transform(np.eye(3) if rotation is None else rotation, center_m)
+    """A box turned by so many degrees about its y axis."""
+    pose = make_transform(Rotation.from_euler("y", deg, degrees=True), at_m)
     return Box(name, np.array(size_m), pose, color, texture)
 
 

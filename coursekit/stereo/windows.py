@@ -156,10 +156,14 @@ def window_stats(depth: Any, window: Window, depth_scale_m: float | None = None)
     1.00 mm
     """
     stack, step = depth_stack(depth, depth_scale_m)
-    z = cut(stack, window, step)
-    valid = np.isfinite(z)
+    measured = cut(stack, window, step)
+    return stats_without_mismatches(measured, without_mismatches(measured, step)[0], step)
+
+
+def stats_without_mismatches(measured: Floats, z: Floats, step: float | None) -> WindowStats:
+    """See `window_stats`, of depths (N, h, w) in m, and of the same with NaN for mismatches."""
+    valid = np.isfinite(measured)
     n, height, width = z.shape
-    z, mismatches = without_mismatches(z, step)
     mean = valid_mean(z, axis=0)
     deviation = (z - mean)[:, np.isfinite(z).sum(axis=0) > 1]
     pixel_std, pixel_dof, drift = _temporal(deviation.reshape(n, -1))
@@ -172,7 +176,7 @@ def window_stats(depth: Any, window: Window, depth_scale_m: float | None = None)
         n_frames=n,
         n_pixels=height * width,
         invalid_fraction=1 - float(valid.mean()),
-        n_mismatches=mismatches,
+        n_mismatches=int(valid.sum() - np.isfinite(z).sum()),
         frozen_fraction=float(frozen),
         depth_m=float(level),
         depth_error_m=math.hypot(
@@ -283,9 +287,9 @@ def _far(off: Floats, step: float | None) -> Bools:
     """Which deviations are beyond JUMP_SIGMAS of what is typical; never NaN."""
     size = np.abs(off)
     typical = size[np.isfinite(size)]
-    if typical.size == 0:
+    if typical.size == 0 or typical.max() <= JUMP_SIGMAS * (step or 0.0):
         return np.zeros(off.shape, bool)
-    middle, most = np.percentile(typical, [50, 90])
+    middle, most = np.percentile(typical, [50, 90], overwrite_input=True)
     scale = max(1.4826 * middle, most / 1.645, step or 0.0)
     return size > max(JUMP_SIGMAS * scale, 1e-9)
 

@@ -46,10 +46,17 @@ from tqdm.auto import tqdm
 from coursekit import results
 from coursekit.checks import positive, want
 from coursekit.submission import report
-from coursekit.submission.flags import Roster, as_json, class_table, place_of, words_of
+from coursekit.submission.flags import (
+    Roster,
+    as_json,
+    class_table,
+    grouped,
+    place_of,
+    words_of,
+)
 from coursekit.submission.format import DOCUMENTS, MANIFEST, NO_TEXT, TURNING_SIGNS, is_junk, slug
 from coursekit.submission.recompute import LABELS, grading_rules
-from coursekit.words import counted
+from coursekit.words import counted, say
 
 TIMEOUT_S = 10.0
 MEMORY_BYTES = 512 * 2**20  # above what a warm process has
@@ -67,11 +74,8 @@ ONE_THREAD = {
     f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL", "NUMBA", "BLIS")
 } | {"VECLIB_MAXIMUM_THREADS": "1"}
 
-CANNOT_START = (
-    "the processes that grade cannot be started, or end at once. Try --workers 1; if that fails "
-    "too, more memory is needed, or the installation is broken (run `python3 course.py test`)"
-)
-
+NOT_GRADED = "not graded (time, memory or a crash)"
+SUMMED = {"graded": "graded", "refused": "refused", "failed": NOT_GRADED, "flagged": "flagged"}
 Graded = tuple[report.ReportLine, str]  # a line in the class, and most of the student's page
 Work = Callable[[str, str], Graded]  # of the file's path and its name
 
@@ -104,18 +108,16 @@ class Bundle:
 
 @dataclass(frozen=True)
 class Summary:
-    """How a batch went: numbers of bundles, and the folder of the report.
+    """How a batch went, and the folder of the report.
 
-    kept: of those, how many were graded by an earlier run. left_out: files that are no bundle.
+    counts: of bundles that were "graded", "refused" or "failed", and of those "flagged". kept: of
+    those, how many were graded by an earlier run. left_out: files that are no bundle.
     missing: who of the roster handed in nothing. changes: of a regrade, whose points changed, from
     what, to what, and why. notes: on the tables.
     """
 
     out: Path
-    graded: int
-    refused: int
-    failed: int
-    flagged: int
+    counts: Counter[str]
     kept: int
     left_out: tuple[str, ...]
     seconds: float
@@ -124,13 +126,9 @@ class Summary:
     notes: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        n = self.graded + self.refused + self.failed
-        others = {
-            "refused": self.refused,
-            "not graded (time, memory or a crash)": self.failed,
-            "flagged": self.flagged,
-        }
-        parts = [f"{self.graded} graded", *(f"{k} {what}" for what, k in others.items() if k)]
+        n = sum(self.counts[kind] for kind in ("graded", "refused", "failed"))
+        said = [kind for kind in SUMMED if self.counts[kind] or kind == "graded"]
+        parts = [f"{self.counts[kind]} {SUMMED[kind]}" for kind in said]
         took = f" in {self.seconds:.0f} s" if self.kept < n else ""
         lines = [f"{counted(n, 'bundle')}{took}: {', '.join(parts)}."]
         if self.kept:
@@ -200,11 +198,12 @@ def grade_folder(
     roster = Roster(class_table(Path(choices.roster)) if choices.roster else ())
     _own_points(out / OWN_POINTS)
     _check_out(out, overwrite)
-    if not folder.is_file():
-        return _grade(folder, out, limits, progress, roster, choices)
+    zipped = folder.is_file()
     with tempfile.TemporaryDirectory() as scratch:
-        _unpack(folder, Path(scratch))
-        return _grade(Path(scratch), out, limits, progress, roster, choices, dated=True)
+        if zipped:
+            _unpack(folder, Path(scratch))
+        bundles = Path(scratch) if zipped else folder
+        return _grade(bundles, out, limits, progress, roster, choices, dated=zipped)
 
 
 def _grade(
@@ -241,23 +240,13 @@ def _grade(
                         raise KeyboardInterrupt
         except KeyboardInterrupt:
             many = counted(len(bundles), "bundle")
-            says = f"stopped after {finished} of {many}, which are kept. The same command goes on"
-            raise Stopped(f"{says} from there.") from None
+            raise Stopped(say("submission.stopped", done=finished, many=many)) from None
         done, changes, notes = _finish(out, bundles, others, roster, choices)
     counts = Counter(_kind(line) for line in done)
-    return Summary(
-        out,
-        counts["graded"],
-        counts["refused"],
-        counts["failed"],
-        sum(line.flagged for line in done),
-        kept,
-        left_out,
-        time.monotonic() - started,
-        tuple(line.name for line in done if line.reason == "missing"),
-        tuple(changes),
-        notes,
-    )
+    counts["flagged"] = sum(line.flagged for line in done)
+    missing = tuple(line.name for line in done if line.reason == "missing")
+    seconds = time.monotonic() - started
+    return Summary(out, counts, kept, left_out, seconds, missing, tuple(changes), notes)
 
 
 @contextlib.contextmanager
@@ -309,7 +298,9 @@ def _walk(folder: Path, out: Path) -> Iterator[tuple[Path, str]]:
         ahead += reversed(below)
 
 
-def find_bundles(folder: Path, out: Path) -> tuple[list[Bundle], tuple[str, ...], list[Graded]]:
+def find_bundles(
+    folder: Path, out: Path
+) -> tuple[list[Bundle], tuple[str, ...], list[report.ReportLine]]:
     """The bundles in a folder and below it; the other files; and lines for what cannot be read.
 
     A bundle is a .zip, whatever a browser adds to that, one without an ending, or an unpacked one.
@@ -318,7 +309,7 @@ def find_bundles(folder: Path, out: Path) -> tuple[list[Bundle], tuple[str, ...]
     """
     found: list[Bundle] = []
     others: list[str] = []
-    lines: list[Graded] = []
+    lines: list[report.ReportLine] = []
     seen: Counter[str] = Counter()
     for path, why in _walk(folder, out.resolve()):
         raw = path.relative_to(folder).as_posix()
@@ -326,7 +317,7 @@ def find_bundles(folder: Path, out: Path) -> tuple[list[Bundle], tuple[str, ...]
         seen[name] += 1
         name = name if seen[name] == 1 else f"{name} ({seen[name]})"
         if why:
-            lines.append((report.not_graded(name, "unreadable", f"The folder {why}."), ""))
+            lines.append(report.not_graded(name, "unreadable", why=why))
         elif (
             (path.is_dir() and not path.is_symlink())
             or ".zip" in path.name.lower()
@@ -337,18 +328,11 @@ def find_bundles(folder: Path, out: Path) -> tuple[list[Bundle], tuple[str, ...]
             others.append(name)
     if not found:
         there = f", only {counted(len(others), 'other file')}" if others else " or below it"
-        raise ValueError(
-            f"{folder}: there is no bundle (.zip) in it{there}; "
-            "want the folder with what students handed in"
-        )
+        raise ValueError(say("submission.no_bundle", folder=folder, there=there))
     handed = {_whose(bundle.name) for bundle in found}
-    alone: dict[str, list[str]] = {}
-    for name in others:
-        if _whose(name) not in handed | {""}:
-            alone.setdefault(_whose(name), []).append(name)
+    alone = grouped((_whose(name), name) for name in others if _whose(name) not in handed | {""})
     for names in alone.values():
-        says = f"There is no bundle, only {', '.join(names[:5])}. Ask for the .zip."
-        lines.append((report.not_graded(names[0], "no_bundle", says), ""))
+        lines.append(report.not_graded(names[0], "no_bundle", files=", ".join(names[:5])))
     return found, tuple(others), lines
 
 
@@ -360,13 +344,11 @@ def _whose(name: str) -> str:
 
 def _holds_a_bundle(path: Path) -> bool:
     """Whether a file without the ending .zip is a zip with a manifest in it."""
-    try:
-        if path.is_symlink() or not path.is_file():
-            return False
-        with path.open("rb") as file:
-            return file.read(4) == b"PK\3\4" and MANIFEST.encode() in file.read(HASHED_BYTES)
-    except OSError:
-        return False
+    with contextlib.suppress(OSError):
+        if path.is_file() and not path.is_symlink():
+            with path.open("rb") as file:
+                return file.read(4) == b"PK\3\4" and MANIFEST.encode() in file.read(HASHED_BYTES)
+    return False
 
 
 def _unpack(archive: Path, into: Path) -> None:
@@ -390,8 +372,7 @@ def _unpack(archive: Path, into: Path) -> None:
                     then = datetime(*member.date_time).timestamp()
                     os.utime(target, (then, then))
     except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, OSError) as error:
-        says = f"{archive.name}: cannot be unpacked ({error}); download it again"
-        raise ValueError(says) from None
+        raise ValueError(say("submission.not_unpacked", file=archive.name, error=error)) from None
 
 
 def _key(path: Path, name: str) -> str:
@@ -470,7 +451,7 @@ def work_through(
                     yield running.pop(future), outcome
         for bundle in running.values():
             if bundle.key in tried:
-                yield bundle, _failed(bundle, "lost", "All processes ended with it, twice.")
+                yield bundle, _failed(bundle, "lost")
             else:
                 tried.add(bundle.key)
                 again.append(bundle)
@@ -507,20 +488,17 @@ def _outcome(future: Future[Graded], bundle: Bundle, limits: Limits) -> Graded:
         raise error
     ending = _ending(error.exitcode) if isinstance(error, ProcessExpired) else ""
     if isinstance(error, TimeoutError) or ending == "SIGPROF":
-        says = f"It took longer than {limits.timeout_s:g} s. Grade it with a longer --timeout."
-        return _failed(bundle, "timeout", says)
+        return _failed(bundle, "timeout", limit=limits.timeout_s)
     if ending:
-        says = f"It ended the process that graded it ({ending}). Look inside."
-        return _failed(bundle, "died", says)
+        return _failed(bundle, "died", ending=ending)
     if isinstance(error, MemoryError):
-        return report.out_of_memory(bundle.name), ""
-    says = f"The grader failed on it ({type(error).__name__}). Please report it with the file."
-    return _failed(bundle, "error", says)
+        return _failed(bundle, "memory")
+    return _failed(bundle, "error", error=type(error).__name__)
 
 
-def _failed(bundle: Bundle, reason: str, says: str) -> Graded:
+def _failed(bundle: Bundle, reason: str, **facts: Any) -> Graded:
     """The line of a bundle whose grading failed, and no page."""
-    return report.not_graded(bundle.name, reason, says), ""
+    return report.not_graded(bundle.name, reason, **facts), ""
 
 
 def _ending(code: int) -> str:
@@ -549,7 +527,7 @@ def _pool(limits: Limits) -> Iterator[ProcessPool]:
                 pool.active  # noqa: B018 - a property that starts it
             pool.schedule(_ready).result(PATIENCE_S)
         except (BrokenProcessPool, OSError, RuntimeError) as error:  # TimeoutError is an OSError
-            raise ChildProcessError(CANNOT_START) from error
+            raise ChildProcessError(say("submission.cannot_start")) from error
         yield pool
     finally:
         pool.stop()
@@ -612,35 +590,22 @@ def limit_memory(more_bytes: int) -> None:
 def _check_out(out: Path, overwrite: bool) -> None:
     """ValueError unless the folder is empty, or a report: then whatever else is in it stays."""
     if out.is_symlink() or (out.exists() and not out.is_dir()):
-        raise ValueError(f"out: {out} is no folder; want a new or empty one")
+        raise ValueError(say("submission.out_no_folder", out=out))
     if not out.exists():
         return
     others = [entry.name for entry in out.iterdir() if not is_junk(entry.name)]
     if others and not (out / ROWS).is_dir():
-        raise ValueError(
-            f"out: {out} holds {min(others)}, and is no report; want a new or empty folder"
-        )
+        raise ValueError(say("submission.out_no_report", out=out, file=min(others)))
     if (out / CSV).exists() and not overwrite:
-        raise ValueError(
-            f"out: {out} holds a finished report already: choose another folder, or overwrite it "
-            "(--overwrite; only what is new is graded)"
-        )
+        raise ValueError(say("submission.out_finished", out=out))
 
 
 @contextlib.contextmanager
 def _alone(out: Path) -> Iterator[None]:
-    """One grader at a time in a report. The system frees the lock when its holder ends."""
-    with (out / ROWS / "lock").open("a+b") as file:
+    """One grader at a time in a report."""
+    with contextlib.ExitStack() as held:
         try:
-            if sys.platform == "win32":
-                import msvcrt
-
-                file.seek(0)
-                msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
-            else:
-                import fcntl
-
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            held.enter_context(results.locked(out / ROWS / "lock", wait=False))
         except OSError:
             raise ValueError(f"out: another `coursekit grade` is writing to {out}") from None
         yield
@@ -674,15 +639,17 @@ def _store(out: Path, bundle: Bundle, outcome: Graded, dated: bool = False) -> N
 
 
 def _finish(
-    out: Path, bundles: list[Bundle], others: Sequence[Graded], roster: Roster, how: Choices
+    out: Path,
+    bundles: list[Bundle],
+    others: Sequence[report.ReportLine],
+    roster: Roster,
+    how: Choices,
 ) -> tuple[list[report.ReportLine], list[tuple[str, ...]], tuple[str, ...]]:
     """Write what takes the whole class; returns the lines with what they share, changes and notes
     on the tables."""
-    gone = "What was kept of it is gone. Run the same command again."
-    each = [_load(out, b) or report.not_graded(b.name, "lost", gone) for b in bundles]
-    each += [line for line, _ in others]
+    each = [_load(out, b) or report.not_graded(b.name, "lost", report.GONE) for b in bundles]
     own = _own_points(out / OWN_POINTS)
-    lines = report.across(each, roster, how.late_after, own)
+    lines = report.across([*each, *others], roster, how.late_after, own)
     pages = [b.page(line) for b, line in zip(bundles, lines, strict=False)]  # they come first
     for i, page in enumerate(pages):
         if lines[i].points is not None:
@@ -690,12 +657,13 @@ def _finish(
     state = {line.who: [line.name or line.student, *_state(line)] for line in lines if line.counts}
     changes = list(_changes(_json(out / ROWS / CLASS), state))
     table = report.grades_csv(lines, how.separator)
+    imports, notes = report.exports(lines, how.separator, how.assignment)
     texts = {
         PARAGRAPHS: report.paragraphs_page(lines),
         SECOND: report.paragraphs_page(lines, named=False),
         PAGE: report.class_page(lines, changes),
         CSV: table,
-        **(imports := report.exports(lines, how.separator, how.assignment)),
+        **imports,
         f"{ROWS}/{CLASS}": json.dumps({"csv": _digest(table), "state": state}),
     }
     before = _json(out / ROWS / CLASS).get("csv")
@@ -718,13 +686,7 @@ def _finish(
     for path in (out / ROWS).iterdir():
         if re.fullmatch(r"[0-9a-f]{64}", path.stem) and path.stem not in keys:
             path.unlink()
-    column, known = report.canvas_column(lines, how.assignment)
-    says = f"canvas.csv: the points are in a column “{column}”, which the roster does not have once"
-    return (
-        lines,
-        changes,
-        (f"{says}; --assignment names another.",) * ("canvas.csv" in imports and not known),
-    )
+    return lines, changes, notes
 
 
 def _write_pages(out: Path, bundles: list[Bundle], lines: Sequence[report.ReportLine]) -> None:
@@ -754,9 +716,8 @@ def _own_points(path: Path) -> dict[str, dict[str, str]]:
             try:
                 report.number_of(row.get(column, ""))
             except ValueError:
-                raise ValueError(
-                    f"{path.name}: {row.get('student')}: {column}: got {row[column]!r}, want points"
-                ) from None
+                facts = {"student": row.get("student"), "column": column, "got": row[column]}
+                raise ValueError(say("submission.no_points", file=path.name, **facts)) from None
         found[row.get("who", "").removeprefix("'")] = row
     return found
 
@@ -808,5 +769,5 @@ def _dated(path: Path) -> str:
 def _kind(line: report.ReportLine) -> str:
     """What the summary counts a line as: graded, refused, failed or missing."""
     if line.points is not None or line.reason == "missing":
-        return "graded" if line.reason != "missing" else "missing"
+        return line.reason or "graded"
     return "failed" if line.reason in report.FAILED else "refused"

@@ -17,12 +17,12 @@ import unicodedata
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import datetime
-from functools import lru_cache, partial
+from functools import cache, partial
 from itertools import combinations
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -32,13 +32,13 @@ from coursekit.checks import want
 from coursekit.submission.format import CameraFacts, Stack, Submission
 from coursekit.submission.recompute import HEADINGS, SEEN, Recomputed, grading_rules
 
+_Key = TypeVar("_Key")
+_Thing = TypeVar("_Thing")
 LARGEST_WAVE = 6  # so many of them across a window; finer ones hold what was added
 N_WAVES = (
     27  # numbers in a spectrum: pairs of 0 to 6 waves down and across, in any order, but (0, 0)
 )
-FRAME_LIKENESS = (
-    0.8  # of two frames' spectra; strangers' 8th best of 12 reaches 0.74 in a small window
-)
+FRAME_LIKENESS = 0.8  # of two frames' spectra; strangers' 8th best of 12: 0.74 in a small window
 COMPARED, MOST_FRAMES = 150_000, 40_000  # pairs of stacks in all, and frames for each, at most
 FRAMES_ASKED = 12  # frames of a stack that are looked for in others
 FRAMES_FOUND = 9  # of these, for the stacks to be the same measurement
@@ -66,9 +66,9 @@ class Flag:
     note: bool = False
 
 
-def _flag(code: str, **facts: Any) -> Flag:
+def flag_of(code: str, note: bool = False, **facts: Any) -> Flag:
     """The flag of this code; facts: what its sentence in words.toml has to be filled with."""
-    return Flag(code, SEEN[code].format(**facts))
+    return Flag(code, SEEN[code].format(**facts), note)
 
 
 def data_flags(submission: Submission, found: Recomputed, prints: Fingerprint) -> tuple[Flag, ...]:
@@ -94,12 +94,12 @@ def _too_clean(camera: CameraFacts, found: Recomputed, limits: dict[str, float])
     for m in several:
         different, n = len({frame.tobytes() for frame in m.stack.counts}), m.stats.n_frames
         if different < n and not m.stats.frozen_fraction > 0.5:
-            yield _flag("repeated_frames", z=m.distance_m, different=different, n=n)
+            yield flag_of("repeated_frames", z=m.distance_m, different=different, n=n)
     product = camera.fx * (camera.baseline_m or 0.05)
     known = [m for m in several if m.std is not None]
     sigma_d = [m.stats.pixel_std_unrounded_m * product / m.distance_m**2 for m in known]
     if sigma_d and max(sigma_d) < limits["least_sigma_d_px"]:
-        yield _flag("too_clean", most=max(sigma_d), least=limits["least_sigma_d_px"])
+        yield flag_of("too_clean", most=max(sigma_d), least=limits["least_sigma_d_px"])
 
 
 def _flat(found: Recomputed, limits: dict[str, float]) -> Iterator[Flag]:
@@ -109,7 +109,7 @@ def _flat(found: Recomputed, limits: dict[str, float]) -> Iterator[Flag]:
         return
     most = free.exponent + 2 * math.sqrt(free.covariance[1, 1])
     if most < limits["flat_exponent"]:
-        yield _flag("not_distance_dependent", exponent=free.exponent, most=most)
+        yield flag_of("not_distance_dependent", exponent=free.exponent, most=most)
 
 
 def _invented(found: Recomputed, limits: dict[str, float]) -> Iterator[Flag]:
@@ -132,15 +132,15 @@ def _invented(found: Recomputed, limits: dict[str, float]) -> Iterator[Flag]:
     pattern = max((look.pattern for _, look in looks), default=math.inf)
     uneven = max((look.uneven for _, look in looks if look.uneven is not None), default=math.inf)
     if likeness < limits["white"]:
-        yield _flag("white_in_space", likeness=likeness)
+        yield flag_of("white_in_space", likeness=likeness)
     if pattern < limits["pattern"]:
-        yield _flag("no_pattern", times=pattern)
+        yield flag_of("no_pattern", times=pattern)
     if uneven < limits["uneven"]:
-        yield _flag("even_noise", part=uneven)
+        yield flag_of("even_noise", part=uneven)
     for (one, first), (two, second) in combinations(looks, 2):
         likeness = _correlation(first.stays, second.stays)
         if likeness > limits["same_pattern"]:
-            yield _flag("same_pattern", one=one, two=two, likeness=likeness)
+            yield flag_of("same_pattern", one=one, two=two, likeness=likeness)
 
 
 class _Look(NamedTuple):
@@ -224,10 +224,10 @@ def _simulated(submission: Submission) -> Iterator[Flag]:
     if camera.source == "live" and any(_perfect_clock(s.times_s) for s in submission.stacks):
         reasons.append("its clock has no jitter")
     if reasons and camera.source != "simulated":
-        yield _flag("simulated_as_live", source=camera.source, reasons="; ".join(reasons))
+        yield flag_of("simulated_as_live", source=camera.source, reasons="; ".join(reasons))
 
 
-@lru_cache(maxsize=1)
+@cache
 def _simulated_devices() -> tuple[tuple[float, ...], ...]:
     """Width, height, fx, fy, cx and cy (px) of each camera that the course simulates."""
     lenses = [specifications.device(name).unit.depth for name in specifications.device_names()]
@@ -254,7 +254,7 @@ def _times(submission: Submission, limits: dict[str, float]) -> Iterator[Flag]:
             reasons.append(f"{where} say {1 / float(np.median(steps)):.3g} frames a second")
     reasons += _times_together(submission)
     if reasons:
-        yield _flag("impossible_times", reasons="; ".join(reasons))
+        yield flag_of("impossible_times", reasons="; ".join(reasons))
 
 
 def _times_together(submission: Submission) -> Iterator[str]:
@@ -281,7 +281,7 @@ def _one_stack_twice(prints: Sequence[StackPrint]) -> Iterator[Flag]:
         for two in prints[:i]:
             alike = _shared(one, [two])[0][0] or _shared(two, [one])[0][0]
             if one.digest == two.digest or alike:
-                yield _flag("one_stack_twice", one=two.distance_m, two=one.distance_m)
+                yield flag_of("one_stack_twice", one=two.distance_m, two=one.distance_m)
 
 
 # --- fingerprints, and who shares what ------------------------------------------------------
@@ -320,23 +320,21 @@ class Fingerprint:
     def from_dict(cls, data: Mapping[str, Any]) -> Fingerprint:
         """The fingerprint whose JSON `as_json` made."""
 
-        def rows(text: str) -> NDArray[np.int8]:
-            return np.frombuffer(base64.b64decode(text), np.int8).reshape(-1, N_WAVES)
-
-        stacks = tuple(
-            StackPrint(**{**s, "level": tuple(s["level"]), "frames": rows(s["frames"])})
-            for s in data["stacks"]
-        )
-        return cls(**{**data, "stacks": stacks})
+        stacks = []
+        for stack in data["stacks"]:
+            frames = np.frombuffer(base64.b64decode(stack["frames"]), np.int8).reshape(-1, N_WAVES)
+            stacks.append(StackPrint(**{**stack, "level": tuple(stack["level"]), "frames": frames}))
+        return cls(**{**data, "stacks": tuple(stacks)})
 
 
 def as_json(record: Any) -> str:
     """A fingerprint, or a record that has one, as JSON; an array becomes its bytes in base64."""
 
-    def text(values: NDArray[np.int8]) -> str:
-        return base64.b64encode(values.tobytes()).decode("ascii")
+    def plain(value: Any) -> Any:
+        array = isinstance(value, np.ndarray)
+        return base64.b64encode(value.tobytes()).decode("ascii") if array else vars(value)
 
-    return json.dumps(asdict(record), default=text)
+    return json.dumps(record, default=plain)
 
 
 @dataclass(frozen=True)
@@ -367,11 +365,9 @@ def _stack_print(stack: Stack) -> StackPrint:
     counts = np.ascontiguousarray(stack.counts)
     _, height, width = counts.shape
     digest = hashlib.blake2b(repr(counts.shape).encode() + counts.tobytes(), digest_size=16)
-    values = tuple(
-        zlib.crc32(values.tobytes())
-        for values in np.sort(counts.reshape(len(counts), -1), axis=1)
-        if np.count_nonzero(np.diff(values)) >= DIFFERENT  # else strangers may have the same
-    )
+    ordered = np.sort(counts.reshape(len(counts), -1), axis=1)
+    steps = np.count_nonzero(np.diff(ordered, axis=1), axis=1)  # few: strangers may have the same
+    values = tuple(zlib.crc32(frame.tobytes()) for frame in ordered[steps >= DIFFERENT])
     named = partial(StackPrint, stack.distance_m, digest.hexdigest(), values=values)
     if min(height, width) <= 2 * LARGEST_WAVE:
         return named((), np.zeros((0, N_WAVES), np.int8))
@@ -485,6 +481,14 @@ def _same_values(prints: Mapping[str, Fingerprint]) -> Counter[tuple[str, str, f
     return shared
 
 
+def grouped(pairs: Iterable[tuple[_Key, _Thing]]) -> dict[_Key, list[_Thing]]:
+    """The things that have the same key, in order."""
+    found: dict[_Key, list[_Thing]] = {}
+    for key, thing in pairs:
+        found.setdefault(key, []).append(thing)
+    return found
+
+
 def _groups(keys: Sequence[Any], pairs: Sequence[tuple[Any, Any]]) -> list[list[Any]]:
     """The keys that pairs connect, in groups of two or more."""
     from scipy.sparse import coo_array
@@ -493,9 +497,8 @@ def _groups(keys: Sequence[Any], pairs: Sequence[tuple[Any, Any]]) -> list[list[
     number = {key: i for i, key in enumerate(keys)}
     one, two = np.array([(number[a], number[b]) for a, b in pairs], int).reshape(-1, 2).T
     graph = coo_array((np.ones(len(one)), (one, two)), shape=(len(keys), len(keys)))
-    groups: dict[int, list[Any]] = {}
-    for key, label in zip(keys, connected_components(graph, directed=False)[1], strict=True):
-        groups.setdefault(int(label), []).append(key)
+    labels = connected_components(graph, directed=False)[1].tolist()
+    groups = grouped(zip(labels, keys, strict=True))
     return [group for group in groups.values() if len(group) > 1]
 
 
@@ -648,10 +651,10 @@ class Roster:
             return
         other = self.find(typed)
         if other is not None and other.key != one.key:
-            yield _flag("another_student", typed=typed, name=one.name)
+            yield flag_of("another_student", typed=typed, name=one.name)
         else:
             alike = bool({*words_of(typed)} & {*words_of(one.name)})
-            yield replace(_flag("other_name", typed=typed, name=one.name), note=alike)
+            yield flag_of("other_name", alike, typed=typed, name=one.name)
 
 
 def class_table(path: Path) -> list[dict[str, str]]:
@@ -683,11 +686,11 @@ def same_words(said: Mapping[str, tuple[str, str]]) -> list[Copy]:
     paragraphs that are too short for the rubric are not compared.
     """
     least = grading_rules()["exercise"]["words"]
-    who: dict[tuple[str, ...], list[str]] = {}
-    for key, (_, paragraph) in said.items():
-        words = re.findall(r"\w+", unicodedata.normalize("NFKC", paragraph).casefold())
-        if len(words) >= least:
-            who.setdefault(tuple(words), []).append(key)
+    texts_of = (
+        (tuple(re.findall(r"\w+", unicodedata.normalize("NFKC", text).casefold())), key)
+        for key, (_, text) in said.items()
+    )
+    who = grouped((words, key) for words, key in texts_of if len(words) >= least)
     copies = []
     for texts in _alike(list(who), least - WORDS_IN_A_ROW + 1):
         keys = tuple(key for text in texts for key in who[text])

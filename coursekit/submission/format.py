@@ -15,6 +15,7 @@ import json
 import math
 import os
 import re
+import tomllib
 import unicodedata
 import warnings
 import zipfile
@@ -53,11 +54,8 @@ ALLOWED_BYTES = {
     re.compile(r"depth_[0-9]{1,2}\.npy"): MAX_HEADER + 2 * MAX_SAMPLES,
     re.compile(r"times_[0-9]{1,2}\.npy"): MAX_HEADER + 8 * MAX_FRAMES,
 }
+WORDS = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding="utf-8"))
 SCHEMA = json.loads(Path(__file__).with_name("bundle.schema.json").read_text(encoding="utf-8"))
-
-HAND_IN = "hand in the file that `coursekit submit` wrote, as it is"
-COPY_AGAIN = "copy or download it again"
-AS_IT_WAS = "hand in the .zip that `coursekit submit` wrote, and nothing else"
 
 FIRST_DATE = (1980, 1, 1, 0, 0, 0)  # that a zip can say
 SECRET_FLAGS = 0x2041  # of a zip's member: it is encrypted, or its header is
@@ -196,12 +194,18 @@ class Submission:
 class Refused(ValueError):
     """A bundle that is not read. `reason`: a short code. The message: what is wrong, what to do."""
 
-    def __init__(self, reason: str, wrong: str, cure: str = HAND_IN) -> None:
+    def __init__(self, reason: str, wrong: str, cure: str) -> None:
         super().__init__(reason, wrong, cure)  # all of it, so that it survives pickling
         self.reason, self.wrong, self.cure = reason, wrong, cure
 
     def __str__(self) -> str:
         return f"{self.wrong}; {self.cure}."
+
+
+def _refused(key: str, **facts: Any) -> Refused:
+    """What words.toml says of a reason (before the dot), with the facts in its places."""
+    wrong, cure = [*WORDS["refused"][key], "hand_in"][:2]
+    return Refused(key.partition(".")[0], wrong.format(**facts), WORDS["cures"][cure])
 
 
 # --- packing --------------------------------------------------------------------------------------
@@ -327,7 +331,7 @@ def read_bundle(source: bytes | Path) -> Submission:
         stacks=tuple(_stack(members, i, **stack) for i, stack in enumerate(stacks)),
     )
     for fault in _faults(submission):
-        raise Refused("bad_value", fault)
+        raise _refused("bad_value", fault=fault)
     return submission
 
 
@@ -335,12 +339,11 @@ def _bytes_of(path: Path) -> bytes:
     """The bytes of a file, one more than allowed at most: then it is too large."""
     try:
         if path.is_symlink() or not path.is_file():  # opening a pipe would wait for ever
-            raise Refused("not_a_file", f"{shown(path.name)} is not there, or no plain file")
+            raise _refused("not_a_file", file=shown(path.name))
         with path.open("rb") as file:
             return file.read(MAX_FILE + 1)
     except OSError as error:
-        wrong = f"{shown(path.name)} cannot be read ({error.strerror})"
-        raise Refused("unreadable", wrong) from error
+        raise _refused("unreadable", file=shown(path.name), error=error.strerror) from error
 
 
 def _unzipped(data: bytes, inner: bool = False) -> dict[str, bytes]:
@@ -350,11 +353,11 @@ def _unzipped(data: bytes, inner: bool = False) -> dict[str, bytes]:
     inner: it came out of one. A zip that holds nothing but a bundle is opened once more.
     """
     if len(data) > MAX_FILE:
-        raise Refused("too_large", f"The file has {len(data)} bytes, {MAX_FILE} are allowed")
+        raise _refused("too_large.file", size=len(data), most=MAX_FILE)
     try:
         archive = zipfile.ZipFile(io.BytesIO(data))
     except Exception:  # a stranger's bytes: the parser may trip over anything
-        raise Refused("not_a_zip", "The file is no zip, or cut off", COPY_AGAIN) from None
+        raise _refused("not_a_zip") from None
     every = [m for m in archive.infolist() if not is_junk(m.orig_filename)]
     members = {m.orig_filename: m for m in every if not m.orig_filename.endswith("/")}
     if len(members) == 1 and next(iter(members)).lower().endswith(".zip") and not inner:
@@ -362,10 +365,9 @@ def _unzipped(data: bytes, inner: bool = False) -> dict[str, bytes]:
         if bundle.file_size <= min(MAX_FILE, MAX_RATIO * bundle.compress_size):
             return _unzipped(_content(archive, bundle), inner=True)
     if len(members) > MAX_MEMBERS or sum(m.file_size for m in every) > MAX_TOTAL:
-        wrong = f"Unpacked, it has more than {MAX_TOTAL} bytes, or more than {MAX_MEMBERS} members"
-        raise Refused("too_large", wrong)
+        raise _refused("too_large.unpacked", most=MAX_TOTAL, members=MAX_MEMBERS)
     if len({m.orig_filename for m in every}) < len(every):
-        raise Refused("not_plain", "The zip has two members of one name", AS_IT_WAS)
+        raise _refused("not_plain.twice")
     parts = {name: name.rpartition("/") for name in members}
     folder = next((at for at, _, name in parts.values() if name == MANIFEST), "")
     found = {}
@@ -392,17 +394,15 @@ def _check_member(member: zipfile.ZipInfo, name: str) -> None:
     """A member has a name of the format and is a plain file within the caps, as it is declared."""
     most = next((most for pattern, most in ALLOWED_BYTES.items() if pattern.fullmatch(name)), None)
     if most is None:
-        wrong = f"The zip has a member {shown(name)}, which no bundle has"
-        raise Refused("unknown_member", wrong, AS_IT_WAS)
+        raise _refused("unknown_member", name=shown(name))
     link = member.external_attr >> 28 not in (0, 8)  # as Unix writes it: 8 is a plain file
     known = member.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
     if member.flag_bits & SECRET_FLAGS or not known or link:
-        wrong = f"{name} is no plain file: it is encrypted, packed in another way, or a link"
-        raise Refused("not_plain", wrong, AS_IT_WAS)
+        raise _refused("not_plain.member", name=name)
     packed = member.compress_size
     if member.file_size > min(most, MAX_RATIO * packed) or packed > MAX_FILE:
-        wrong = f"{name} would unpack to {member.file_size} bytes, {most} are allowed and"
-        raise Refused("too_large", f"{wrong} {MAX_RATIO} times what it takes up in the file")
+        facts = {"name": name, "size": member.file_size, "most": most, "ratio": MAX_RATIO}
+        raise _refused("too_large.member", **facts)
 
 
 def _content(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
@@ -413,8 +413,7 @@ def _content(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
     except Exception:  # a stranger's bytes: the parser may trip over anything
         content = None
     if content is None or len(content) != member.file_size:
-        wrong = f"{member.filename} is damaged, or not as long as its header says"
-        raise Refused("damaged", wrong, COPY_AGAIN)
+        raise _refused("damaged", name=member.filename)
     return content
 
 
@@ -426,8 +425,7 @@ def _manifest(members: dict[str, bytes]) -> dict[str, Any]:
     for name, entry in listed.items():
         content = members[name]
         if entry["bytes"] != len(content) or entry["sha256"] != hashlib.sha256(content).hexdigest():
-            wrong = f"{name} does not match its own manifest: it was changed after it was packed"
-            raise Refused("wrong_hash", wrong)
+            raise _refused("wrong_hash", name=name)
     return manifest
 
 
@@ -435,29 +433,27 @@ def _want_names(members: Iterable[str], wanted: Iterable[str], by: str) -> None:
     """Refused unless these names, and no others, are in the bundle; by: where they are listed."""
     for name in sorted({*wanted} ^ {*members}):
         if name in members:
-            raise Refused("unlisted_member", f"{name} is in the bundle, but not in {by}")
-        raise Refused("missing_member", f"{shown(name)} is missing from the bundle")
+            raise _refused("unlisted_member", name=name, by=by)
+        raise _refused("missing_member", name=shown(name))
 
 
 def _document(members: dict[str, bytes], name: str) -> dict[str, Any]:
     """A JSON member that is as the schema wants it, with tuples for lists."""
     if name not in members:
-        raise Refused("missing_member", f"{name} is missing from the bundle")
+        raise _refused("missing_member", name=name)
     try:
         text = members[name].decode("utf-8")
         # NaN becomes what is no value of JSON, so that the schema says where it stands
         read = json.loads(text, object_pairs_hook=_without_doubles, parse_constant=str.encode)
         document = _with_tuples(read, MAX_NESTED)
     except (ValueError, RecursionError) as error:  # also an integer of thousands of digits
-        raise Refused("not_json", f"{name} cannot be read ({error})") from None
+        raise _refused("not_json", name=name, error=error) from None
     if name == MANIFEST and isinstance(document, dict) and document.get("format") not in READS:
-        wrong = f"The bundle has format {shown(document.get('format'))}, this grader reads {READS}"
-        cure = "update the course where you pack or where you grade, whichever is older"
-        raise Refused("other_format", wrong, cure)
+        raise _refused("other_format", got=shown(document.get("format")), reads=READS)
     try:
         check_schema({name: document})
     except fastjsonschema.JsonSchemaValueException as fault:
-        raise Refused("bad_value", f"{_fault_text(name, fault)} ({name})") from None
+        raise _refused("bad_value", fault=f"{_fault_text(name, fault)} ({name})") from None
     return document
 
 
@@ -507,8 +503,8 @@ def _stack(members: dict[str, bytes], i: int, distance_m: float, window: Any) ->
     times = _array(f"times_{i}.npy", members[f"times_{i}.npy"], "<f8", 1)
     wanted = (len(times), window[3], window[2])
     if counts.shape != wanted or counts.size > MAX_SAMPLES or len(times) > MAX_FRAMES:
-        wrong = f"depth_{i}.npy has the shape {counts.shape}, its window and times want {wanted}"
-        raise Refused("bad_array", f"{wrong}, {MAX_FRAMES} frames and {MAX_SAMPLES} values at most")
+        facts = {"i": i, "shape": counts.shape, "frames": MAX_FRAMES, "most": MAX_SAMPLES}
+        raise _refused("bad_array.size", wanted=wanted, **facts)
     return Stack(distance_m, window, counts, times)
 
 
@@ -520,14 +516,14 @@ def _array(name: str, content: bytes, dtype: str, rank: int) -> AnyArray:
         with warnings.catch_warnings(action="error"):  # of a header as Python 2 wrote it
             found = np.lib.format.read_array_header_1_0(file, max_header_size=MAX_HEADER)
     except Exception:  # a stranger's bytes: the parser may trip over anything
-        raise Refused("bad_array", f"{name} is no NumPy array of format 1.0") from None
+        raise _refused("bad_array", name=name) from None
     shape, fortran, kind = found
     if version != (1, 0) or fortran or kind != np.dtype(dtype) or len(shape) != rank:
         order = ", in Fortran order" if fortran else ""
-        wrong = f"{name} holds {shown(kind.str)} of shape {shown(shape)}{order}"
-        raise Refused("bad_array", f"{wrong}; {rank} dimensions of {dtype} are wanted, format 1.0")
+        facts = {"kind": shown(kind.str), "shape": shown(shape), "order": order}
+        raise _refused("bad_array.kind", name=name, rank=rank, dtype=dtype, **facts)
     if min(shape) < 1 or math.prod(shape) * kind.itemsize != len(content) - file.tell():
-        raise Refused("bad_array", f"{name} is not as long as its shape {shown(shape)} says")
+        raise _refused("bad_array.length", name=name, shape=shown(shape))
     values = np.frombuffer(content, kind, offset=file.tell()).reshape(shape)
     return values.astype(kind.newbyteorder("="), copy=False)
 

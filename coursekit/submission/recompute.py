@@ -18,12 +18,10 @@ import numpy as np
 
 from coursekit.arrays import Floats
 from coursekit.checks import number, want, whole
-from coursekit.stereo import NoiseFit, WindowStats, fit_noise, window_stats
-from coursekit.stereo.windows import cut, effective_frames, series_std, without_mismatches
-from coursekit.submission.format import Stack, Submission
+from coursekit.stereo import NoiseFit, WindowStats, fit_noise, windows
+from coursekit.submission.format import WORDS, Stack, Submission
 
 RULES = Path(__file__).with_name("rubric.toml")
-WORDS = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding="utf-8"))
 LABELS: dict[str, str] = WORDS["labels"]  # of what is asked for, by topic
 MISTAKES: dict[str, str] = WORDS["mistakes"]
 WHY: dict[str, str] = WORDS["why"]  # a number that a mistake explains is wrong, by its code
@@ -31,24 +29,13 @@ SAYS: dict[str, str] = WORDS["says"]  # longer sentences of the rubric
 SEEN: dict[str, str] = WORDS["seen"]  # what a flag says, by its code
 HEADINGS: dict[str, list[str]] = WORDS["columns"]  # of tables that are read or written
 REPEAT: dict[str, str] = WORDS["repeat"]  # by topic: the section of notebook 02 to repeat
-EXERCISE = ("distances_m", "slack_m", "frames", "window_px", "words", "tape_at_most_m")
-TOLERANCES = ("standard_errors", "error_of_an_error", "prediction", "prediction_factor", "near")
-FLAGS = (
-    "least_sigma_d_px",
-    "flat_exponent",
-    "white",
-    "pattern",
-    "uneven",
-    "same_pattern",
-    "fastest_hz",
-)
 KEYS: dict[str, tuple[float, Collection[str]]] = {  # of rubric.toml: the largest value, the keys
-    "exercise": (2000, EXERCISE),
+    "exercise": (2000, WORDS["rules"]["exercise"]),
     "points": (1000, LABELS),
-    "tolerance": (1000, TOLERANCES),
+    "tolerance": (1000, WORDS["rules"]["tolerance"]),
     "digits": (9, [*LABELS][1:6] + [*LABELS][7:10]),
     "credit": (1, MISTAKES),
-    "flags": (1e6, FLAGS),
+    "flags": (1e6, WORDS["rules"]["flags"]),
 }
 AT_LEAST_ONE = ("frames", "window_px", "prediction_factor", "near")
 WHOLE_NUMBERS = ("frames", "window_px", "words")
@@ -110,12 +97,15 @@ class WithError:
 class AtDistance:
     """One distance; None is what its raw depths do not say.
 
+    z_mm: raw depths (N, h, w), NaN where invalid; clean_mm: the same with NaN for mismatches, too.
     bias, std in mm. bias_se_mm holds the tape's error, the error in bias does not. invalid: as a
     fraction; its standard error is that of a mean over frames.
     """
 
     stack: Stack
     scale_m: float
+    z_mm: Floats
+    clean_mm: Floats
     stats: WindowStats
     bias: WithError | None
     bias_se_mm: float | None
@@ -128,24 +118,13 @@ class AtDistance:
         return self.stack.distance_m
 
     @cached_property
-    def z_mm(self) -> Floats:
-        """Raw depths (N, h, w), mm, NaN where invalid."""
-        _, height, width = self.stack.counts.shape
-        return 1e3 * cut(self.stack.counts, (0, 0, width, height), self.scale_m)
-
-    @cached_property
-    def clean_mm(self) -> Floats:
-        """The same with NaN for mismatches, which `window_stats` leaves out of what it says."""
-        return 1e3 * without_mismatches(1e-3 * self.z_mm, self.scale_m)[0]
-
-    @cached_property
     def kept(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Bias and std, mm, with mismatches kept, each as textbooks pool it: all samples alike, all
         pixels alike, or only pixels that are always valid. Empty where there is no mismatch."""
+        if not self.stats.n_mismatches:
+            return (), ()
         z = self.z_mm.reshape(len(self.z_mm), -1)
         z = z[:, np.isfinite(z).sum(axis=0) > 1]
-        if not (self.stats.n_mismatches and z.size):
-            return (), ()
         level, square = np.nanmean(z, axis=0), np.nanvar(z, axis=0, ddof=1)
         seen, always = np.isfinite(z).sum(axis=0), np.isfinite(z).all(axis=0)
         ways = [(seen, seen - 1), (seen > 0, seen > 0), (always, always)]
@@ -168,7 +147,7 @@ class AtDistance:
         pixels = pixels[:, np.isfinite(pixels).all(axis=0)]
         independent = float(n)
         if pixels.shape[1]:
-            independent, _ = effective_frames(pixels - pixels.mean(axis=0))
+            independent, _ = windows.effective_frames(pixels - pixels.mean(axis=0))
         share = (independent - 1) / (n - 1)
         return self.std.value / math.sqrt(1 + (frames - 1) * share)
 
@@ -203,11 +182,15 @@ def _measured(stack: Stack, scale: float, tape: float) -> AtDistance:
     ends = np.iinfo(stack.counts.dtype).max  # no depth, as for `window_stats`
     stack = replace(stack, counts=np.where(stack.counts == ends, 0, stack.counts))
     with np.errstate(all="ignore"):  # depths that no camera gives; what is not finite is dropped
-        stats = window_stats(stack.counts, (0, 0, width, height), scale)
+        z = windows.cut(stack.counts, (0, 0, width, height), scale)
+        clean = windows.without_mismatches(z, scale)[0]
+        stats = windows.stats_without_mismatches(z, clean, scale)
     bias = _in_mm(stats.depth_m - stack.distance_m, stats.depth_error_m)
     return AtDistance(
         stack=stack,
         scale_m=scale,
+        z_mm=1e3 * z,
+        clean_mm=1e3 * clean,
         stats=stats,
         bias=bias,
         bias_se_mm=None if bias is None else math.hypot(bias.se, 1e3 * tape),
@@ -220,7 +203,7 @@ def _invalid(stack: Stack) -> WithError:
     """The invalid fraction and its standard error, from how it changes from frame to frame."""
     each = (stack.counts == 0).mean(axis=(1, 2))
     least = 0.5 / stack.counts.size  # half a sample
-    std, squares = series_std(each)
+    std, squares = windows.series_std(each)
     se = std / math.sqrt(max(squares, 1.0)) if math.isfinite(std) else 0.0
     return WithError(float(each.mean()), max(se, least))
 
@@ -230,20 +213,14 @@ def _law(
 ) -> tuple[NoiseFit | None, str]:
     """The noise law through the stds with this exponent (None: free), or why there is none."""
     known = [m for m in at if m.std is not None]
-    camera = submission.camera
     if not known:
         return None, "there are no depths to get it from"
+    z, stds = [m.distance_m for m in known], [m.stats.pixel_std_m for m in known]
+    dof, camera = [m.stats.pixel_dof for m in known], submission.camera
+    lens = camera.fx, camera.baseline_m, camera.depth_scale_m
     try:
         with np.errstate(all="ignore"):
-            fit = fit_noise(
-                [m.distance_m for m in known],
-                [m.stats.pixel_std_m for m in known],
-                [m.stats.pixel_dof for m in known],
-                camera.fx,
-                camera.baseline_m,
-                camera.depth_scale_m,
-                exponent,
-            )
+            fit = fit_noise(z, stds, dof, *lens, exponent)
             fits = math.isfinite(fit.sigma_d_px) and np.isfinite(fit.covariance).all()
     except (ValueError, np.linalg.LinAlgError) as error:
         return None, " ".join(str(error).split())

@@ -17,7 +17,6 @@ import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,18 +34,20 @@ from coursekit.submission.flags import (
     Person,
     Roster,
     copies,
+    flag_of,
+    grouped,
     place_of,
     same_words,
     words_of,
 )
-from coursekit.submission.format import Plot, Refused, Submission, TableRow, read_bundle
-from coursekit.submission.recompute import HEADINGS, LABELS, MISTAKES, REPEAT, SEEN, Recomputed
+from coursekit.submission.format import WORDS, Plot, Refused, Submission, TableRow, read_bundle
+from coursekit.submission.recompute import HEADINGS, LABELS, MISTAKES, REPEAT, SAYS, Recomputed
 from coursekit.submission.rubric import Grade, Item, grade
 from coursekit.words import counted
 
 HEADER = (*HEADINGS["first"], *LABELS, *HEADINGS["last"])  # of grades.csv
 FAILED = ("timeout", "died", "memory", "error", "lost")  # reasons; tried anew by the next run
-NOTHING = "Nothing was handed in."
+NOTHING, GONE = WORDS["failed"]["missing"], WORDS["failed"]["gone"]
 AGAIN = "Your file could not be read: hand it in again."
 MOODLE_COLUMNS, CANVAS_COLUMNS, OWN_COLUMNS = (HEADINGS[k] for k in ("moodle", "canvas", "own"))
 FORMULA = tuple("=+-@\t\r\n＝＋－＠")  # what makes a spreadsheet calculate a cell
@@ -57,24 +58,9 @@ PLOT = {"W": 480, "H": 320, "LEFT": 52, "RIGHT": 14, "TOP": 14, "BOTTOM": 46}
 LARGEST_MM = 1e6  # beyond this nothing is drawn
 
 
-@cache
-def _template() -> jinja2.Template:
-    """The template of all pages, read once; everything that it shows is escaped."""
-    loader = jinja2.FileSystemLoader(HERE)
-    pages = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True)
-    pages.filters |= {
-        "points": _points,
-        "result": _result,
-        "counted": counted,
-        "px": "{:.1f}".format,
-    }
-    pages.globals |= PLOT | {"style": Markup((HERE / "report.css").read_text(encoding="utf-8"))}
-    return pages.get_template("report.html.jinja")
-
-
 def _page(**values: Any) -> str:
     """One page; values: what the template shows, with `what` for the kind of page."""
-    return _template().render(**values).lstrip()
+    return TEMPLATE.render(**values).lstrip()
 
 
 @dataclass(frozen=True)
@@ -166,8 +152,10 @@ def graded(file: str, grade: Grade, submission: Submission) -> ReportLine:
     )
 
 
-def not_graded(file: str, reason: str, says: str) -> ReportLine:
-    """The line of a bundle that was refused, or whose grading failed."""
+def not_graded(file: str, reason: str, says: str = "", **facts: Any) -> ReportLine:
+    """The line of a bundle that was refused, or whose grading failed; says: else what words.toml
+    says of the reason, with the facts in it."""
+    says = says or WORDS["failed"][reason].format(**facts)
     return ReportLine(file, reason=reason, says=says)
 
 
@@ -184,13 +172,7 @@ def grade_file(path: str, name: str) -> tuple[ReportLine, str]:
     except Refused as refused:
         return not_graded(name, refused.reason, str(refused)), ""
     except MemoryError:
-        return out_of_memory(name), ""
-
-
-def out_of_memory(name: str) -> ReportLine:
-    """The line of a bundle that wants more memory than a process may have."""
-    says = "It takes more memory than a bundle may. Ask for it again, or look inside."
-    return not_graded(name, "memory", says)
+        return not_graded(name, "memory"), ""
 
 
 def across(
@@ -216,13 +198,9 @@ def across(
         if line.fingerprint is not None
     }
     said = {line.file: (who[line.file].key, line.paragraph) for line in done}
-    about: dict[str, list[Flag]] = {}
-    for copy in [*copies(prints), *same_words(said)]:
-        for key in copy.keys:
-            about.setdefault(key, []).append(_copy_flag(copy))
-    theirs: dict[str, list[ReportLine]] = {}
-    for line in lines:
-        theirs.setdefault(who[line.file].key, []).append(line)
+    shared = [*copies(prints), *same_words(said)]
+    about = grouped((key, _copy_flag(copy)) for copy in shared for key in copy.keys)
+    theirs = grouped((who[line.file].key, line) for line in lines)
     chosen = {
         key: _that_counts([line for line in some if line.points is not None] or some)
         for key, some in theirs.items()
@@ -235,21 +213,16 @@ def across(
         flags = [*line.flags, *about.get(line.file, ()), *more, *_clock(line)]
         flags += roster.other_name(one, line.student)
         if last is not line and line.points is not None:
-            says = (
-                f"An earlier bundle of {last.student}, {_points(line.points)} points; "
-                f"{last.file} counts, {_points(last.points)} points."
-            )
-            flags.append(Flag("earlier_bundle", says, note=True))
+            facts = {"student": last.student, "file": last.file}
+            facts |= {"points": _points(line.points), "better": _points(last.points)}
+            flags.append(flag_of("earlier_bundle", note=True, **facts))
         own_line = _of(line, one, own)
         found.append(
             replace(own_line, flags=tuple(flags), counts=last is line, late=late, fingerprint=None)
         )
-    there = {line.who for line in found}
-    for one in roster.people.values():
-        if one.key not in there:
-            nothing = not_graded("", "missing", NOTHING)
-            found.append(_of(nothing, one, own))
-    return found
+    nothing, there = not_graded("", "missing"), {line.who for line in found}
+    missing = [one for one in roster.people.values() if one.key not in there]
+    return [*found, *(_of(nothing, one, own) for one in missing)]
 
 
 def _of(line: ReportLine, one: Person, own: Mapping[str, Mapping[str, str]]) -> ReportLine:
@@ -276,8 +249,7 @@ def _that_counts(some: Sequence[ReportLine]) -> tuple[ReportLine, tuple[Flag, ..
         f"{line.file} ({_points(line.points)} points, packed {_date(line.made)})"
         for line in some[:6]
     )
-    says = SEEN["same_name"].format(typed=best.student, bundles=each)
-    return best, (Flag("same_name", says),)
+    return best, (flag_of("same_name", typed=best.student, bundles=each),)
 
 
 def _clock(line: ReportLine) -> Iterator[Flag]:
@@ -285,10 +257,8 @@ def _clock(line: ReportLine) -> Iterator[Flag]:
     now = datetime.now(UTC).isoformat(timespec="seconds")
     for what, moment in (("was handed in", line.handed_in), ("was graded", now)):
         if line.made and moment and _seconds(line.made) > _seconds(moment) + 86_400:
-            says = SEEN["wrong_clock"].format(
-                made=_date(line.made), after=f"it {what} ({_date(moment)})"
-            )
-            yield Flag("wrong_clock", says)
+            after = f"it {what} ({_date(moment)})"
+            yield flag_of("wrong_clock", made=_date(line.made), after=after)
             return
 
 
@@ -335,9 +305,8 @@ def student_page(line: ReportLine, body: str) -> str:
 
     line: after `across`. body: of `page_body`, or "" where the bundle was not graded.
     """
-    lost = [item for item in line.items if item.points < item.of]
-    facts = {"told": _told(line), "decided": _decided(line), "body": Markup(body)}
-    return _page(what="student", bundle=line, lost=len(lost), **facts)
+    lost = sum(item.points < item.of for item in line.items)
+    return _page(what="student", bundle=line, lost=lost, body=Markup(body))
 
 
 def _decided(line: ReportLine) -> str:
@@ -362,25 +331,14 @@ def page_body(grade: Grade, submission: Submission) -> str:
 
     No flags, which are the instructor's.
     """
-    camera = submission.camera
-    baseline = "unknown" if camera.baseline_m is None else f"{1e3 * camera.baseline_m:.2f} mm"
     return _page(
         what="body",
         submission=submission,
         made=_date(submission.made),
-        grade=grade,
-        facts=f"{camera.name} ({camera.source}), {camera.width}x{camera.height} px, "
-        f"fx = {camera.fx:.1f} px, baseline {baseline}, "
-        f"depth unit {1e3 * camera.depth_scale_m:g} mm",
         figure=_noise_figure(submission, grade.recomputed),
         comparison=list(_comparison(grade, submission)),
         lost=[item for item in grade.items if item.points < item.of],
         right=[item for item in grade.items if item.points >= item.of],
-        paragraph=submission.conclusion.paragraph.strip(),
-        outcomes=[
-            (name, "right" if outcome.right else "not yet", outcome.attempts)
-            for name, outcome in sorted(submission.outcomes.items())
-        ],
     )
 
 
@@ -390,28 +348,25 @@ def _comparison(grade: Grade, submission: Submission) -> Iterator[tuple[str, ...
     for m in grade.recomputed.at:
         same = (row for row in claims.rows if abs(row.distance_m - m.distance_m) < 0.005)
         row = next(same, TableRow(m.distance_m))
-        claim = _pair(row.depth_bias_mm, row.depth_bias_se_mm, "+.2f", ".2f")
-        found = _pair(getattr(m.bias, "value", None), m.bias_se_mm, "+.2f", ".2f")
+        claim = _pair(row.depth_bias_mm, "+.2f", row.depth_bias_se_mm)
+        found = _pair(getattr(m.bias, "value", None), "+.2f", m.bias_se_mm)
         yield f"{m.distance_m:.2f}\u00a0m", "bias (mm)", claim, found
-        claim = _pair(row.depth_std_mm, row.depth_std_se_mm, ".3f", ".3f")
-        found = _pair(getattr(m.std, "value", None), getattr(m.std, "se", None), ".3f", ".3f")
+        claim = _pair(row.depth_std_mm, ".3f", row.depth_std_se_mm)
+        found = _pair(getattr(m.std, "value", None), ".3f", getattr(m.std, "se", None))
         yield "", "std (mm)", claim, found
         percent = None if row.invalid_fraction is None else 100 * row.invalid_fraction
-        yield "", "invalid (%)", _pair(percent), _pair(100 * m.invalid.value)
+        yield "", "invalid (%)", _pair(percent, ".1f"), _pair(100 * m.invalid.value, ".1f")
     sigma_d, ends = (law.sigma_d_px, law.sigma_d_interval_px) if law else (None, None)
-    claim, found = (_pair(value, None, ".3f") for value in (claims.sigma_d_px, sigma_d))
-    yield "all", "σ_d (px)", claim, found
+    yield "all", "σ_d (px)", _pair(claims.sigma_d_px, ".3f"), _pair(sigma_d, ".3f")
     yield "", "95 % (px)", _ends(claims.sigma_d_interval_px), _ends(ends)
 
 
-def _pair(
-    value: float | None, error: float | None = None, digits: str = ".1f", error_digits: str = ".2f"
-) -> str:
-    """A value and its error in fixed formats, such as "+1.25 ± 0.10"; "-" for what is not there."""
+def _pair(value: float | None, digits: str, error: float | None = None) -> str:
+    """A value and its error in a fixed format, such as "+1.25 ± 0.10"; "-" for none."""
     if value is None:
         return "-"
     text = _fixed(value, digits)
-    return text if error is None else f"{text} ± {_fixed(error, error_digits)}"
+    return text if error is None else f"{text} ± {_fixed(error, digits.lstrip('+'))}"
 
 
 def _ends(ends: Interval | None) -> str:
@@ -476,17 +431,7 @@ def _noise_figure(submission: Submission, found: Recomputed) -> dict[str, Any] |
     axes = _Axes(0.8 * min(ends), 1.1 * max(ends), 1.1 * max([*tops, 1e-6]))
     claims, off_claims = axes.split(claimed.items())
     guesses, off_guesses = axes.split(predicted.items())
-    off = ", ".join(off_claims + off_guesses)
-    key = [("measured", "recomputed from your raw depths, ± 2 standard errors")]
-    figure = _law_curves(axes, submission, found, ends, key)
-    key += [("claimed", "your table")] * bool(claimed)
-    key += [("predicted", "your prediction")] * bool(predicted)
-    words = []
-    for z, std, se in measured:
-        said = f", claimed {claimed[z]:.3g} mm" if z in claimed else ""
-        said += f", predicted {predicted[z]:.3g} mm" if z in predicted else ""
-        words.append(f"{z:.2f} m: recomputed {std:.3g} ± {se:.2g} mm{said}")
-    return figure | {
+    return _law_curves(axes, submission, found, min(ends)) | {
         "x_ticks": [(axes.x(v), f"{v:.2g}") for v in _ticks(axes.low, axes.high, 6)],
         "y_ticks": [(axes.y(v), f"{v:.3g}") for v in _ticks(0, axes.top, 5)],
         "measured": [
@@ -496,43 +441,36 @@ def _noise_figure(submission: Submission, found: Recomputed) -> dict[str, Any] |
         ],
         "claimed": claims,
         "predicted": guesses,
-        "key": key,
-        "alt": f"Std of one pixel's depth over time at {'; '.join(words)}.",
-        "off": f" Off the scale and not drawn: {off}." if off else "",
+        "said": [(*row, claimed.get(row[0]), predicted.get(row[0])) for row in measured],
+        "has_table": bool(claimed),
+        "has_guesses": bool(predicted),
+        "off": ", ".join(off_claims + off_guesses),
     }
 
 
 def _law_curves(
-    axes: _Axes,
-    submission: Submission,
-    found: Recomputed,
-    ends: Sequence[float],
-    key: list[tuple[str, str]],
-) -> dict[str, str]:
+    axes: _Axes, submission: Submission, found: Recomputed, nearest: float
+) -> dict[str, Any]:
     """The curve of the fitted law with its band, and, where it shows, what rounding to counts makes
-    of it; what they mean goes into `key`."""
+    of it; `in_counts` is the count in mm where that shows at the nearest distance, too."""
     if found.law is None:
         return {}
-    step_mm = 1e3 * submission.camera.depth_scale_m
+    step_mm, z = 1e3 * submission.camera.depth_scale_m, np.linspace(axes.low, axes.high, 40)
 
     def rounded(std_mm: float) -> float:
         return math.sqrt(float(rounded_variance(std_mm, step_mm)))
 
-    def rounding_shows(z: float) -> bool:
-        least = 1e3 * float(found.law.std_m(z)[0]) if found.law else 0.0
-        return rounded(least) > 1.05 * least
-
-    z = np.linspace(axes.low, axes.high, 40)
     middle, low, high = ((1e3 * curve).tolist() for curve in found.law.std_m(z))
-    band = np.minimum(low + high[::-1], axes.top)
-    key.append(("law", f"law with your σ_d of {found.law.sigma_d_px:.3f} px, and its 95 % band"))
-    if rounding_shows(min(ends)):
-        key.append(("rounded", f"the same in depth counts of {step_mm:g} mm"))
-    shows = rounding_shows(axes.low)
+    shows, near = (
+        rounded(std) > 1.05 * std
+        for std in (1e3 * float(found.law.std_m(at)[0]) for at in (axes.low, nearest))
+    )
     return {
-        "band": axes.path([*z, *z[::-1]], band),
+        "band": axes.path([*z, *z[::-1]], np.minimum(low + high[::-1], axes.top)),
         "law": axes.path(z, middle),
         "rounded": axes.path(z, map(rounded, middle)) if shows else "",
+        "sigma_d": found.law.sigma_d_px,
+        "in_counts": step_mm if near else None,
     }
 
 
@@ -548,18 +486,6 @@ def _ticks(low: float, high: float, about: int) -> list[float]:
 # --- the instructor's pages -----------------------------------------------------------------------
 
 
-def _histogram(percents: Sequence[float]) -> dict[str, Any]:
-    """How many students got which part of the points, in tens of percent."""
-    bins = np.histogram(np.clip(percents, 0, 100), 10, (0, 100))[0].tolist()
-    words = ", ".join(f"{n} from {10 * i} to {10 * i + 10} %" for i, n in enumerate(bins) if n)
-    return {
-        "bins": bins,
-        "most": max([*bins, 1]),
-        "wide": (PLOT["W"] - PLOT["LEFT"] - PLOT["RIGHT"]) / 10,
-        "alt": f"Students by points: {words}." if words else "No graded bundle.",
-    }
-
-
 def class_page(lines: Sequence[ReportLine], changes: Sequence[tuple[str, ...]] = ()) -> str:
     """Distribution, misconceptions, flags, refused bundles, and a link to every student's page.
 
@@ -567,38 +493,31 @@ def class_page(lines: Sequence[ReportLine], changes: Sequence[tuple[str, ...]] =
     """
     done = [line for line in lines if line.points is not None]
     counts = [line for line in done if line.counts]
-    percents = [line.percent or 0.0 for line in counts]
     everybody = [line for line in lines if line.counts]
-    named = sorted(everybody, key=lambda line: (words_of(line.name or line.student), line.file))
-    ask_first = "No points were taken for these. Ask first: there may be an innocent reason."
+    given = [(line.total, line.of or 100) for line in everybody]
+    percents = [100 * total / of for total, of in given if total is not None]
+    named = sorted(everybody, key=_by_name)
     return _page(
         what="class",
+        lines=lines,
         done=done,
         counts=counts,
         percents=percents,
         median=statistics.median(percents) if percents else 0.0,
-        flagged=sum(line.flagged for line in done),
-        figure=_histogram(percents),
+        bins=np.histogram(np.clip(percents, 0, 100), 10, (0, 100))[0].tolist(),
         topics=_topics(counts),
         left_out=_left_out(counts),
-        flags=[
-            ("To look at", ask_first, _by_flag(done, False)),
-            ("Notes", "Expected, and no reason to ask.", _by_flag(done, True)),
-        ],
-        refused=[
-            (
-                line,
-                f"{line.name} is asked to hand it in again." if _told(line) and line.name else "",
-            )
-            for line in lines
-            if line.points is None and line.reason != "missing"
-        ],
-        missing=[line.name for line in lines if line.reason == "missing"],
-        late=[line for line in everybody if line.late],
+        flags=_by_flag(done, False),
+        notes=_by_flag(done, True),
         changes=changes,
         named=named,
         ranked=sorted(named, key=lambda line: (line.total is not None, line.total or 0.0)),
     )
+
+
+def _by_name(line: ReportLine) -> tuple[list[str], str]:
+    """In which order people stand on a page."""
+    return words_of(line.name or line.student), line.file
 
 
 def _result(line: ReportLine) -> str:
@@ -616,36 +535,36 @@ def _topics(lines: Sequence[ReportLine]) -> list[tuple[str, str, int, Any]]:
     """
     found = []
     for topic, label in LABELS.items():
-        who: dict[str, list[ReportLine]] = {}
-        wrong = 0
-        for line in lines:  # a mistake made at three distances is made by one student
-            items = [i for i in line.items if i.topic == topic and i.verdict != "missing"]
-            mistakes = dict.fromkeys(filter(None, map(_said, items)))
-            wrong += bool(mistakes)
-            for said in mistakes:
-                who.setdefault(said, []).append(line)
-        groups = sorted(who.items(), key=lambda pair: -len(pair[1]))
-        found.append((label, REPEAT.get(topic, ""), wrong, groups))
+        said = [(line, _ways(line, topic)) for line in lines]
+        groups = grouped((way, line) for line, ways in said for way in ways)
+        ranked = sorted(groups.items(), key=lambda pair: -len(pair[1]))
+        if ranked:
+            found.append(
+                (label, REPEAT.get(topic, ""), sum(bool(ways) for _, ways in said), ranked)
+            )
     return sorted(found, key=lambda row: -row[2])
+
+
+def _ways(line: ReportLine, topic: str) -> list[str]:
+    """In which ways a topic is wrong; a mistake made at three distances is one."""
+    items = [i for i in line.items if i.topic == topic and i.verdict != "missing"]
+    return [*dict.fromkeys(filter(None, map(_said, items)))]
 
 
 def _left_out(lines: Sequence[ReportLine]) -> list[tuple[str, list[ReportLine]]]:
     """What students left out, with those who left out the same."""
-    who: dict[str, list[ReportLine]] = {}
-    for line in lines:
-        topics = dict.fromkeys(item.topic for item in line.items if item.verdict == "missing")
-        if topics:
-            who.setdefault(", ".join(LABELS[topic] for topic in topics), []).append(line)
+    topics = (
+        (dict.fromkeys(item.topic for item in line.items if item.verdict == "missing"), line)
+        for line in lines
+    )
+    who = grouped((", ".join(LABELS[t] for t in some), line) for some, line in topics if some)
     return sorted(who.items(), key=lambda pair: -len(pair[1]))
 
 
 def _by_flag(lines: Sequence[ReportLine], note: bool) -> list[Any]:
     """Those who share a flag share a row."""
-    who: dict[tuple[str, str], list[ReportLine]] = {}
-    for line in lines:
-        for flag in line.flags:
-            if flag.note == note:
-                who.setdefault((flag.code.replace("_", " "), flag.says), []).append(line)
+    flags = ((flag, line) for line in lines for flag in line.flags if flag.note == note)
+    who = grouped(((flag.code.replace("_", " "), flag.says), line) for flag, line in flags)
     return list(who.items())
 
 
@@ -654,24 +573,12 @@ def paragraphs_page(lines: Sequence[ReportLine], named: bool = True) -> str:
 
     named: else by code and without links, for a second marker.
     """
-    some = [line for line in lines if line.points is not None and line.counts]
-    some.sort(key=lambda line: (words_of(line.name or line.student), line.file))
+    some = sorted((n for n in lines if n.points is not None and n.counts), key=_by_name)
     if not named:
-        some = sorted(
-            (replace(line, name=line.code, page="") for line in some), key=lambda line: line.name
-        )
-    said = [(line, _about(line)) for line in some if line.paragraph.strip()]
+        some = sorted((replace(n, name=n.code, page="") for n in some), key=lambda n: n.name)
+    said = [line for line in some if line.paragraph.strip()]
     silent = [line for line in some if not line.paragraph.strip()]
     return _page(what="paragraphs", said=said, silent=silent, named=named)
-
-
-def _about(line: ReportLine) -> str:
-    """What stands under a name on the page of paragraphs: its length, and the verdict."""
-    facts = [counted(len(line.paragraph.split()), "word")]
-    facts += [f"which error dominates: {i.verdict}" for i in line.items if i.topic == "verdict"]
-    if any(flag.code == "same_words" for flag in line.flags):
-        facts.append("shares its words with others, see the class page")
-    return "; ".join(facts)
 
 
 def _said(item: Item) -> str:
@@ -725,8 +632,9 @@ def canvas_column(lines: Sequence[ReportLine], assignment: str = "") -> tuple[st
 
 def exports(
     lines: Sequence[ReportLine], separator: str = ",", assignment: str = ""
-) -> dict[str, str]:
-    """Tables that Moodle and Canvas import, by the file's name; lines: after `across`.
+) -> tuple[dict[str, str], tuple[str, ...]]:
+    """Tables that Moodle and Canvas import, by the file's name, and a note if the roster does not
+    have the column of the points; lines: after `across`.
 
     Moodle's is its offline grading worksheet, found by `Identifier`; Canvas' its gradebook, found
     by `ID`, with the row of the points possible. Both have whoever has points or a word for them;
@@ -750,11 +658,12 @@ def exports(
             canvas.append((name, number, *ids, grade_of))
     if any(row[3] or row[6] != NOTHING for row in moodle):
         tables["moodle.csv"] = _csv([MOODLE_COLUMNS, *moodle], separator)
-    if any(row[-1] for row in canvas):
-        columns = (*CANVAS_COLUMNS[:-1], canvas_column(lines, assignment)[0])
-        possible = ("    Points Possible", "", "", "", "", "100")
-        tables["canvas.csv"] = _csv([columns, possible, *canvas], separator)
-    return tables
+    if not any(row[-1] for row in canvas):
+        return tables, ()
+    column, known = canvas_column(lines, assignment)
+    possible = ("    Points Possible", "", "", "", "", "100")
+    tables["canvas.csv"] = _csv([(*CANVAS_COLUMNS[:-1], column), possible, *canvas], separator)
+    return tables, () if known else (SAYS["no_column"].format(column),)
 
 
 def own_table(lines: Sequence[ReportLine], separator: str = ",") -> str:
@@ -794,3 +703,10 @@ def _cell(text: str) -> str:
 def _points(value: float | None) -> str:
     """Points without zeros that say nothing."""
     return "" if value is None else f"{value:.2f}".rstrip("0").rstrip(".")
+
+
+PAGES = jinja2.Environment(loader=jinja2.FileSystemLoader(HERE), autoescape=True, trim_blocks=True)
+PAGES.filters |= {"points": _points, "result": _result, "told": _told, "decided": _decided}
+PAGES.filters |= {"counted": counted, "px": "{:.1f}".format}
+PAGES.globals |= PLOT | {"style": Markup((HERE / "report.css").read_text(encoding="utf-8"))}
+TEMPLATE = PAGES.get_template("report.html.jinja")  # of all pages; it escapes all that it shows

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -142,6 +142,11 @@ class _Question(NamedTuple):
         return self.item("missing", f"{self.name}: missing; {why}.")
 
 
+def _say(sentence: str, **facts: Any) -> str:
+    """A sentence of words.toml with the facts in its places."""
+    return SAYS[sentence].format(**facts)
+
+
 def grade(submission: Submission) -> Grade:
     """Compare what a submission claims with what its raw depths say.
 
@@ -220,8 +225,8 @@ def _chosen(wanted: Sequence[float], at: Sequence[AtDistance]) -> dict[float, At
 
 def _row(submission: Submission, z: float) -> TableRow | None:
     """The row of the student's table at a distance."""
-    near = [r for r in submission.claims.rows if abs(r.distance_m - z) <= SAME_DISTANCE_M]
-    return min(near, key=lambda r: abs(r.distance_m - z), default=None)
+    rows = {row.distance_m: row for row in submission.claims.rows}
+    return rows.get(_nearest(list(rows), z) or 0.0)
 
 
 def _one_distance(
@@ -252,21 +257,16 @@ def _data(asked: _Question, z: float, m: AtDistance | None) -> Item:
     exercise = grading_rules()["exercise"]
     needed, side = exercise["frames"], exercise["window_px"]
     if m is None:
-        says = f"{z:.2f} m is missing: {needed} frames of raw depth are needed there."
-        return asked.item("missing", says)
+        return asked.item("missing", _say("no_stack", z=z, needed=needed))
     n, height, width = m.stack.counts.shape
-    where = f"{m.distance_m:.2f} m"
+    facts = {"z": m.distance_m, "frames": counted(n, "frame"), "needed": needed, "side": side}
+    facts["window"] = f"{width}x{height} px"
+    few, small = n < needed, min(width, height) < side
     if m.bias is None:
-        says = f"{where} has no depth in its window: every pixel is invalid."
-        return asked.item("wrong", says)
-    small = min(width, height) < side
-    if n < needed:
-        says = f"{where} has {counted(n, 'frame')}, {needed} are needed"
-        says += f", and a window of {width}x{height} px is small." if small else "."
-    elif small:
-        says = f"{where} has a window of {width}x{height} px, at least {side}x{side} are needed."
-    else:
-        return asked.item("right", f"{where} has {n} frames of {width}x{height} px: enough.")
+        return asked.item("wrong", _say("no_depth", **facts))
+    if not (few or small):
+        return asked.item("right", _say("enough", **facts))
+    says = _say("few_and_small" if few and small else "few" if few else "small", **facts)
     return asked.item("partial", says, "incomplete", min(n / needed, 1.0) * (0.5 if small else 1.0))
 
 
@@ -318,9 +318,9 @@ def _bias_se(asked: _Question, submission: Submission, m: AtDistance, claim: flo
             yield from _other_units(se, 0.1 * se, 1e3 * m.scale_m)
 
     near = _nearest_of(claim, (both, apart))  # with the tape's, or apart from it
-    item = _judge_error(asked, claim, near, mistakes)
+    item = _judge(asked, claim, near, None, mistakes)
     if item.verdict == "right" and submission.camera.source == "live" and tape == 0:
-        says = SAYS["no_tape"].format(asked.name, _shown("bias_se", claim))
+        says = _say("no_tape", what=asked.name, claim=_shown("bias_se", claim))
         return asked.item("partial", says, "no_tape", tolerance=item.tolerance)
     return item
 
@@ -407,7 +407,7 @@ def _std_se(asked: _Question, _: Submission, m: AtDistance, claim: float) -> Ite
             yield _Mistake("independent", std / math.sqrt(n * pixels))
         yield from _other_units(found, 0.1 * found, 1e3 * m.scale_m)
 
-    return _judge_error(asked, claim, found, mistakes)
+    return _judge(asked, claim, found, None, mistakes)
 
 
 def _invalid(asked: _Question, _: Submission, m: AtDistance, claim: float) -> Item:
@@ -453,38 +453,31 @@ def _plot(asked: _Question, submission: Submission, found: Recomputed) -> Item:
     wanted = len(grading_rules()["exercise"]["distances_m"])
     absent, wrong, right = [], [], 0
     for z, std in measured.items():
-        where, near, tolerance = f"{z:.2f} m", _nearest(plot.distances_m, z), 0.0
+        near, tolerance = _nearest(plot.distances_m, z), _tolerance("std", std.se)
         if near is None:
-            absent.append(where)
+            absent.append(f"{z:.2f} m")
             continue
-        got, tolerance = plot.measured_mm[plot.distances_m.index(near)], _tolerance("std", std.se)
-        kept = _row(submission, z)  # the std of one's own table, which is judged there
-        own = None if kept is None else kept.depth_std_mm
+        got = plot.measured_mm[plot.distances_m.index(near)]
+        own = getattr(_row(submission, z), "depth_std_mm", None)  # which is judged in the table
         if min(abs(got - std.value), abs(got - (own or math.inf))) <= tolerance:
             right += 1
         else:
-            said = [_shown("std", value) for value in (got, std.value)]
-            says = f"at {where} it shows a measured {said[0]}, your raw depths say {said[1]}"
-            wrong.append(f"{says} ({_accepted('std', tolerance)})")
+            values = {"got": _shown("std", got), "found": _shown("std", std.value)}
+            wrong.append(_say("plotted", z=z, accepted=_accepted("std", tolerance), **values))
     there = [_nearest(list(measured), z) for z in plot.distances_m]
-    for z, near in zip(plot.distances_m, there, strict=True):
-        if near is None:
-            wrong.append(f"it shows a point at {z:.2f} m, where there are no raw depths")
+    pairs = zip(plot.distances_m, there, strict=True)
+    wrong += [_say("plotted_more", z=z) for z, near in pairs if near is None]
     part = right / max(wanted, len(measured), len(plot.distances_m))
     if wrong:
-        says = f"Plot: wrong because {'; '.join(wrong)}."
-        return asked.item(
-            "partial" if round(asked.of * part / 2, 2) else "wrong", says, "", part / 2
-        )
+        verdict: Judgement = "partial" if round(asked.of * part / 2, 2) else "wrong"
+        return asked.item(verdict, f"Plot: wrong because {'; '.join(wrong)}.", "", part / 2)
     if absent or right < wanted:
         short = f"{', '.join(absent)} missing" if absent else f"{right} of {wanted} distances"
-        says = f"Plot: it shows what you measured, but with {short}"
         if plot.predicted_mm is None:
             part *= grading_rules()["credit"]["no_prediction"]
-            says += " and without your prediction"
-        return asked.item("partial", f"{says}.", "no_prediction", part)
-    shows = "measured std as in your raw depths"
-    return _prediction(asked, plot, shows, [measured[z].value for z in there if z is not None])
+            short += " and without your prediction"
+        return asked.item("partial", _say("plotted_less", short=short), "no_prediction", part)
+    return _prediction(asked, plot, [measured[z].value for z in there if z is not None])
 
 
 def _nearest(distances_m: Sequence[float], z: float) -> float | None:
@@ -493,46 +486,36 @@ def _nearest(distances_m: Sequence[float], z: float) -> float | None:
     return near if abs(near - z) <= SAME_DISTANCE_M else None
 
 
-def _prediction(asked: _Question, plot: Plot, shows: str, found_mm: Sequence[float]) -> Item:
-    """The predicted curve: it was made before measuring, so its shape must be right, and its scale
-    to a factor.
+def _prediction(asked: _Question, plot: Plot, found_mm: Sequence[float]) -> Item:
+    """The predicted curve, where the measured points are right: it was made before measuring, so
+    its shape must be right, and its scale to a factor.
 
-    shows: what is right about the measured points. found_mm: what the raw depths say for each.
+    found_mm: what the raw depths say for each point.
     """
-
-    def partial(mistake: str, says: str) -> Item:
-        return asked.item("partial", f"Plot: {shows}, but {says}", mistake)
-
     if plot.predicted_mm is None:
-        why = "predicted is what sigma_d, fx and baseline say before you measure."
-        return partial("no_prediction", f"without your prediction; {why}")
+        return asked.item("partial", _say("no_prediction"), "no_prediction")
     z, predicted, found = map(np.array, (plot.distances_m, plot.predicted_mm, found_mm))
     if not (predicted > 0).all():
-        return partial("proportional", "a predicted std must be greater than 0.")
+        return asked.item("partial", _say("not_positive"), "proportional")
     if len(z) > 1 and np.array_equal(predicted, plot.measured_mm):
-        return asked.item("partial", SAYS["copied_prediction"], "copied_prediction")
+        return asked.item("partial", _say("copied_prediction"), "copied_prediction")
     rule, shape = grading_rules()["tolerance"], predicted / z**2
     off, slack, most = shape.max() / shape.min() - 1, rule["prediction"], rule["prediction_factor"]
     if off > slack:
         law = "Z" if np.ptp(np.log(predicted / z)) < math.log(1 + slack) else "something else"
-        return partial("proportional", SAYS["proportional"].format(law, off))
+        return asked.item("partial", _say("proportional", law=law, off=off), "proportional")
     ratio = float(np.exp(np.log(predicted / found).mean())) if (found > 0).all() else 1.0
     if 1 / most <= ratio <= most:
-        times = f"{ratio:.2f} times what your raw depths say"
-        says = f"Plot: {shows}, prediction proportional to Z² and {times}: right."
-        return asked.item("right", says)
-    mistake, says = "metres", "the prediction is in metres: 1 m is 1000 mm."
-    if not 1 / most <= 1e3 * ratio <= most:
-        mistake, says = "off_scale", f"the prediction is {ratio:.2g} times what your raw depths say"
-        says += f"; within a factor of {most:g} is accepted."
-    return partial(mistake, says)
+        return asked.item("right", _say("predicted", ratio=ratio))
+    mistake = "metres" if 1 / most <= 1e3 * ratio <= most else "off_scale"
+    return asked.item("partial", _say(f"predicted_{mistake}", ratio=ratio, most=most), mistake)
 
 
 def _sigma_d(asked: _Question, submission: Submission, found: Recomputed) -> Item:
     """The std of disparity, px, from sigma_Z = Z^2 sigma_d / (fx B) through all distances."""
     claim, law, camera = submission.claims.sigma_d_px, found.law, submission.camera
     if law is None:
-        return _no_law(asked, claim, found)
+        return _no_law(asked, found)
     if claim is None:
         return asked.missing("the fit with the exponent held at 2 is asked for")
     value = law.sigma_d_px
@@ -544,16 +527,13 @@ def _sigma_d(asked: _Question, submission: Submission, found: Recomputed) -> Ite
         product = camera.fx * (camera.baseline_m or 0.0)
         known = [m for m in found.at if m.std is not None]
 
-        def mean(stds_m: Iterable[float], power: int) -> float:
-            pairs = zip(stds_m, known, strict=True)
-            return float(np.mean([std * product / m.distance_m**power for std, m in pairs]))
+        def mean(std: str, power: int) -> float:
+            each = [getattr(m.stats, std) * product / m.distance_m**power for m in known]
+            return float(np.mean(each))
 
-        yield _Mistake("not_squared", mean((m.stats.pixel_std_m for m in known), 1))
-        for key, stds in (
-            ("spatial", [m.stats.spatial_std_m for m in known]),
-            ("of_the_mean", [m.stats.mean_std_m for m in known]),
-        ):
-            yield _Mistake(key, mean(stds, 2), 0.02 * mean(stds, 2))
+        yield _Mistake("not_squared", mean("pixel_std_m", 1))
+        for key, std in (("spatial", "spatial_std_m"), ("of_the_mean", "mean_std_m")):
+            yield _Mistake(key, mean(std, 2), 0.02 * mean(std, 2))
 
     return _judge(asked, claim, value, tolerance, mistakes)
 
@@ -562,7 +542,7 @@ def _sigma_d_interval(asked: _Question, submission: Submission, found: Recompute
     """The 95 % interval of sigma_d, px, widened for the scatter about the law."""
     claim, law = submission.claims.sigma_d_interval_px, found.law
     if law is None:
-        return _no_law(asked, None if claim is None else claim[0], found)
+        return _no_law(asked, found)
     if claim is None:
         return asked.missing("a number without one says nothing of how well it fits")
     stated = submission.claims.sigma_d_px or 0.0
@@ -579,18 +559,14 @@ def _exponent(asked: _Question, submission: Submission, found: Recomputed) -> It
     claims, free = submission.claims, found.free
     claim, interval = claims.exponent, claims.exponent_interval
     if found.law is None:
-        return _no_law(asked, claim, found)
+        return _no_law(asked, found)
     if claim is None and interval is None:
         at, n = [m.distance_m for m in found.at], counted(len(found.at), "distance")
-        over = f"{n} over a factor of {max(at) / min(at):.2g}"
-        says = f"Exponent: none quoted, and {over} say too little of it: right."
-        return asked.item("right", says)
+        return asked.item("right", _say("no_exponent", n=n, factor=max(at) / min(at)))
     if free is None or free.exponent is None or free.exponent_interval is None:
-        says = "Exponent: your raw depths give none to compare yours with."
-        return asked.item("missing", says)
+        return asked.item("missing", _say("none_to_compare"))
     if claim is None:
-        says = "Exponent: there is an interval, but no exponent in it."
-        return asked.item("partial", says, "incomplete")
+        return asked.item("partial", _say("no_middle"), "incomplete")
     value, tolerance = free.exponent, _tolerance("exponent", _log_se(free, 1))
 
     def mistakes() -> Iterator[_Mistake]:
@@ -609,12 +585,12 @@ def _with_interval(
     assert free.exponent_interval is not None
     low, high = free.exponent_interval
     if interval is None:
-        says = SAYS["no_interval"].format(claim, low, high)
+        says = _say("no_interval", claim=claim, low=low, high=high)
         return asked.item("partial", says, "no_interval", tolerance=item.tolerance)
     ends = _judge_interval(asked, interval, (low, high), free, 1)
     if ends.verdict == "right":
-        says = SAYS["exponent"].format(claim, *interval, free.exponent, low, high)
-        return replace(item, says=says)
+        facts = {"interval": interval, "found": free.exponent, "low": low, "high": high}
+        return replace(item, says=_say("exponent", claim=claim, **facts))
     if ends.points < 0.5 * asked.of:  # the exponent itself is right
         points = round(0.5 * asked.of, 2)
         mistake = ends.mistake or "no_interval"
@@ -634,7 +610,8 @@ def _judge_interval(
     unit = UNIT_OF[topic]
     one, two = (" to ".join(_digits(topic, end) for end in ends) for ends in (claim, found))
     accepted = f"{_accepted(topic, tolerance)} for each end"
-    says = SAYS["compared"].format(asked.name, one + unit, two + unit, accepted)
+    facts = {"claim": one + unit, "found": two + unit, "accepted": accepted}
+    says = _say("compared", what=asked.name, **facts)
     off = _apart(claim, found)
     if off <= tolerance:
         return asked.item("right", f"{says}: right.", tolerance=tolerance)
@@ -666,12 +643,10 @@ def _apart(one: Interval, two: Interval) -> float:
     return max(abs(a - b) for a, b in zip(one, two, strict=True))
 
 
-def _no_law(asked: _Question, claim: float | None, found: Recomputed) -> Item:
+def _no_law(asked: _Question, found: Recomputed) -> Item:
     """No fit: the camera's facts lack the baseline, or the raw depths are at fault."""
-    if found.why_no_law.startswith("baseline_m"):
-        says = f"{asked.name}: missing; without the camera's baseline there is no disparity."
-        return asked.item("missing", says)
-    return asked.item("missing", f"{asked.name}: your raw depths give none ({found.why_no_law}).")
+    key = "no_baseline" if found.why_no_law.startswith("baseline_m") else "no_law"
+    return asked.item("missing", _say(key, what=asked.name, why=found.why_no_law))
 
 
 # --- the conclusion -------------------------------------------------------------------------------
@@ -685,18 +660,15 @@ def _conclusion(asked: _Question, submission: Submission, found: Recomputed) -> 
         why = "your raw depths give neither" if said.dominates else "say which dominates"
         return asked.missing(f"{why} where you will mount the camera")
     if said.distance_m is None:
-        says = f"Bias or noise: you say {said.dominates}, but not at which mounting distance."
-        return asked.item("partial", says, "incomplete")
-    z, frames = said.distance_m, said.frames
-    low, high = known[0].distance_m / 1.5, 1.5 * known[-1].distance_m
+        return asked.item("partial", _say("nowhere", dominates=said.dominates), "incomplete")
+    z, frames, near, far = said.distance_m, said.frames, known[0].distance_m, known[-1].distance_m
     bias, bias_se, noise, noise_se = _at_mounting(submission, known, z, frames)
-    over = f"{frames} frames" if frames > 1 else "one frame"
-    says = SAYS["dominates"].format(said.dominates, z, bias, bias_se, noise, over)
-    if not low <= z <= high:
-        ends = f"{known[0].distance_m:.2f} to {known[-1].distance_m:.2f} m"
-        says += f", but you measured from {ends} only: that is too far to tell."
-        if low <= z / 100 <= high:
-            says = f"Bias or noise: {z:g} m? In metres: {z / 100:g}."
+    facts = {"bias": bias, "se": bias_se, "noise": noise, "dominates": said.dominates, "z": z}
+    says = _say("dominates", over=f"{frames} frames" if frames > 1 else "one frame", **facts)
+    if not near / 1.5 <= z <= 1.5 * far:
+        says += _say("too_far", near=near, far=far)
+        if near / 1.5 <= z / 100 <= 1.5 * far:
+            says = _say("centimetres", z=z, metres=z / 100)
         return asked.item("partial", says, "not_measured_there")
     lead = abs(bias) - noise
     sure = grading_rules()["tolerance"]["standard_errors"] * math.hypot(bias_se, noise_se)
@@ -705,9 +677,9 @@ def _conclusion(asked: _Question, submission: Submission, found: Recomputed) -> 
     larger = "bias" if lead > 0 else "noise"
     if said.dominates == larger:
         return asked.item("right", f"{says}: right.")
-    says += f": wrong because {larger} is the larger by {abs(lead):.2f} mm"
-    says += "; averaging takes noise down and leaves the bias" * (larger == "bias" and frames > 1)
-    return asked.item("partial", f"{says}.", "other_dominates")
+    averaged = SAYS["averaging"] * (larger == "bias" and frames > 1)
+    says += _say("other", larger=larger, lead=abs(lead), averaged=averaged)
+    return asked.item("partial", says, "other_dominates")
 
 
 def _at_mounting(
@@ -737,9 +709,8 @@ def _paragraph(asked: _Question, submission: Submission) -> Item:
     if words == 0:
         return asked.missing("three sentences on which error dominates, and why")
     if words < grading_rules()["exercise"]["words"]:
-        says = f"Paragraph: {counted(words, 'word')}; say in three sentences why."
-        return asked.item("partial", says, "short")
-    return asked.item("right", f"Paragraph: {words} words, for your instructor to read.")
+        return asked.item("partial", _say("short", words=counted(words, "word")), "short")
+    return asked.item("right", _say("paragraph", words=words))
 
 
 # --- judging one number ---------------------------------------------------------------------------
@@ -749,49 +720,34 @@ def _judge(
     asked: _Question,
     claim: float,
     found: float,
-    tolerance: float,
+    tolerance: float | None,
     mistakes: Callable[[], Iterator[_Mistake]],
 ) -> Item:
-    """A claimed number beside what the raw depths say; the mistake that explains it best counts."""
-    tolerance += _rounding(asked.topic, claim) - _half_digit(asked.topic)
-    off = abs(claim - found) / tolerance
-    accepted = _accepted(asked.topic, tolerance)
-    return _verdict(asked, claim, found, off, tolerance, accepted, mistakes)
+    """A claimed number beside what the raw depths say: right, explained, close or wrong; the
+    mistake that explains it best counts.
 
-
-def _judge_error(
-    asked: _Question, claim: float, found: float, mistakes: Callable[[], Iterator[_Mistake]]
-) -> Item:
-    """A standard error, which is itself known to a part only: its ratio to what is found counts."""
-    rule = grading_rules()["tolerance"]
-    factor = 1 + rule["standard_errors"] * rule["error_of_an_error"]
-    off = abs(math.log(claim / found)) / math.log(factor) if claim > 0 < found else math.inf
-    if abs(claim - found) <= _rounding(asked.topic, claim):
-        off = 0.0
-    accepted = f"up to {factor:.2g} times as much or as little is accepted"
-    return _verdict(asked, claim, found, off, (factor - 1) * found, accepted, mistakes)
-
-
-def _verdict(
-    asked: _Question,
-    claim: float,
-    found: float,
-    off: float,
-    tolerance: float,
-    accepted: str,
-    mistakes: Callable[[], Iterator[_Mistake]],
-) -> Item:
-    """Right, explained, close or wrong; off: in units of what is accepted."""
-    shown = [_shown(asked.topic, value) for value in (claim, found)]
-    says = SAYS["compared"].format(asked.name, *shown, accepted)
+    tolerance: None for a standard error, which is itself known to a part only: there the ratio to
+    what is found counts.
+    """
+    topic, rule = asked.topic, grading_rules()["tolerance"]
+    if tolerance is None:
+        factor = 1 + rule["standard_errors"] * rule["error_of_an_error"]
+        off = abs(math.log(claim / found)) / math.log(factor) if claim > 0 < found else math.inf
+        off = 0.0 if abs(claim - found) <= _rounding(topic, claim) else off
+        tolerance, accepted = (factor - 1) * found, _say("factor", factor=factor)
+    else:
+        tolerance += _rounding(topic, claim) - _half_digit(topic)
+        off, accepted = abs(claim - found) / tolerance, _accepted(topic, tolerance)
+    facts = {"claim": _shown(topic, claim), "found": _shown(topic, found), "accepted": accepted}
+    says = _say("compared", what=asked.name, **facts)
     answer = partial(asked.item, tolerance=tolerance)
     if off <= 1:
         return answer("right", f"{says}: right.")
     mistake = _explanation(asked, claim, found, tolerance, mistakes())
     if mistake is not None:
-        says, code = f"{says}: wrong because {mistake.why(asked.topic)}.", mistake.key
+        says, code = f"{says}: wrong because {mistake.why(topic)}.", mistake.key
         return answer("partial", says, code.partition(".")[0])
-    if off <= grading_rules()["tolerance"]["near"]:
+    if off <= rule["near"]:
         return answer("partial", f"{says}: close, but not within that.", "close")
     size = "large" if claim > found else "small"
     return answer("wrong", f"{says}: wrong because it is too {size}.")
@@ -812,7 +768,7 @@ def _explanation(
         value, off = mistake.value, abs(claim - mistake.value)
         within = max(mistake.within, EXPLAINED_WITHIN * abs(value))
         if abs(value - found) < max(2 * tolerance, NEAR_RIGHT * abs(found)):
-            coarse = _written(claim) > COARSE * abs(value)
+            coarse = _last_digit(claim) > COARSE * abs(value)
             within = 0.0 if coarse else max(_half_digit(topic), EXACTLY * abs(value))
         if off <= within and off < least:
             best, least = mistake, off
@@ -821,8 +777,7 @@ def _explanation(
 
 def _unknown(asked: _Question, claim: float) -> Item:
     """A claim about what the raw depths do not give."""
-    said = _shown(asked.topic, claim)
-    says = f"{asked.name}: you say {said}, but your raw depths do not give it."
+    says = _say("unknown", what=asked.name, claim=_shown(asked.topic, claim))
     return asked.item("wrong", says)
 
 
@@ -837,9 +792,9 @@ def _tolerance(topic: str, se: float) -> float:
     return float(grading_rules()["tolerance"]["standard_errors"] * se + _half_digit(topic))
 
 
-def _written(claim: float) -> float:
+def _last_digit(number: float) -> float:
     """Half a unit of the last digit with which a number is written."""
-    return 0.5 * 10.0 ** int(Decimal(repr(float(claim))).as_tuple().exponent)
+    return 0.5 * 10.0 ** int(Decimal(repr(float(number))).as_tuple().exponent)
 
 
 def _rounding(topic: str, claim: float) -> float:
@@ -849,7 +804,7 @@ def _rounding(topic: str, claim: float) -> float:
         return _half_digit(topic)
     first = math.floor(math.log10(abs(claim)))
     most = 0.5 * 10.0 ** (first - (topic not in ONE_DIGIT))
-    return max(_half_digit(topic), min(_written(claim), most))
+    return max(_half_digit(topic), min(_last_digit(claim), most))
 
 
 def _log_se(law: NoiseFit, i: int, widened: bool = True) -> float:

@@ -22,34 +22,17 @@ from coursekit.cameras import Camera, Frames
 from coursekit.checks import want
 from coursekit.lessons import questions
 from coursekit.stereo import NoiseFit
-from coursekit.submission.format import (
-    CameraFacts,
-    Claims,
-    Conclusion,
-    Outcome,
-    Plot,
-    Refused,
-    Stack,
-    Submission,
-    TableRow,
-    bundle_bytes,
-    read_bundle,
-    slug,
-)
+from coursekit.submission import format as bundle
 from coursekit.submission.rubric import shortcomings
-from coursekit.words import counted
+from coursekit.words import counted, say
 
 MEASURED = "studio_1.measured"  # in results/
 LESSON_PREFIX = "depth_noise."  # of its checkpoints and exercises
-COLUMNS = [field.name for field in fields(TableRow)][1:]  # of one's own table
+COLUMNS = [field.name for field in fields(bundle.TableRow)][1:]  # of one's own table
+CAMERA_FACTS = ("name", "serial", "source", "baseline_m", "depth_scale_m")
 IN_MM = {"mm": 1.0, "m": 1e3}  # units of a std, and what one of them is in mm
 NOBODY = "nobody"  # stands in for a name while there is none
 Table = Mapping[float, Sequence[float | None]]
-
-MEASURE_FIRST = (
-    "The studio exercise is not measured yet: run the studio cells of notebook 02 (with a camera, "
-    "a set of recordings or the simulated one), up to the one that keeps the measurement."
-)
 
 
 class CannotHandIn(ValueError):
@@ -64,7 +47,7 @@ def _in_one_line() -> Iterator[None]:
     """ValueErrors become `CannotHandIn`."""
     try:
         yield
-    except Refused as refused:  # what is wrong; the cure is for whoever grades
+    except bundle.Refused as refused:  # what is wrong; the cure is for whoever grades
         raise CannotHandIn(refused.wrong) from refused
     except ValueError as error:
         raise CannotHandIn(str(error)) from error
@@ -89,26 +72,27 @@ class Handed:
         return questions.Verdict("submit", kind, self.headline, self.says)._repr_html_()  # type: ignore[arg-type]
 
 
-def stack(frames: Frames, window: tuple[int, int, int, int], distance_m: float) -> Stack:
+def stack(frames: Frames, window: tuple[int, int, int, int], distance_m: float) -> bundle.Stack:
     """The raw depth of frames in a window (left, top, width, height) px, and their times.
 
     distance_m: of what the frames show, by tape. What a bundle cannot hold is said by `keep`.
     """
     left, top, width, height = window
     counts = frames.depth[:, top : top + height, left : left + width].copy()
-    return Stack(distance_m, window, counts, np.array([frame.time_s for frame in frames], float))
+    times = np.array([frame.time_s for frame in frames], float)
+    return bundle.Stack(distance_m, window, counts, times)
 
 
 def measured(
     camera: Camera,
-    stacks: Iterable[Stack],
+    stacks: Iterable[bundle.Stack],
     quantities: Mapping[str, results.Quantity],
     fit: NoiseFit,
     predicted_mm: Sequence[float] | None,
     tape_sigma_m: float,
     caliper_m: float,
     table: Table | None = None,
-) -> Submission:
+) -> bundle.Submission:
     """A measured studio exercise, still without a name and a conclusion.
 
     stacks: one a distance. quantities: what notebook 02 measured; the figure takes from it
@@ -127,25 +111,19 @@ def measured(
     if fit.baseline_m is not None:  # else there is no disparity
         sigma_d, interval = fit.sigma_d_px, fit.sigma_d_interval_px
     stds = tuple(std for z in at if (std := _std_mm(z, quantities)) is not None)
-    figure = Plot(at, stds, predicted) if len(stds) == len(stacks) else None
-    return Submission(
+    facts = {name: getattr(camera, name) for name in CAMERA_FACTS} | asdict(camera.depth)
+    figure = bundle.Plot(at, stds, predicted) if len(stds) == len(stacks) else None
+    return bundle.Submission(
         student=NOBODY,
         made=results.now(),
         versions=results.versions(),
-        camera=CameraFacts(
-            name=camera.name,
-            serial=camera.serial,
-            source=camera.source,
-            **asdict(camera.depth),
-            baseline_m=camera.baseline_m,
-            depth_scale_m=camera.depth_scale_m,
-        ),
+        camera=bundle.CameraFacts(**facts),
         tape_sigma_m=tape_sigma_m,
         caliper_m=caliper_m,
         stacks=stacks,
-        claims=Claims(rows, sigma_d, interval, free, fit.exponent_interval),
+        claims=bundle.Claims(rows, sigma_d, interval, free, fit.exponent_interval),
         plot=figure,
-        conclusion=Conclusion(),
+        conclusion=bundle.Conclusion(),
         outcomes={},
     )
 
@@ -158,7 +136,7 @@ def keep(*arguments: Any, **named: Any) -> Path:
     The arguments are those of `measured`, and so are the errors; nothing is written then.
     """
     path, kept = results.folder() / MEASURED, measured(*arguments, **named)
-    results.write_bytes(path, bundle_bytes(kept))
+    results.write_bytes(path, bundle.bundle_bytes(kept))
     return path
 
 
@@ -192,7 +170,7 @@ def submit(
         frames = int(frames)
     kept = load_measured()
     if kept is None:
-        return Handed(None, MEASURE_FIRST)
+        return Handed(None, say("submission.measure_first"))
     claims, plot = replace(kept.claims, mismatches=mismatches), kept.plot
     if table is not None:
         claims = replace(claims, rows=_own_rows([s.distance_m for s in kept.stacks], table))
@@ -205,31 +183,28 @@ def submit(
         plot=plot,
         student=name or NOBODY,
         made=results.now(),
-        conclusion=Conclusion(distance_m, frames, dominates, (paragraph or "").strip()),
+        conclusion=bundle.Conclusion(distance_m, frames, dominates, (paragraph or "").strip()),
         outcomes=outcomes(),
     )
-    data = bundle_bytes(whole)  # Refused for what no bundle can hold
+    data = bundle.bundle_bytes(whole)  # Refused for what no bundle can hold
     path = (Path(folder) if folder else results.folder()) / bundle_name(name)
     says = shortcomings(whole)
     if name and path.exists() and not overwrite:
-        there = f"{relative(path)} is there already and stays as it is, with what you said before. "
-        there += "To replace it: `overwrite=True` (or --overwrite)."
-        there += " Of what you say now the grader would say:" if says else ""
+        would = " Of what you say now the grader would say:" if says else ""
+        there = say("submission.there_already", file=relative(path), would=would)
         return Handed(None, there, says)
     if not name:
-        headline = "Nothing is written yet: a bundle needs your name (`student`)."
-        headline += " This is what the grader would say:" if says else ""
-        return Handed(None, headline, says)
+        would = " This is what the grader would say:" if says else ""
+        return Handed(None, say("submission.no_name", would=would), says)
     results.write_bytes(path, data)
-    measured_with = f"{counted(len(whole.stacks), 'distance')} with {whole.camera.name}"
-    headline = f"Wrote {relative(path)}, {measured_with}: hand in this one file. "
-    headline += "What the grader will say is missing or weak:" if says else ""
-    return Handed(path, headline + "The grader misses nothing in it." * (not says), says)
+    facts = {"file": relative(path), "at": counted(len(whole.stacks), "distance")}
+    weak = "submission.wrote_weak" if says else "submission.wrote"
+    return Handed(path, say(weak, camera=whole.camera.name, **facts), says)
 
 
 def bundle_name(student: str) -> str:
     """The file name of a student's bundle: letters and digits of the name, nothing else."""
-    return f"studio_1_{slug(student)}.zip"
+    return f"studio_1_{bundle.slug(student)}.zip"
 
 
 def relative(path: Path) -> str:
@@ -240,16 +215,16 @@ def relative(path: Path) -> str:
     return f"{path.resolve().parent.name}/{path.name}"
 
 
-def outcomes() -> dict[str, Outcome]:
+def outcomes() -> dict[str, bundle.Outcome]:
     """How the checkpoints and exercises of notebook 02 stand that were attempted, by name."""
     return {
-        name: Outcome(any(a.get("kind") == "right" for a in attempts), len(attempts))
+        name: bundle.Outcome(any(a.get("kind") == "right" for a in attempts), len(attempts))
         for name, attempts in questions.read_attempts().items()
         if name.startswith(LESSON_PREFIX)
     }
 
 
-def load_measured() -> Submission | None:
+def load_measured() -> bundle.Submission | None:
     """What `keep` wrote, without a name and a conclusion; None if there is nothing.
 
     Raises ValueError for a damaged file.
@@ -258,8 +233,8 @@ def load_measured() -> Submission | None:
     if not path.exists():
         return None
     try:
-        return read_bundle(path)
-    except Refused as error:
+        return bundle.read_bundle(path)
+    except bundle.Refused as error:
         raise ValueError(
             f"{path.name}: {error} Run the studio cells of notebook 02 again."
         ) from error
@@ -277,16 +252,16 @@ def _std_mm(distance_m: float, quantities: Mapping[str, results.Quantity]) -> fl
     return IN_MM[std.unit] * std.value
 
 
-def _own_rows(distances_m: Sequence[float], table: Table) -> tuple[TableRow, ...]:
+def _own_rows(distances_m: Sequence[float], table: Table) -> tuple[bundle.TableRow, ...]:
     """The student's own numbers; what is None, or not there, is left out."""
     want(isinstance(table, Mapping), "table", table, "{0.30: (five numbers), ...}")
     five = "five: bias, its standard error, std, its standard error (mm), invalid part"
-    rows = {z: TableRow(z) for z in distances_m}
+    rows = {z: bundle.TableRow(z) for z in distances_m}
     for z, numbers in table.items():
         want(z in rows, "table", z, f"one of the distances {', '.join(f'{d:g}' for d in rows)}")
         several = isinstance(numbers, (tuple, list, np.ndarray)) and len(numbers) == len(COLUMNS)
         want(several, f"table at {z:g} m", numbers, five)
-        rows[z] = TableRow(z, *numbers)
+        rows[z] = bundle.TableRow(z, *numbers)
     return tuple(rows.values())
 
 
