@@ -579,7 +579,7 @@ class Screen:
 
 
 class LiveImage(Screen):
-    """A widget: the image with what is seen, taken and wanted drawn into it, and words below."""
+    """A widget: the image with what is seen, taken and wanted drawn into it, and words above."""
 
     def __init__(self, board: Board, lens: Intrinsics, views: int) -> None:
         import ipywidgets
@@ -589,7 +589,7 @@ class LiveImage(Screen):
         self._image = ipywidgets.Image(format="jpeg", value=_jpeg(np.zeros((48, 64, 3), np.uint8)))
         self._image.layout.max_width = "100%"
         self._words = ipywidgets.HTML("Waiting for the first image ...")
-        self._box = ipywidgets.VBox([self._image, self._words])
+        self._box = ipywidgets.VBox([self._words, self._image])
 
     def say(self, text: str) -> None:
         self._said = text
@@ -606,6 +606,8 @@ class LiveImage(Screen):
 
     def close(self) -> None:
         """The last image stays."""
+        legend = "The last image. Rings: the board; dots: the views before it."
+        self._words.value = f"{html.escape(self._said)} {legend}"
 
     def __repr__(self) -> str:
         return "The live image appears here while the cell runs."

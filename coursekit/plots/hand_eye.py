@@ -27,6 +27,7 @@ from coursekit.simulation.arm_poses import Setup
 from coursekit.words import say
 
 VIEW_M = 0.16  # how far the camera's pyramid is drawn
+AXES_M = 0.12  # the gripper's, as drawn
 SPACE_M = ((-0.30, 0.66), (-0.36, 0.36), (0.0, 0.84))  # x, y, z of the base that is shown
 CLEAR_PX = 13.0  # around a letter
 
@@ -43,7 +44,7 @@ def mounts(
     fig.set_layout_engine("none")  # the 3-D axes reserve far more room than they use
     texts = []
     for k, (name, setup) in enumerate(setups.items()):
-        ax: Any = fig.add_axes((k / len(setups), 0.0, 0.98 / len(setups), 1.0), projection="3d")
+        ax: Any = fig.add_axes((k / len(setups), 0.0, 0.96 / len(setups), 1.0), projection="3d")
         limits = dict(zip(("xlim", "ylim", "zlim"), SPACE_M, strict=True))
         ax.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)", **limits)
         ax.set_box_aspect(np.ptp(SPACE_M, axis=1), zoom=0.96)
@@ -64,6 +65,10 @@ def _rig(ax: Any, setup: Setup, q: Floats) -> dict[str, float]:
     links = setup.arm.link_frames(q)[:, :3, 3]
     chain = np.concatenate([np.zeros((1, 3)), links, gripper[None, :3, 3]])
     ax.plot(*chain.T, "o-", color=COLORS["block"], lw=5, ms=7)
+    axes = transform_points(gripper, AXES_M * np.kron(np.eye(3), [[0], [1]])).reshape(3, 2, 3)
+    for axis, line in zip("xyz", axes, strict=True):
+        ax.plot(*line.T, color=COLORS["ink"], lw=1.2)
+        ax.text(*line[1], axis, fontsize=9)
     rim = transform_points(board, setup.board.outline)
     sheet = rim[[[0, 1], [3, 2]]]
     ax.plot_surface(*np.moveaxis(sheet, 2, 0), color=COLORS["cube"], alpha=0.5, shade=False)
@@ -80,8 +85,8 @@ def _rig(ax: Any, setup: Setup, q: Floats) -> dict[str, float]:
         "C": (camera, board, "truth"),
     }
     ends = [np.stack([start[:3, 3], end[:3, 3]]) for start, end, _ in arrows.values()]
-    taken = [_on_page(ax, line) for line in (chain, rim[[0, 1, 2, 3, 0]], view, *ends)]
-    for (name, (*_, color)), line in zip(arrows.items(), taken[3:], strict=True):
+    taken = [_on_page(ax, line) for line in (chain, rim[[0, 1, 2, 3, 0]], view, *axes, *ends)]
+    for (name, (*_, color)), line in zip(arrows.items(), taken[-3:], strict=True):
         place = _arrow(ax, name, line[0], line[-1], COLORS[color], np.concatenate(taken))
         taken.append(place)
     lengths = [float(np.linalg.norm(end - start)) for start, end in ends]
