@@ -138,7 +138,7 @@ class RosBag(Camera):
     def stream(self) -> Generator[Frame, None, None]:
         others: dict[str, list[_Shot]] = {name: [] for name in self._names.values()}
         waiting = others.pop("depth")
-        need(not self._closed, "closed", what=self._what)
+        need(not self._closed, "cameras.closed", what=self._what)
         with self._reader() as reader:
             for name, shot in self._shots(reader):
                 (waiting if name == "depth" else others[name]).append(shot)

@@ -28,7 +28,7 @@ class CameraError(RuntimeError):
 def need(holds: object, sentence: str, /, **facts: Any) -> None:
     """CameraError with a sentence of texts.toml and the facts in it, unless the condition holds."""
     if not holds:
-        raise CameraError(say(f"cameras.{sentence}", **facts))
+        raise CameraError(say(sentence, **facts))
 
 
 class Description:

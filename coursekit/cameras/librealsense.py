@@ -55,7 +55,7 @@ def connected_realsenses() -> dict[str, str]:
     except RuntimeError as error:
         raise CameraError(start_problem("the RealSense", error)) from error
     found.pop("", None)  # a device in recovery mode has no serial number
-    need(found or not _realsense_on_usb(), "not_permitted", udev=UDEV_ADVICE)
+    need(found or not _realsense_on_usb(), "cameras.not_permitted", udev=UDEV_ADVICE)
     return found
 
 

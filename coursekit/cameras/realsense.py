@@ -67,7 +67,7 @@ class RealSense(Camera):
     def _start(self) -> None:
         """Start streaming."""
         with self._running.turn:
-            need(not self._running.left, "closed_meanwhile", what=self._what)
+            need(not self._running.left, "cameras.closed_meanwhile", what=self._what)
             try:
                 pipeline = self._rs.pipeline()
                 self._profile = pipeline.start(self._config())
@@ -85,7 +85,7 @@ class RealSense(Camera):
         return config
 
     def _check_open(self) -> None:
-        need(self._running.pipeline, "closed", what=self._what)
+        need(self._running.pipeline, "cameras.closed", what=self._what)
 
     def _depth_sensor(self) -> Any:
         return self._profile.get_device().first_depth_sensor()
@@ -139,7 +139,7 @@ class RealSense(Camera):
             except RuntimeError as error:
                 stopped = f"{self._what} stopped giving frames ({error})"
                 raise CameraError(f"{stopped}: {say('cameras.unplugged')}") from error
-            need(arrived is not None, "closed_meanwhile", what=self._what)
+            need(arrived is not None, "cameras.closed_meanwhile", what=self._what)
             if arrived:
                 return images
         silent = f"no frame came from {self._what} for {MOST_POLLS * POLL_MS / 1000:g} s"

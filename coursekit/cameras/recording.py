@@ -39,17 +39,17 @@ SAME_PLACE_M = 0.0005  # distances closer than this are one place
 
 def check_recording(path: Path) -> None:
     """CameraError with what to do when `path` is no recording."""
-    need(path.suffix in FILE_STARTS, "no_recording", path=path)
-    need(path.exists(), "no_file", path=path)
-    need(path.is_file(), "no_plain_file", path=path)
+    need(path.suffix in FILE_STARTS, "cameras.no_recording", path=path)
+    need(path.exists(), "cameras.no_file", path=path)
+    need(path.is_file(), "cameras.no_plain_file", path=path)
     try:
         with path.open("rb") as file:
             start = file.read(16)
     except OSError as error:
         raise CameraError(say("cameras.not_read", path=path, error=error.strerror)) from error
-    need(start, "empty_file", path=path)
+    need(start, "cameras.empty_file", path=path)
     same = start.startswith(FILE_STARTS[path.suffix])
-    need(same, "other_file", path=path, suffix=path.suffix)
+    need(same, "cameras.other_file", path=path, suffix=path.suffix)
 
 
 def without_depth(path: Path, topics: Sequence[str]) -> CameraError:
@@ -162,7 +162,7 @@ def _publish(unfinished: Path, target: Path, given: int) -> None:
     """Give a finished recording its name, once all its frames are found in it."""
     written = len(depth_frame_numbers(unfinished))
     # librealsense does not say when it cannot write
-    need(written >= given, "not_written", written=written, given=given, target=target)
+    need(written >= given, "cameras.not_written", written=written, given=given, target=target)
     try:
         os.replace(unfinished, target)
     except OSError as error:
@@ -293,7 +293,7 @@ class Index:
     def read(cls, folder: Path) -> Index:
         """The index of a set; CameraError for a folder without one, and for a damaged one."""
         path = folder / INDEX
-        need(path.exists(), "no_index", folder=folder, intrinsics=INTRINSICS)
+        need(path.exists(), "cameras.no_index", folder=folder, intrinsics=INTRINSICS)
         try:
             scenes = [RecordedScene(**entry) for entry in results.read_json(path)["scenes"]]
             for scene in scenes:

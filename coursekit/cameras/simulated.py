@@ -193,7 +193,7 @@ class SimulatedCamera(Camera):
         return np.repeat(grey[..., None], 3, axis=2)
 
     def _check_open(self) -> None:
-        need(not self._closed, "closed", what=f"the {self.name}")
+        need(not self._closed, "cameras.closed", what=f"the {self.name}")
 
     def _start_afresh(self) -> None:
         """Start the named stream of random numbers, and the drift at a moment that it names."""
