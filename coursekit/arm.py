@@ -52,16 +52,6 @@ CAMERA_RADIUS_M = 0.02
 ARM_RADIUS_M = 0.05
 # Inverse kinematics: damped Gauss-Newton steps from several starts, joint_0 turned to the target.
 IK_STEPS, IK_DAMPING, IK_STEP_RAD, IK_TOLERANCE = 40, 1e-4, 0.4, 1e-9
-IK_STARTS = (
-    (0.0, 1.2, 1.0, 0.3, 0.0, 0.0),
-    (0.0, 1.6, 1.6, -0.9, 0.0, 0.0),
-    (0.0, 1.0, 1.3, 1.0, 0.0, 0.0),
-    (0.0, 2.0, 1.8, 0.5, 0.0, 0.0),
-    (0.0, 1.2, 1.0, 0.0, 0.7, 1.2),
-    (0.0, 1.2, 1.0, 0.0, -0.7, -1.2),
-    (0.5, 1.4, 1.4, -0.5, -0.5, 2.2),
-    (-0.5, 1.4, 1.4, -0.5, 0.5, -2.2),
-)
 IK_MORE_STARTS = 16  # all over the joints' ranges, always the same ones
 
 
@@ -72,7 +62,8 @@ class Arm:
     joints: their names. origins (6, 4, 4): each joint's frame in its parent's at angle zero, m.
     axes (6, 3): unit vectors in the joint's own frame. limits (6, 2): lower and upper, rad.
     T_flange_gripper, T_gripper_camera (4, 4), m: the gripper in the flange (`link_6`), and the
-    camera's colour optical frame in the gripper. The table is the plane z = 0 of the base.
+    camera's colour optical frame in the gripper. starts (n, 6), rad: where `inverse` begins. The
+    table is the plane z = 0 of the base.
     """
 
     name: str
@@ -82,6 +73,7 @@ class Arm:
     limits: Floats
     T_flange_gripper: Floats
     T_gripper_camera: Floats
+    starts: Floats
 
     def forward(self, q: ArrayLike, tool: Tool = "gripper") -> Floats:
         """T_base_gripper (..., 4, 4), or T_base_flange, at joint angles q (..., 6), rad.
@@ -197,7 +189,7 @@ class Arm:
             low, high = self.limits.T
             more = np.random.default_rng(0).uniform(low, high, (IK_MORE_STARTS, 6))
             more *= [0.5, 1.0, 1.0, 1.0, 1.0, 1.0]  # joint_0 roughly towards the target
-            starts += [*np.array(IK_STARTS), *more]
+            starts += [*self.starts, *more]
         if start is not None:
             starts.insert(0, np.broadcast_to(_angles(start), (*shape, 6)).reshape(-1, 6))
         towards = np.arctan2(targets[:, 1, 3], targets[:, 0, 3])
@@ -264,6 +256,7 @@ def widowx() -> Arm:
         np.array([joint["limit_rad"] for joint in joints], dtype=np.float64),
         T_flange_gripper,
         invert_transform(T_flange_gripper) @ _chain(table["camera"]),
+        np.array(table["inverse_starts_rad"]),
     )
     for value in vars(arm).values():
         if isinstance(value, np.ndarray):

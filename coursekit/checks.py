@@ -40,6 +40,12 @@ def want(holds: object, name: str, got: object, wanted: str) -> None:
         raise ValueError(f"{name}: got {shown(got)}, want {wanted}")
 
 
+def refuse(fault: object, sentence: str) -> None:
+    """ValueError with this sentence where there is a fault."""
+    if fault:
+        raise ValueError(sentence)
+
+
 def settle(thing: object, **fields: object) -> None:
     """Set fields of a frozen dataclass as they were checked, in its `__post_init__`."""
     for name, value in fields.items():
@@ -140,22 +146,18 @@ def covariance(name: str, value: ArrayLike, size: int) -> Floats:
 def transforms(name: str, value: ArrayLike, tolerance: float = ROTATION_TOLERANCE) -> Floats:
     """`value` as rigid transforms (..., 4, 4); the message names the first that is none."""
     T = array(name, value, (4, 4), leading=True)
-    if not np.isfinite(T).all():
-        raise ValueError(f"{name}: has NaN or infinite entries")
+    refuse(not np.isfinite(T).all(), f"{name}: has NaN or infinite entries")
     if not np.allclose(T[..., 3, :], [0, 0, 0, 1], atol=1e-9):
         raise ValueError(f"{name}: the last row must be (0, 0, 0, 1); is the matrix transposed?")
     R = T[..., :3, :3]
     off = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(initial=0.0)
-    if off > tolerance:
-        raise ValueError(f"{name}: the rotation is not orthonormal (R R^T is off by {off:.1e})")
-    if (np.linalg.det(R) < 0).any():
-        raise ValueError(f"{name}: the rotation has determinant -1, a reflection")
+    refuse(off > tolerance, f"{name}: the rotation is not orthonormal (R R^T is off by {off:.1e})")
+    refuse((np.linalg.det(R) < 0).any(), f"{name}: the rotation has determinant -1, a reflection")
     return T
 
 
 def transform(name: str, value: ArrayLike) -> Floats:
     """`value` as one rigid transform (4, 4)."""
     T = transforms(name, value)
-    if T.ndim != 2:
-        raise ValueError(f"{name}: got shape {T.shape}, want one (4, 4) transform")
+    refuse(T.ndim != 2, f"{name}: got shape {T.shape}, want one (4, 4) transform")
     return T

@@ -12,7 +12,7 @@ import io
 import re
 import sys
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -29,12 +29,8 @@ from coursekit.words import Estimate, Findings, say, wrapped
 SHOWN = 1  # reason, the commonest, for which images were not used
 NOT_TRUSTED = 3  # the exit code; what was found is written nevertheless
 
-OPTIONS = {"path": "--out", "n": "--frames", "which": "--camera", "distance_m": "--distance"}
-OPTIONS |= {f"{name}_m": f"--{name}-mm (here in m)" for name in ("square", "marker")}
-OPTIONS |= {"detections": "photographs", "images": "photographs", "intrinsics": "--lens"}
-OPTIONS |= {name: f"--{name}" for name in ("squares", "paper", "dictionary", "workers", "timeout")}
 COMMANDS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
-INSTEAD = COMMANDS.pop("instead")
+INSTEAD, OPTIONS = COMMANDS.pop("instead"), COMMANDS.pop("arguments")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -226,23 +222,10 @@ def _doctor(options: argparse.Namespace) -> int:
     return doctor.run(options.camera, options.json)
 
 
-TYPES = {
-    "int": int,
-    "float": float,
-    "lower": str.lower,
-    "moment": datetime.fromisoformat,
-    "squares": _squares,
-}
-RUN: dict[str, Callable[[argparse.Namespace], int | None]] = {
-    "calibrate": _calibrate,
-    "hand-eye": _hand_eye,
-    "record": _record,
-    "board": _board,
-    "submit": _submit,
-    "grade": _grade,
-    "export": _export,
-    "doctor": _doctor,
-}
+TYPES = {"int": int, "float": float, "lower": str.lower, "squares": _squares}
+TYPES |= {"moment": datetime.fromisoformat}
+RUNS = (_calibrate, _hand_eye, _record, _board, _submit, _grade, _export, _doctor)
+RUN = {run.__name__[1:].replace("_", "-"): run for run in RUNS}  # by the command's name
 
 
 if __name__ == "__main__":

@@ -27,21 +27,16 @@ import textwrap
 import time
 import tomllib
 import webbrowser
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 Condition = Literal["ok", "note", "problem"]
 
 OLDEST, NEWEST_TESTED, TOO_NEW = (3, 11), (3, 13), (3, 15)
 PINS = Path(__file__).resolve().parents[1] / "requirements.txt"
-WITHOUT_PACKAGES = {  # how it is called, and the Python that runs there all the same
-    ("win32", "ARM64"): ("Windows on ARM", "the Python for x86-64"),
-    ("darwin", "x86_64"): ("Intel processors under macOS", "on Apple silicon the arm64 Python"),
-}
 LOADED = ("numpy", "scipy", "cv2", "numba", "matplotlib", "ipywidgets")
 UDEV_FOLDERS = tuple(map(Path, ("/etc/udev/rules.d", "/usr/lib/udev/rules.d", "/lib/udev/rules.d")))
 LEAST_FREE_BYTES = 100_000_000  # results, recordings, bundles
@@ -73,11 +68,11 @@ class CheckUp:
     def __str__(self) -> str:
         head = f"{self.verdict:8} {self.check:12} "
         blank = " " * len(head)
-        text = textwrap.fill(self.says, LINE_WIDTH, initial_indent=head, subsequent_indent=blank)
-        if not self.remedy:
-            return text
-        return f"{text}\n" + textwrap.fill(
-            self.remedy, LINE_WIDTH, initial_indent=f"{blank}-> ", subsequent_indent=f"{blank}   "
+        parts = ((self.says, head, blank), (self.remedy, f"{blank}-> ", f"{blank}   "))
+        return "\n".join(
+            textwrap.fill(text, LINE_WIDTH, initial_indent=first, subsequent_indent=later)
+            for text, first, later in parts
+            if text
         )
 
 
@@ -100,21 +95,21 @@ def run(camera: str = "auto", as_json: bool = False) -> int:
     camera: what `open_camera` takes: "auto", "simulated", a serial number or a recording. as_json:
     one object for programs instead, when all are made.
     """
-    if as_json:
-        lines = list(checks(camera))
-        print(json.dumps({"coursekit": edition(), "checks": list(map(asdict, lines))}, indent=1))
-        return int(any(line.verdict == "problem" for line in lines))
     if isinstance(sys.stdout, io.TextIOWrapper):  # a pipe on Windows cannot show every letter
         sys.stdout.reconfigure(errors="replace")
-    verdicts = Counter[Condition]()
+    lines = []
     for line in checks(camera):
-        print(line, flush=True)
-        verdicts[line.verdict] += 1
-    if problems := verdicts["problem"]:
+        lines.append(line)
+        if not as_json:
+            print(line, flush=True)
+    problems = sum(line.verdict == "problem" for line in lines)
+    if as_json:
+        print(json.dumps({"coursekit": edition(), "checks": list(map(asdict, lines))}, indent=1))
+    elif problems:
         print(f"\n{problems} problem{'s' * (problems > 1)}: do what stands there, and ask again.")
-        return 1
-    print("\nNothing is in the way. `python3 course.py lab` opens the notebooks.")
-    return 0
+    else:
+        print("\nNothing is in the way. `python3 course.py lab` opens the notebooks.")
+    return int(problems > 0)
 
 
 def checks(camera: str = "auto") -> Iterator[CheckUp]:
@@ -138,8 +133,8 @@ def _named(name: str, check: Check, *about: Any) -> Iterator[CheckUp]:
 
 
 def _python() -> CheckUp:
-    computer, running = (sys.platform, platform.machine()), sys.version_info
-    lacks, runs = WITHOUT_PACKAGES.get(computer, ("", ""))
+    computer, running = f"{sys.platform} {platform.machine()}", sys.version_info
+    lacks, runs = DOCTOR_TEXTS["without_packages"].get(computer, ("", ""))
     faults = {
         "python_old": running < OLDEST,
         "python_32": sys.maxsize < 2**32,
@@ -163,33 +158,25 @@ def edition() -> str:
     return f"{_version('coursekit') or 'not installed'}{commit and ', commit '}{commit}"
 
 
-class Pin(NamedTuple):
-    """One package of requirements.txt; marker: where it is wanted, empty for everywhere."""
+def pins(path: Path) -> list[Any]:
+    """The packages that a requirements file pins, each a `Requirement`, in its order."""
+    from packaging.requirements import Requirement
 
-    name: str
-    version: str
-    marker: str
-
-
-def pins(path: Path) -> list[Pin]:
-    """The packages that a requirements file pins, in its order."""
-    pattern = re.compile(r"^([\w.-]+)==([^\s;\\]+)\s*(?:;\s*([^\\]+?))?\s*\\?$")
-    matches = map(pattern.match, path.read_text(encoding="utf-8").splitlines())
-    return [Pin(m[1], m[2], m[3] or "") for m in matches if m]
+    lines = path.read_text(encoding="utf-8").splitlines()
+    return [Requirement(line.rstrip("\\ ")) for line in lines if re.match(r"[\w.-]+==", line)]
 
 
 def _packages() -> Iterator[CheckUp]:
-    from packaging.markers import Marker
-
     if not PINS.exists():
         yield found("no_pins", file=PINS.name)
         return
-    wanted = [pin for pin in pins(PINS) if not pin.marker or Marker(pin.marker).evaluate()]
-    there = {pin.name: _version(pin.name) for pin in wanted}
+    here = (pin for pin in pins(PINS) if pin.marker is None or pin.marker.evaluate())
+    tested = {pin.name: str(pin.specifier).removeprefix("==") for pin in here}
+    there = {name: _version(name) for name in tested}
     others = [
-        f"{pin.name} {there[pin.name]} (tested with {pin.version})"
-        for pin in wanted
-        if there[pin.name] not in (pin.version, "")
+        f"{name} {version} (tested with {tested[name]})"
+        for name, version in there.items()
+        if version not in (tested[name], "")
     ]
     missing = [name for name, version in there.items() if not version]
     faults = {"missing": missing, "unsuited": _out_of_range(), "others": others}
@@ -198,7 +185,7 @@ def _packages() -> Iterator[CheckUp]:
             more = f" and {len(names) - MOST_PACKAGES} more" if len(names) > MOST_PACKAGES else ""
             yield found(what, names=", ".join(names[:MOST_PACKAGES]) + more)
     if not any(faults.values()):
-        yield found("pinned", count=len(wanted), file=PINS.name)
+        yield found("pinned", count=len(tested), file=PINS.name)
 
 
 def _version(name: str) -> str:
@@ -242,10 +229,8 @@ def _opencv() -> CheckUp:
     packages = sorted(set(metadata.packages_distributions().get("cv2", ())))
     good = len(packages) == 1 and _version(packages[0]).startswith(cv2.__version__)
     good &= hasattr(cv2, "calibrateHandEye")
-    brings = " and ".join(packages) or "no package"
-    return found(
-        "opencv", good, version=cv2.__version__, brings=brings, packages=" ".join(packages)
-    )
+    names = {"brings": " and ".join(packages) or "no package", "packages": " ".join(packages)}
+    return found("opencv", good, version=cv2.__version__, **names)
 
 
 def _kernel() -> CheckUp:
@@ -403,27 +388,18 @@ def _tested(which: str) -> Iterator[CheckUp]:
         yield from _named("Depth test", _depth_test, camera)
 
 
-def _depth_unit(camera: Any) -> CheckUp:
+def _length(camera: Any, what: str, tolerance: float) -> CheckUp:
+    """A length that the camera reports, beside that of its data sheet where the course has one."""
     from coursekit.cameras.realsense import specified
 
-    scale_m, device = camera.depth_scale_m, specified(camera.name)
+    length_m, device = getattr(camera, f"{what}_m"), specified(camera.name)
+    if length_m is None:
+        return found(f"no_{what}")
     if device is None:
-        return found("unknown_depth_unit", mm=1e3 * scale_m)
-    usual = device.nominal.depth_scale_m
-    good = abs(scale_m / usual - 1) < 1e-3
-    return found("depth_unit", good, mm=1e3 * scale_m, usual_mm=1e3 * usual, usual=usual)
-
-
-def _baseline(camera: Any) -> CheckUp:
-    from coursekit.cameras.realsense import specified
-
-    if camera.baseline_m is None:
-        return found("no_baseline")
-    mm, device = 1e3 * camera.baseline_m, specified(camera.name)
-    if device is None:
-        return found("unknown_baseline", mm=mm)
-    usual_mm = 1e3 * device.nominal.baseline_m
-    return found("baseline", abs(mm / usual_mm - 1) < 0.02, mm=mm, usual_mm=usual_mm)
+        return found(f"unknown_{what}", mm=1e3 * length_m)
+    usual = getattr(device.nominal, f"{what}_m")
+    good = abs(length_m / usual - 1) < tolerance
+    return found(what, good, mm=1e3 * length_m, usual_mm=1e3 * usual, usual=usual)
 
 
 def _matrix(k: Any) -> CheckUp:
@@ -435,8 +411,8 @@ def _matrix(k: Any) -> CheckUp:
 
 
 FIGURES: tuple[tuple[str, Check], ...] = (
-    ("Depth unit", _depth_unit),
-    ("Baseline", _baseline),
+    ("Depth unit", lambda camera: _length(camera, "depth_scale", 1e-3)),
+    ("Baseline", lambda camera: _length(camera, "baseline", 0.02)),
     ("K of depth", lambda camera: _matrix(camera.depth)),
     ("K of colour", lambda camera: _matrix(camera.color)),
 )
@@ -493,14 +469,12 @@ def _noise(frames: Any, camera: Any) -> CheckUp:
         return found("no_middle", invalid=stats.invalid_fraction)
     if stats.n_frames < LEAST_FRAMES_FOR_NOISE:
         return found("few_frames", count=stats.n_frames, wanted=TEST_FRAMES)
-    mm, depth, (low, high) = 1e3 * stats.pixel_std_m, stats.depth_m, USUAL_NOISE_PX
+    mm, depth = 1e3 * stats.pixel_std_m, stats.depth_m
     if camera.baseline_m is None:
         return found("noise_alone", mm=mm, depth=depth)
     disparity = camera.depth.fx * camera.baseline_m / depth
-    noise_px = disparity * stats.pixel_std_unrounded_m / depth
-    return found(
-        "noise", noise_px <= high, mm=mm, depth=depth, noise_px=noise_px, low=low, high=high
-    )
+    noise_px, usual = disparity * stats.pixel_std_unrounded_m / depth, USUAL_NOISE_PX
+    return found("noise", noise_px <= usual[1], mm=mm, depth=depth, noise_px=noise_px, usual=usual)
 
 
 if __name__ == "__main__":

@@ -55,9 +55,8 @@ class Intrinsics:
         model = SAME_MODEL.get(self.model, self.model)
         known = ", ".join(DISTORTION_MODELS)
         want(model in DISTORTION_MODELS, "model", model, f"one of {known}; {NO_OTHER}")
-        checks.settle(
-            self, model=model, coeffs=tuple(_coefficients("coeffs", self.coeffs).tolist())
-        )
+        coeffs = tuple(_coefficients("coeffs", self.coeffs).tolist())
+        checks.settle(self, model=model, coeffs=coeffs)
 
     @property
     def K(self) -> Floats:
@@ -163,8 +162,7 @@ class Intrinsics:
         known = cls.__dataclass_fields__.keys()
         given = instance("fields", fields, dict).keys()
         missing, unknown = sorted(known - {"model", "coeffs"} - given), sorted(given - known)
-        if missing or unknown:
-            raise ValueError(f"fields: missing {missing}, unknown {unknown}")
+        checks.refuse(missing or unknown, f"fields: missing {missing}, unknown {unknown}")
         return cls(**fields)
 
     @classmethod

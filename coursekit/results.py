@@ -18,13 +18,13 @@ from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from coursekit import checks
 from coursekit.arrays import ArrayLike, Floats
-from coursekit.checks import want
+from coursekit.checks import refuse, want
 from coursekit.formats import lens as lens_files
 from coursekit.formats import numbers
 from coursekit.formats import poses as pose_files
@@ -41,18 +41,6 @@ BASE, GRIPPER = "base_link", "ee_gripper_link"
 OPTICAL_TURN = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
 Source = Literal["live", "recorded", "simulated", "reference"]
 ErrorKind = Literal["bias", "noise"]
-
-
-class MeasuringCamera(Protocol):
-    """What a result is measured with: a camera, or what stands in for one."""
-
-    @property
-    def source(self) -> Source:
-        """Whether it is live, recorded, simulated or a reference."""
-
-    @property
-    def name(self) -> str:
-        """Its name for people, such as "Intel RealSense D435"."""
 
 
 @dataclass(frozen=True)
@@ -207,7 +195,7 @@ def folder() -> Path:
 
 def save(
     lesson: str,
-    camera: MeasuringCamera,
+    camera: Any,
     quantities: Mapping[str, Quantity],
     covariances: Mapping[str, Covariance] | None = None,
     lens: Intrinsics | None = None,
@@ -216,6 +204,7 @@ def save(
 ) -> Path:
     """Write `results/<lesson>.json` in one step (a reader sees the old file or the new one).
 
+    camera: what measured, or an `Origin` or hand-over in its place: its name and source are kept.
     covariances: of those quantities that were estimated together, by a name for the group. lens,
     placement, eye_to_hand: as in `Result`; the camera's serial number goes along where it has one.
     Returns the path. Raises ValueError for what is no quantity and no covariance, and for a
@@ -249,8 +238,7 @@ def read(path: Path) -> Result:
     """A result in another folder; ValueError that names the file where it is damaged."""
     content = read_json(path)
     try:
-        if content.pop("format") not in (1, FORMAT):
-            raise ValueError("written by another version of the course")
+        refuse(content.pop("format") not in (1, FORMAT), "written by another version of the course")
         quantities = {k: Quantity(**v) for k, v in content.pop("quantities").items()}
         covariances = {k: Covariance(**v) for k, v in content.pop("covariances", {}).items()}
         checks.choice("source", content["source"], get_args(Source))

@@ -9,7 +9,7 @@ import pytest
 from common import EXPECTED
 
 from coursekit import results
-from coursekit.budget import HandOver, hand_over, independent_frames
+from coursekit.budget import HandOver, hand_over, independent_frames, looking_down
 from coursekit.budget.handover import NEEDED, lesson_budget, wrist_budget
 from coursekit.results import Covariance, Quantity
 
@@ -217,6 +217,20 @@ def test_a_bias_that_is_subtracted_leaves_its_uncertainty(folders: tuple[Path, P
     left = {r.term.name: r for r in hand_over(folders[1]).budget(subtract_depth_bias=True).rows}
     assert 1e3 * left["depth bias"].low_m == 0.0
     assert 1e3 * left["depth bias"].high_m == pytest.approx(1.0)
+
+
+def test_half_a_tick_is_the_sigma_of_a_bias_once_what_is_known_is_subtracted(folders) -> None:
+    """So notebook 5 counts rigs by `add_up`; left in, a bias of one sign puts more of them out."""
+    write(YOURS)
+    for tilt_deg in (25.0, 45.0):
+        place = {"distance_m": 0.70, "T_base_camera": looking_down(tilt_deg=tilt_deg)}
+        left, whole = (hand_over(folders[1]).budget(known).at(**place) for known in (True, False))
+        sigma = math.hypot(*(r.along_m[0] / 2 for r in left.rows if r.term.normal))
+        low, high = left["forward kinematics"].range  # of the lesson: any way, and of any size
+        sigma = math.hypot(sigma, math.sqrt(low**2 + low * high + high**2) / 3)
+        share = math.erfc(0.005 / (math.sqrt(2.0) * sigma))
+        assert left.draw(200_000).share_over(0.005, "closing") == pytest.approx(share, abs=0.006)
+        assert whole.draw(200_000).share_over(0.005, "closing") > share + 0.008
 
 
 def test_on_the_wrist_with_your_numbers(folders: tuple[Path, Path]) -> None:

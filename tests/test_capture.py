@@ -442,5 +442,5 @@ def test_in_a_notebook_the_live_image_is_displayed_once(tmp_path, monkeypatch, c
     monkeypatch.setattr("IPython.display.display", shown.append)
     capture(HeldBoard(POSES[:1]), CHARUCO, 1, tmp_path / "views")
     assert [type(one) for one in shown] == [LiveImage]
-    assert "<b>0 of 1 views.</b> Locked exposure at 8 ms." in shown[0]._words.value
+    assert "Locked exposure at 8 ms. The last image" in shown[0]._words.value
     assert capsys.readouterr() == ("1 views of the Stub D435 in views.\n", "")

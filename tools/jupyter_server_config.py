@@ -63,3 +63,5 @@ def without_widgets(model: dict[str, Any]) -> None:
 c = get_config()  # type: ignore[name-defined]  # noqa: F821
 c.ServerApp.contents_manager_class = Contents
 c.ServerApp.session_manager_class = Sessions
+# The page need not wait for a check of whether JupyterLab itself was built anew.
+c.ServerApp.tornado_settings = {"page_config_data": {"buildAvailable": False, "buildCheck": False}}

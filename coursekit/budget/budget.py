@@ -42,10 +42,6 @@ Along = Literal["image", "ray", "disparity", "depth", "turn", "shift", "intrinsi
 Directions = Literal["own", "isotropic"]
 MOST_ALIKE = 0.9999  # two frames; beyond it an autocorrelation says nothing more
 SIGMAS = 2.0  # a bias known by its standard deviation is taken to reach so many of them
-QUESTIONS = {
-    "worst case": "how far off can it be, if all point one way?",
-    "quadrature": "how far off is it, if the directions are unrelated?",
-}
 
 
 # --- a term ---
@@ -520,10 +516,9 @@ class ErrorBudget:
     def summary(self) -> list[str]:
         """The sums, a line each, with the question each answers."""
         averaged = f", {self.frames} frames" if self.frames > 1 else ""
-        text = [f"noise in quadrature{averaged}: {1e3 * self.noise_m:.2f} mm (one sigma)"]
-        sums = {"worst case": self.worst_case_m, "quadrature": self.quadrature_m}
-        for name, ends in sums.items():
-            text.append(f"bias, {name}: {span(*ends)} ({QUESTIONS[name]})")
+        text = [say("budget.noise", averaged=averaged, mm=1e3 * self.noise_m)]
+        text.append(say("budget.worst_case", ends=span(*self.worst_case_m)))
+        text.append(say("budget.quadrature", ends=span(*self.quadrature_m)))
         if self._stated:
             return text
         for axis in AXES:

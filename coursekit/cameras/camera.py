@@ -43,13 +43,10 @@ class HiddenTruth:
         return self.reported_baseline_m / self.baseline_m - 1.0
 
     def __repr__(self) -> str:
-        baselines_mm = {
-            "true_mm": 1e3 * self.baseline_m,
-            "reported_mm": 1e3 * self.reported_baseline_m,
-        }
+        mm = {"true_mm": 1e3 * self.baseline_m, "reported_mm": 1e3 * self.reported_baseline_m}
         lenses = map(_lens_text, (self.color_lens, self.reported_color_lens))
         both = dict(zip(("true_lens", "reported_lens"), lenses, strict=True))
-        return say("cameras.truth", t=self, percent=100 * self.scale_error, **baselines_mm, **both)
+        return say("cameras.truth", t=self, percent=100 * self.scale_error, **mm, **both)
 
 
 class Camera(Description, ABC):
@@ -178,9 +175,8 @@ class Camera(Description, ABC):
         """
         checks.whole("n", n)
         if not self.can_place:
-            raise CameraError(
-                f"{say('cameras.not_rearranged', name=self.name)}, so it makes no set"
-            )
+            stays = say("cameras.not_rearranged", name=self.name)
+            raise CameraError(f"{stays}, so it makes no set")
         index = recording.Index.to_extend(Path(folder).expanduser(), name, distances_m, overwrite)
         for distance_m in distances_m:
             scene = recording.scene_to_record(name, distance_m)

@@ -118,9 +118,8 @@ def capture(
             if not album.views:
                 raise
         except CameraError as error:
-            kept = say(
-                "cameras.views_kept", error=error, count=len(album.views), folder=album.folder
-            )
+            count, folder = len(album.views), album.folder
+            kept = say("cameras.views_kept", error=error, count=count, folder=folder)
             raise CameraError(kept, error.frames) from error
     print(_summary(camera, album, views, before))
     return Detections(album.views, album.skipped)
@@ -138,10 +137,8 @@ def _summary(camera: Camera, album: Album, views: int, before: int) -> str:
     if have == before:
         return say("cameras.none_taken", before=before, **about)
     count = f"{have} views" if have >= views else f"{have} of {views} views"
-    moved = ": there is no board to hold, so the simulated camera was moved"
-    return say(
-        "cameras.taken", count=count, how=moved * isinstance(camera, SimulatedCamera), **about
-    )
+    how = say("cameras.moved") if isinstance(camera, SimulatedCamera) else ""
+    return say("cameras.taken", count=count, how=how, **about)
 
 
 # --- where views come from ---
@@ -484,8 +481,7 @@ def _proposals(board: Board, lens: Intrinsics) -> tuple[_View, ...]:
                 view = _aimed(board, lens, facing, near, aim * lens.size)
                 if view is not None:
                     views.append(view)
-    if not views:
-        raise ValueError(f"board: no view of {wide:g} x {high:g} m fits into {lens.size} px")
+    checks.refuse(not views, f"board: no view of {wide:g} x {high:g} m fits into {lens.size} px")
     return tuple(views)
 
 
@@ -583,7 +579,7 @@ class Screen:
 
 
 class LiveImage(Screen):
-    """A widget: the image with what is seen, taken and wanted drawn into it, and words below."""
+    """A widget: the image with what is seen, taken and wanted drawn into it, and words above."""
 
     def __init__(self, board: Board, lens: Intrinsics, views: int) -> None:
         import ipywidgets
@@ -593,7 +589,7 @@ class LiveImage(Screen):
         self._image = ipywidgets.Image(format="jpeg", value=_jpeg(np.zeros((48, 64, 3), np.uint8)))
         self._image.layout.max_width = "100%"
         self._words = ipywidgets.HTML("Waiting for the first image ...")
-        self._box = ipywidgets.VBox([self._image, self._words])
+        self._box = ipywidgets.VBox([self._words, self._image])
 
     def say(self, text: str) -> None:
         self._said = text
@@ -610,6 +606,8 @@ class LiveImage(Screen):
 
     def close(self) -> None:
         """The last image stays."""
+        legend = "The last image. Rings: the board; dots: the views before it."
+        self._words.value = f"{html.escape(self._said)} {legend}"
 
     def __repr__(self) -> str:
         return "The live image appears here while the cell runs."

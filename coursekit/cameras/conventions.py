@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -28,14 +29,8 @@ COEFFS = {
     "radial": (-0.27, 0.11, 0.0, 0.0, 0.05),
     "radial and tangential": (-0.27, 0.11, 0.0018, -0.0012, 0.05),
 }
-CASES = (
-    ("none", "none"),
-    ("brown_conrady", "radial and tangential"),
-    ("inverse_brown_conrady", "radial"),
-    ("inverse_brown_conrady", "radial and tangential"),
-    ("modified_brown_conrady", "radial"),
-    ("modified_brown_conrady", "radial and tangential"),
-)
+CASES = [("none", "none"), ("brown_conrady", "radial and tangential")]
+CASES += product(("inverse_brown_conrady", "modified_brown_conrady"), [*COEFFS][1:])
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from coursekit.arrays import AnyArray, Floats, NDArray
 from coursekit.boards.detector import natural
 from coursekit.cameras import recording
 from coursekit.cameras.camera import Camera, camera_line
-from coursekit.cameras.frames import FRAMES_PER_S, NO_DEPTH, CameraError, Description, Frame
+from coursekit.cameras.frames import FRAMES_PER_S, NO_DEPTH, CameraError, Description, Frame, need
 from coursekit.cameras.realsense import shortest_decimal
 from coursekit.geometry import Intrinsics, invert_transform, make_transform
 from coursekit.words import counted, say
@@ -136,12 +136,9 @@ class RosBag(Camera):
     # --- frames --------------------------------------------------------------------------------
 
     def stream(self) -> Generator[Frame, None, None]:
-        others: dict[str, list[_Shot]] = {
-            name: [] for name in self._names.values() if name != "depth"
-        }
-        waiting: list[_Shot] = []
-        if self._closed:
-            raise CameraError(say("cameras.closed", what=self._what))
+        others: dict[str, list[_Shot]] = {name: [] for name in self._names.values()}
+        waiting = others.pop("depth")
+        need(not self._closed, "cameras.closed", what=self._what)
         with self._reader() as reader:
             for name, shot in self._shots(reader):
                 (waiting if name == "depth" else others[name]).append(shot)
@@ -181,10 +178,8 @@ class RosBag(Camera):
         if depth.shape != self.depth.size[::-1]:
             raise ValueError(f"a depth image of {depth.shape}, camera_info says {self.depth.size}")
         eyes = (images["left"], images["right"]) if {"left", "right"} <= images.keys() else None
-        figures = self.depth, self.color, self.T_color_depth
-        return Frame(
-            depth, images.get("color"), self.depth_scale_m, shot.time_s, shot.number, *figures, eyes
-        )
+        facts = shot.time_s, shot.number, self.depth, self.color, self.T_color_depth
+        return Frame(depth, images.get("color"), self.depth_scale_m, *facts, eyes)
 
     def lock(self) -> str:
         return say("cameras.as_recorded")

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
+from coursekit import checks
 from coursekit.arrays import AnyArray, Floats, Image, NDArray
 from coursekit.geometry import Intrinsics, align_depth_to_color, deproject_image
 from coursekit.words import Listed, counted, say
@@ -22,6 +23,12 @@ class CameraError(RuntimeError):
     def __init__(self, message: str, frames: Iterable[Frame] = ()) -> None:
         super().__init__(message)
         self.frames = Frames(frames)
+
+
+def need(holds: object, sentence: str, /, **facts: Any) -> None:
+    """CameraError with a sentence of texts.toml and the facts in it, unless the condition holds."""
+    if not holds:
+        raise CameraError(say(sentence, **facts))
 
 
 class Description:
@@ -107,8 +114,7 @@ class Frames(Listed[Frame]):
     @property
     def depth(self) -> NDArray[np.uint16]:
         """All depth images as one array of counts, (N, H, W); ValueError when there is none."""
-        if not self:
-            raise ValueError("frames: there are none, so there is no depth to stack")
+        checks.refuse(not self, "frames: there are none, so there is no depth to stack")
         return np.stack([frame.depth for frame in self])
 
     def __repr__(self) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from coursekit.cameras.frames import CameraError
+from coursekit.cameras.frames import CameraError, need
 from coursekit.words import ROOM_TEXTS, say
 
 USB_DEVICES = Path("/sys/bus/usb/devices")  # Linux only
@@ -55,8 +55,7 @@ def connected_realsenses() -> dict[str, str]:
     except RuntimeError as error:
         raise CameraError(start_problem("the RealSense", error)) from error
     found.pop("", None)  # a device in recovery mode has no serial number
-    if not found and _realsense_on_usb():
-        raise CameraError(say("cameras.not_permitted", udev=UDEV_ADVICE))
+    need(found or not _realsense_on_usb(), "cameras.not_permitted", udev=UDEV_ADVICE)
     return found
 
 
@@ -77,7 +76,5 @@ def start_problem(what: str, error: RuntimeError) -> str:
 
 def _realsense_on_usb() -> bool:
     """Whether the operating system (Linux only) sees a RealSense on USB."""
-    names = (
-        path.read_text(errors="replace", encoding="utf-8") for path in USB_DEVICES.glob("*/product")
-    )
-    return any("RealSense" in name for name in names)
+    products = USB_DEVICES.glob("*/product")
+    return any("RealSense" in path.read_text("utf-8", "replace") for path in products)

@@ -16,7 +16,7 @@ from coursekit import specifications
 from coursekit.arrays import Image
 from coursekit.cameras import recording
 from coursekit.cameras.camera import Camera, camera_line
-from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Frame
+from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Frame, need
 from coursekit.cameras.librealsense import device_info, load_librealsense, start_problem
 from coursekit.geometry import Intrinsics, make_transform
 from coursekit.words import ROOM_TEXTS, say
@@ -67,8 +67,7 @@ class RealSense(Camera):
     def _start(self) -> None:
         """Start streaming."""
         with self._running.turn:
-            if self._running.left:
-                raise CameraError(say("cameras.closed_meanwhile", what=self._what))
+            need(not self._running.left, "cameras.closed_meanwhile", what=self._what)
             try:
                 pipeline = self._rs.pipeline()
                 self._profile = pipeline.start(self._config())
@@ -86,8 +85,7 @@ class RealSense(Camera):
         return config
 
     def _check_open(self) -> None:
-        if self._running.pipeline is None:
-            raise CameraError(say("cameras.closed", what=self._what))
+        need(self._running.pipeline, "cameras.closed", what=self._what)
 
     def _depth_sensor(self) -> Any:
         return self._profile.get_device().first_depth_sensor()
@@ -103,11 +101,9 @@ class RealSense(Camera):
         self.name = device_info(rs, device, "name") or "RealSense"
         self.serial = device_info(rs, device, "serial_number")
         self.depth_scale_m = shortest_decimal(sensor.get_depth_scale())
-        self.baseline_m = None
-        if sensor.supports(rs.option.stereo_baseline):
-            self.baseline_m = (
-                shortest_decimal(sensor.get_option(rs.option.stereo_baseline)) / 1000.0
-            )
+        option = rs.option.stereo_baseline
+        known = sensor.supports(option)
+        self.baseline_m = shortest_decimal(sensor.get_option(option)) / 1000.0 if known else None
         profiles = {p.stream_type(): p for p in self._profile.get_streams()}
         depth = profiles[rs.stream.depth].as_video_stream_profile()
         self.depth = Intrinsics.from_realsense(depth.get_intrinsics())
@@ -143,8 +139,7 @@ class RealSense(Camera):
             except RuntimeError as error:
                 stopped = f"{self._what} stopped giving frames ({error})"
                 raise CameraError(f"{stopped}: {say('cameras.unplugged')}") from error
-            if arrived is None:
-                raise CameraError(say("cameras.closed_meanwhile", what=self._what))
+            need(arrived is not None, "cameras.closed_meanwhile", what=self._what)
             if arrived:
                 return images
         silent = f"no frame came from {self._what} for {MOST_POLLS * POLL_MS / 1000:g} s"
@@ -168,10 +163,8 @@ class RealSense(Camera):
         recording.check_distance(distance_m)
         device = specified(self.name)
         glass_m = device.nominal.glass_m if device else 0.0
-        what, distance_mm = (
-            ROOM_TEXTS["cameras"]["placing"].get(name, f"Put the {name}"),
-            1000 * (distance_m - glass_m),
-        )
+        what = ROOM_TEXTS["cameras"]["placing"].get(name, f"Put the {name}")
+        distance_mm = 1000 * (distance_m - glass_m)
         where = {"distance_mm": distance_mm, "distance_m": distance_m, "glass_mm": 1000 * glass_m}
         print(say("cameras.place", what=what, **where))
         input("Press Enter when it stands there")
@@ -206,9 +199,8 @@ class RealSense(Camera):
         self._skip(WARM_UP_FRAMES)
         if refused or not np.isclose(self.depth_scale_m, depth_scale_m, rtol=1e-3):
             keeps = say("cameras.keeps_unit", what=self._what, unit_mm=1000 * self.depth_scale_m)
-            raise CameraError(
-                keeps + (f" (librealsense says: {refused})" if refused else "")
-            ) from refused
+            said = f" (librealsense says: {refused})" if refused else ""
+            raise CameraError(keeps + said) from refused
         return f"depth unit set to {1000 * self.depth_scale_m:g} mm"
 
     # --- exposure ------------------------------------------------------------------------------
@@ -252,16 +244,14 @@ class RealSense(Camera):
     def _depth_exposure(self, sensor: Any) -> tuple[float, float]:
         """Exposure (us) and gain of the newest depth image, which automatic exposure chose."""
         depth = self._next_frameset().get_depth_frame()
+        values, option = self._rs.frame_metadata_value, self._rs.option
 
         def chosen(value: Any, setting: Any) -> float:
             known = depth.supports_frame_metadata(value)
             return depth.get_frame_metadata(value) if known else sensor.get_option(setting)
 
-        values, option = self._rs.frame_metadata_value, self._rs.option
-        return (
-            chosen(values.actual_exposure, option.exposure),
-            chosen(values.gain_level, option.gain),
-        )
+        exposure_us = chosen(values.actual_exposure, option.exposure)
+        return exposure_us, chosen(values.gain_level, option.gain)
 
 
 class _Running:

@@ -17,7 +17,7 @@ from typing import Any
 
 from coursekit import checks, results
 from coursekit.arrays import AnyArray
-from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Description, Frame
+from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Description, Frame, need
 from coursekit.cameras.librealsense import load_librealsense
 from coursekit.geometry import Intrinsics
 from coursekit.words import say
@@ -39,22 +39,17 @@ SAME_PLACE_M = 0.0005  # distances closer than this are one place
 
 def check_recording(path: Path) -> None:
     """CameraError with what to do when `path` is no recording."""
-    if path.suffix not in FILE_STARTS:
-        raise CameraError(say("cameras.no_recording", path=path))
-    if not path.exists():
-        raise CameraError(f"there is no file {path}: check the name and the folder")
-    if not path.is_file():
-        raise CameraError(f"{path} is a folder: name the .db3 or .bag file in it")
+    need(path.suffix in FILE_STARTS, "cameras.no_recording", path=path)
+    need(path.exists(), "cameras.no_file", path=path)
+    need(path.is_file(), "cameras.no_plain_file", path=path)
     try:
         with path.open("rb") as file:
             start = file.read(16)
     except OSError as error:
-        denied = f"{path} cannot be read ({error.strerror}): check its permissions"
-        raise CameraError(denied) from error
-    if not start:
-        raise CameraError(f"{path} is empty: copy it again or record it anew")
-    if not start.startswith(FILE_STARTS[path.suffix]):
-        raise CameraError(say("cameras.other_file", path=path, suffix=path.suffix))
+        raise CameraError(say("cameras.not_read", path=path, error=error.strerror)) from error
+    need(start, "cameras.empty_file", path=path)
+    same = start.startswith(FILE_STARTS[path.suffix])
+    need(same, "cameras.other_file", path=path, suffix=path.suffix)
 
 
 def without_depth(path: Path, topics: Sequence[str]) -> CameraError:
@@ -140,10 +135,9 @@ def write_recording(
 def _check_target(path: str | os.PathLike[str], overwrite: bool) -> Path:
     target = Path(path).expanduser()
     checks.want(target.suffix == ".db3", "path", str(target), "a name that ends in .db3")
-    if not target.parent.is_dir():
-        raise ValueError(f"path: there is no folder {target.parent}: make it first")
-    if target.is_dir():
-        raise ValueError(f"path: {target} is a folder, want a file name")
+    place = target.parent
+    checks.refuse(not place.is_dir(), f"path: there is no folder {place}: make it first")
+    checks.refuse(target.is_dir(), f"path: {target} is a folder, want a file name")
     if target.exists() and not overwrite:
         raise ValueError(f"path: {target} exists already: choose another name or overwrite=True")
     return target
@@ -167,8 +161,8 @@ def restore_order(path: Path) -> None:
 def _publish(unfinished: Path, target: Path, given: int) -> None:
     """Give a finished recording its name, once all its frames are found in it."""
     written = len(depth_frame_numbers(unfinished))
-    if written < given:  # librealsense does not say when it cannot write
-        raise CameraError(say("cameras.not_written", written=written, given=given, target=target))
+    # librealsense does not say when it cannot write
+    need(written >= given, "cameras.not_written", written=written, given=given, target=target)
     try:
         os.replace(unfinished, target)
     except OSError as error:
@@ -299,16 +293,14 @@ class Index:
     def read(cls, folder: Path) -> Index:
         """The index of a set; CameraError for a folder without one, and for a damaged one."""
         path = folder / INDEX
-        if not path.exists():
-            raise CameraError(say("cameras.no_index", folder=folder, intrinsics=INTRINSICS))
+        need(path.exists(), "cameras.no_index", folder=folder, intrinsics=INTRINSICS)
         try:
             scenes = [RecordedScene(**entry) for entry in results.read_json(path)["scenes"]]
             for scene in scenes:
                 check_distance(scene.distance_m)
                 in_folder = Path(scene.file).name == scene.file
                 checks.want(in_folder, "file", scene.file, "a name in the set's own folder")
-            if not scenes:
-                raise ValueError("it lists no scenes")
+            checks.refuse(not scenes, "it lists no scenes")
         except (KeyError, TypeError, ValueError) as error:
             raise CameraError(f"{path} is damaged ({error}): record the set anew") from error
         return cls(folder, scenes)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import unicodedata
 import zlib
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -15,7 +15,7 @@ from coursekit import checks, results, specifications
 from coursekit.arrays import ArrayLike, Floats, Image
 from coursekit.boards import Board
 from coursekit.cameras.camera import Camera, HiddenTruth
-from coursekit.cameras.frames import FRAMES_PER_S, CameraError, Frame
+from coursekit.cameras.frames import FRAMES_PER_S, Frame, need
 from coursekit.cameras.recording import check_depth_scale, check_distance
 from coursekit.geometry import Intrinsics, invert_transform
 from coursekit.simulation import Rig, RigView, Scene, artefact_scene, render, tabletop, wall_scene
@@ -23,11 +23,7 @@ from coursekit.simulation.board_images import board_scene, check_pose, render_bo
 from coursekit.specifications import Unit
 from coursekit.words import say
 
-SCENES: dict[str, Callable[[float], Scene]] = {
-    "60 mm block": tabletop,
-    "wall": wall_scene,
-    "artefacts": artefact_scene,
-}
+SCENES = {"60 mm block": tabletop, "wall": wall_scene, "artefacts": artefact_scene}
 
 # How far a unit is from what it reports. The vendor allows 2 % of depth error at 2 m; with these a
 # D435 is 2-5 mm off at 0.45 m, as people find (data/published_depth_noise.json).
@@ -197,8 +193,7 @@ class SimulatedCamera(Camera):
         return np.repeat(grey[..., None], 3, axis=2)
 
     def _check_open(self) -> None:
-        if self._closed:
-            raise CameraError(say("cameras.closed", what=f"the {self.name}"))
+        need(not self._closed, "cameras.closed", what=f"the {self.name}")
 
     def _start_afresh(self) -> None:
         """Start the named stream of random numbers, and the drift at a moment that it names."""

@@ -23,7 +23,7 @@ from xml.etree import ElementTree
 
 import yaml
 
-from coursekit.checks import want
+from coursekit.checks import refuse, want
 
 FORMAT_TEXTS = tomllib.loads((Path(__file__).parent / "texts.toml").read_text("utf-8"))
 LARGEST, LARGEST_TREE = 2 << 20, 256 << 10  # bytes of a table, of YAML, JSON or XML
@@ -76,8 +76,8 @@ def tree(text: str, name: str, wanted: str) -> Any:
         # OpenCV's first line is no YAML, nor are the tabs that JSON may be indented with
         plain = re.sub(r"\A%YAML:.*", "", text).replace("\t", " ")
         opened = itertools.accumulate(1 if m[0] in "[{" else -1 for m in BRACKET.finditer(plain))
-        if any(depth > DEEPEST for depth in opened):  # the loader takes time with the square
-            raise ValueError(f"is deeper than {DEEPEST} levels")
+        # the loader takes time with the square of the depth
+        refuse(any(depth > DEEPEST for depth in opened), f"is deeper than {DEEPEST} levels")
         loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
         nodes = list(yaml.compose_all(plain, Loader=loader))
         return _plain(nodes[0], 0, iter(range(MOST_NODES))) if nodes and nodes[0] else None
@@ -97,8 +97,7 @@ def _plain(node: Any, depth: int, left: Iterator[int]) -> Any:
     """A node of YAML as dictionaries, lists and texts."""
     if depth > DEEPEST or next(left, None) is None:
         raise ValueError(f"is deeper than {DEEPEST} levels, or its aliases make too much of it")
-    if "python" in node.tag:
-        raise ValueError("holds a Python object, which could run code")
+    refuse("python" in node.tag, "holds a Python object, which could run code")
     if isinstance(node, yaml.SequenceNode):
         return [_plain(item, depth + 1, left) for item in node.value]
     if isinstance(node, yaml.MappingNode):
@@ -114,8 +113,7 @@ def _xml(text: str) -> dict[str, Any]:
     if "<!" in text.replace("<!--", ""):
         raise ValueError("declares a document type or entities, which no calibration needs")
     root = ElementTree.fromstring(text)
-    if root.tag != "opencv_storage":
-        raise ValueError(f"is XML with <{root.tag[:40]}>, not <opencv_storage>")
+    refuse(root.tag != "opencv_storage", f"is XML with <{root.tag[:40]}>, not <opencv_storage>")
     found: dict[str, Any] = {}
     for entry in root:
         parts = {part.tag: (part.text or "").strip() for part in entry}

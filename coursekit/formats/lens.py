@@ -19,10 +19,7 @@ from typing import Any
 from coursekit.checks import want
 from coursekit.formats import FORMAT_TEXTS, fill, kind_of, numbers, one_number, read_text, tree
 
-WANTED = (
-    "K and lens as ROS (camera_info), OpenCV (FileStorage), Kalibr (camchain), COLMAP "
-    "(cameras.txt), Open3D or this course write them"
-)
+WANTED = FORMAT_TEXTS["messages"]["lens"]
 LENS_FORMATS = ("ros", "opencv", "kalibr", "colmap", "open3d", "json")
 PINHOLE = ("fx", "fy", "cx", "cy")
 ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")

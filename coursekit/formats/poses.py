@@ -35,9 +35,8 @@ UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "rad": 1.0}
 UNITS |= dict.fromkeys(("deg", "degrees", "°"), math.pi / 180)
 AXIS_ORDERS = [f"{a}{b}{c}" for a, b, c in itertools.product("xyz", repeat=3) if a != b != c]
 ROTATIONS = ("rotation_vector", *AXIS_ORDERS, *(order.upper() for order in AXIS_ORDERS))
-COLUMN_NAMES = {
-    name: ours for ours, names in FORMAT_TEXTS["columns"].items() for name in names.split()
-}
+POSE_COLUMNS = FORMAT_TEXTS["columns"]
+COLUMN_NAMES = {name: ours for ours, names in POSE_COLUMNS.items() for name in names.split()}
 HEADING = re.compile(r"(.+?)(?:[ _]*[\[(]|[ _])(mm|cm|m|deg|degrees|rad|°)[\])]?")
 UNIT_TOLERANCE = 1e-3  # of a quaternion's length: four digits
 # No arm's gripper is farther from its base's origin than the one, nor as near as the other, always
@@ -158,7 +157,7 @@ def _header(lines: list[str], name: str) -> tuple[int, str]:
         elif line:
             for at, header in ((number + 1, line), (number, comment)):
                 cells = re.split(r"[;,\t ]+", re.sub(r" +[\[(]", "(", header))
-                if sum(_known(cell)[0] in FORMAT_TEXTS["columns"] for cell in cells) >= 3:
+                if sum(_known(cell)[0] in POSE_COLUMNS for cell in cells) >= 3:
                     return at, header
             break
     kind = kind_of("\n".join(lines[:50]), "no line that names its columns")
@@ -184,7 +183,7 @@ def _columns(
     units |= dict.fromkeys(ANGULAR, UNITS[angle or "rad"])
     says, angular = None, angle is not None
     for at, (ours, plain, unit) in enumerate(map(_known, cells)):
-        if ours not in FORMAT_TEXTS["columns"]:
+        if ours not in POSE_COLUMNS:
             continue
         want(ours not in places, f"{name}, column {cells[at]!r}", "a second one", f"one {ours}")
         places[ours] = at

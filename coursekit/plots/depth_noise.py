@@ -86,9 +86,8 @@ def reciprocal(fx_baseline: float, distance_m: float, sigma_d_px: float) -> Less
     ax.legend()
     ax.plot(at, distance_m, "o", color=COLORS["ink"])
     ax.set(xlim=(0, 130), ylim=(0, 2.6), xlabel="disparity d (px)", ylabel="depth Z (m)")
-    ax.set_title(
-        f"d = {at:.1f} px, Z = {distance_m:.2f} m: {sigma_d_px:.2f} px become {sigma_mm:.2f} mm"
-    )
+    becomes = f"{sigma_d_px:.2f} px become {sigma_mm:.2f} mm"
+    ax.set_title(f"d = {at:.1f} px, Z = {distance_m:.2f} m: {becomes}")
     facts = {"fb": fx_baseline, "distance_m": distance_m, "d_px": sigma_d_px, "z_mm": sigma_mm}
     return fig.saying("reciprocal", **facts)
 

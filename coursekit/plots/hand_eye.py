@@ -24,8 +24,10 @@ from coursekit.plots.style import (
     single,
 )
 from coursekit.simulation.arm_poses import Setup
+from coursekit.words import say
 
 VIEW_M = 0.16  # how far the camera's pyramid is drawn
+AXES_M = 0.12  # the gripper's, as drawn
 SPACE_M = ((-0.30, 0.66), (-0.36, 0.36), (0.0, 0.84))  # x, y, z of the base that is shown
 CLEAR_PX = 13.0  # around a letter
 
@@ -42,7 +44,7 @@ def mounts(
     fig.set_layout_engine("none")  # the 3-D axes reserve far more room than they use
     texts = []
     for k, (name, setup) in enumerate(setups.items()):
-        ax: Any = fig.add_axes((k / len(setups), 0.0, 0.98 / len(setups), 1.0), projection="3d")
+        ax: Any = fig.add_axes((k / len(setups), 0.0, 0.96 / len(setups), 1.0), projection="3d")
         limits = dict(zip(("xlim", "ylim", "zlim"), SPACE_M, strict=True))
         ax.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)", **limits)
         ax.set_box_aspect(np.ptp(SPACE_M, axis=1), zoom=0.96)
@@ -63,6 +65,10 @@ def _rig(ax: Any, setup: Setup, q: Floats) -> dict[str, float]:
     links = setup.arm.link_frames(q)[:, :3, 3]
     chain = np.concatenate([np.zeros((1, 3)), links, gripper[None, :3, 3]])
     ax.plot(*chain.T, "o-", color=COLORS["block"], lw=5, ms=7)
+    axes = transform_points(gripper, AXES_M * np.kron(np.eye(3), [[0], [1]])).reshape(3, 2, 3)
+    for axis, line in zip("xyz", axes, strict=True):
+        ax.plot(*line.T, color=COLORS["ink"], lw=1.2)
+        ax.text(*line[1], axis, fontsize=9)
     rim = transform_points(board, setup.board.outline)
     sheet = rim[[[0, 1], [3, 2]]]
     ax.plot_surface(*np.moveaxis(sheet, 2, 0), color=COLORS["cube"], alpha=0.5, shade=False)
@@ -70,9 +76,8 @@ def _rig(ax: Any, setup: Setup, q: Floats) -> dict[str, float]:
     wide, high = setup.intrinsics.size
     pixels = np.array([(0, 0), (wide, 0), (wide, high), (0, high)], float)
     far = deproject(pixels, np.full(4, VIEW_M), setup.intrinsics.K)
-    view = transform_points(camera, np.vstack([far, np.zeros(3)]))[
-        [0, 1, 2, 3, 0, 4, 1, 4, 2, 4, 3]
-    ]
+    pyramid = transform_points(camera, np.vstack([far, np.zeros(3)]))
+    view = pyramid[[0, 1, 2, 3, 0, 4, 1, 4, 2, 4, 3]]
     ax.plot(*view.T, color=COLORS["color"], lw=1.2)
     arrows = {
         "T": (base, gripper, "model"),
@@ -80,8 +85,8 @@ def _rig(ax: Any, setup: Setup, q: Floats) -> dict[str, float]:
         "C": (camera, board, "truth"),
     }
     ends = [np.stack([start[:3, 3], end[:3, 3]]) for start, end, _ in arrows.values()]
-    taken = [_on_page(ax, line) for line in (chain, rim[[0, 1, 2, 3, 0]], view, *ends)]
-    for (name, (*_, color)), line in zip(arrows.items(), taken[3:], strict=True):
+    taken = [_on_page(ax, line) for line in (chain, rim[[0, 1, 2, 3, 0]], view, *axes, *ends)]
+    for (name, (*_, color)), line in zip(arrows.items(), taken[-3:], strict=True):
         place = _arrow(ax, name, line[0], line[-1], COLORS[color], np.concatenate(taken))
         taken.append(place)
     lengths = [float(np.linalg.norm(end - start)) for start, end in ends]
@@ -138,11 +143,8 @@ def agreement(sessions: Mapping[str, HandEyeSession]) -> LessonFigure:
         titles = (f"{name}: turned by", "moved along the axis by", "the board in the base")
         for ax, title in zip(row, titles, strict=True):
             ax.set_title(title)
-        texts.append(
-            f"{name}: turns agree within {np.abs(arm[0] - seen[0]).max():.1f} deg, the camera goes "
-            f"{arm[1] @ seen[1] / (arm[1] @ arm[1]):.3f} times as far, the board spreads by "
-            f"{fit.spread_board_mm:.1f} mm"
-        )
+        apart, part = np.abs(arm[0] - seen[0]).max(), arm[1] @ seen[1] / (arm[1] @ arm[1])
+        texts.append(say("plots.agrees", name=name, apart=apart, part=part, fit=fit))
     fig.legend(*axes[2].get_legend_handles_labels(), loc="outside lower right", ncols=3)
     return fig.saying("agreement", each="; ".join(texts))
 
@@ -189,10 +191,8 @@ def more_poses(
         ax.set(xscale="log", yscale="log", xlabel="poses (number)")
         plain_ticks(ax.xaxis, counts, widen=True)
         ax.set_title(name)
-        texts.append(
-            f"{name}: error {error[0]:.2f} to {error[-1]:.2f} mm, stated {half[0]:.2f} to "
-            f"{half[-1]:.2f} mm"
-        )
+        (first, *_, last) = zip(error, half, strict=True)
+        texts.append(say("plots.error_and_half", name=name, first=first, last=last))
     plain_ticks(axes[0].yaxis, (0.1, 0.3, 1, 3, 10), widen=True)
     axes[0].set_ylabel("translation of X (mm)")
     axes[0].legend()

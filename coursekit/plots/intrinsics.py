@@ -14,6 +14,7 @@ from matplotlib.patheffects import withStroke
 
 from coursekit.arrays import Floats
 from coursekit.boards import Detection
+from coursekit.checks import refuse
 from coursekit.geometry import project, transform_points
 from coursekit.intrinsics import Comparison, IntrinsicsResult
 from coursekit.intrinsics.fit import tilts
@@ -85,8 +86,7 @@ def _best_rms(X: Floats, Y: Floats, seen: Floats) -> Floats:
 
 def views(folder: str | Path, detections: Sequence[Detection]) -> LessonFigure:
     """The images of a folder with the corners that were found in them."""
-    if not len(detections):
-        raise ValueError("detections: there are none to show; print them to see why")
+    refuse(not len(detections), "detections: there are none to show; print them to see why")
     fig, axes = panels(len(detections), 3, 9.0, 2.35, 0.3, sharex=True, sharey=True)
     for ax, found in zip(axes, detections, strict=True):
         image = cv2.imread(str(Path(folder) / found.name), cv2.IMREAD_GRAYSCALE)

@@ -184,10 +184,8 @@ def frame(shot: Frame) -> LessonFigure:
         axes[1].imshow(shot.color)
         axes[1].set(title="colour", xlabel="u (px)", ylabel="v (px)")
     beside = "" if shot.color is None else ", and the colour image beside it"
-    half_m, without = np.nanmedian(depth), np.isnan(depth).mean()
-    return fig.saying(
-        "frame", width=width, height=height, half_m=half_m, without=without, beside=beside
-    )
+    facts = {"half_m": np.nanmedian(depth), "without": np.isnan(depth).mean()}
+    return fig.saying("frame", width=width, height=height, beside=beside, **facts)
 
 
 def _far(depth_m: AnyArray) -> float:

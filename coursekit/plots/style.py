@@ -200,7 +200,8 @@ class Draggable:
         data, metadata = first._repr_mimebundle_()
         # ipywidgets 7 has no such method: then there is the picture
         widget: dict[str, Any] = getattr(self.widget(), "_repr_mimebundle_", dict)()
-        show((widget | data, metadata), "The figure in words, as it is drawn first", first.alt)
+        says = "No sliders? Run this cell. The figure in words, as it is drawn first"
+        show((widget | data, metadata), says, first.alt)
 
 
 def _picture(drawn: LessonFigure) -> str:

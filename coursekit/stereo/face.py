@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from coursekit.arrays import AnyArray, Bools, Floats, Interval, Window
-from coursekit.checks import instance, positive, want
+from coursekit.checks import instance, positive, refuse, want
 from coursekit.geometry import Intrinsics, deproject
 from coursekit.stereo import windows
 from coursekit.stereo.law import rounded_variance, unrounded_std
@@ -192,8 +192,7 @@ def _find_face(
     around = windows.clip_window((round(u) - 10, round(v) - 10, 21, 21), few)
     seen = windows.cut(few, around, step)
     seen = seen[np.isfinite(seen)]
-    if seen.size == 0:
-        raise ValueError(f"depth: no valid pixel near ({u:.0f}, {v:.0f}), so no face there")
+    refuse(seen.size == 0, f"depth: no valid pixel near ({u:.0f}, {v:.0f}), so no face there")
     size = width_m or USUAL_WIDTH_M
     z0 = float(np.percentile(seen, 25))  # the block, even where it fills only part of the window
     z0 = float(np.median(seen[np.abs(seen - z0) < NEAR_FACE * size]))

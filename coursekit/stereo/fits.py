@@ -88,21 +88,30 @@ class LawFit(Estimate):
         return self.quantile() * np.sqrt(np.einsum("...i,ij,...j", by, known, by))
 
 
-def _least_squares(
-    residuals: Callable[[Floats], Floats], start: dict[str, float]
+def _fitted(
+    residuals: Callable[[Floats], Floats],
+    start: dict[str, float],
+    z: Floats,
+    fx: float,
+    baseline_m: float | None,
 ) -> dict[str, Any]:
-    """What a `LawFit` is made of: the parameters that make residuals(theta) smallest."""
+    """What a `LawFit` is made of: the parameters that make residuals(theta) smallest.
+
+    z (K,): the distances, m; fx (px), baseline_m: as the camera reports them.
+    """
     from scipy.optimize import least_squares
 
-    found = least_squares(
-        residuals, list(start.values()), x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12
-    )
+    ends = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-12)
+    found = least_squares(residuals, list(start.values()), x_scale="jac", **ends)
     return {
         "names": tuple(start),
         "theta": found.x,
         "covariance": np.linalg.inv(found.jac.T @ found.jac),
         "chi2": float(2 * found.cost),
         "n_residuals": len(found.fun),
+        "n_distances": len(np.unique(z)),
+        "fx": fx,
+        "baseline_m": baseline_m,
     }
 
 
@@ -219,15 +228,15 @@ def fit_noise(
 
     if baseline_m is not None:
         fx_baseline(fx, baseline_m)
+    camera = positive("fx", fx), None if baseline_m is None else float(baseline_m)
     z, s, nu, left_out = _noise_points(distances_m, stds_m, dof)
     reference = float(np.exp(np.log(z).mean()))
     expected = np.log(s) - (digamma(nu / 2) - np.log(nu / 2)) / 2
     error = np.sqrt(polygamma(1, nu / 2)) / 2
     scatter, scatter_dof = _scatter(z, expected, error)
     error = np.hypot(error, scatter)
-    n_distances = len(np.unique(z))
     start = {"ln_std": float(np.mean(np.log(s) - 2 * np.log(z / reference)))}
-    if exponent is None and n_distances > 1:
+    if exponent is None and np.ptp(z) > 0:
         start["exponent"] = 2.0
     power = 2.0 if exponent is None else float(exponent)
 
@@ -238,10 +247,7 @@ def fit_noise(
         return (expected - np.log(variance) / 2) / error
 
     fit = NoiseFit(
-        **_least_squares(residuals, start),
-        n_distances=n_distances,
-        fx=positive("fx", fx),
-        baseline_m=None if baseline_m is None else float(baseline_m),
+        **_fitted(residuals, start, z, *camera),
         reference_m=reference,
         held=None if exponent is None else power,
         scatter=scatter,
@@ -297,9 +303,8 @@ def _noise_notes(fit: NoiseFit, z: Floats, step: float | None) -> Iterator[str]:
     if fit.baseline_m is None:
         yield say("stereo.std_alone")
     if fit.exponent is None:
-        yield say(
-            "stereo.no_exponent", what="std elsewhere" if fit.baseline_m is None else "sigma_d"
-        )
+        what = "std elsewhere" if fit.baseline_m is None else "sigma_d"
+        yield say("stereo.no_exponent", what=what)
     if fit.scatter > 0:
         yield say("stereo.repeats", scatter=fit.scatter)
     if free and span < 3:
@@ -466,12 +471,7 @@ def fit_bias(
             parts.append([(pushed - priors.edge_px[0]) / priors.edge_px[1]])
         return np.concatenate(parts)
 
-    fit = BiasFit(
-        **_least_squares(residuals, start),
-        n_distances=n_distances,
-        fx=float(fx),
-        baseline_m=product / float(fx),
-    )
+    fit = BiasFit(**_fitted(residuals, start, z, float(fx), product / float(fx)))
     return replace(fit, notes=tuple(_bias_notes(fit)))
 
 

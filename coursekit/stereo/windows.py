@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from coursekit.arrays import AnyArray, ArrayLike, Bools, Floats, Integers, Interval, Window
-from coursekit.checks import array, positive, want
+from coursekit.checks import array, positive, refuse, want
 from coursekit.stereo.law import unrounded_std
 
 CORRELATION_PX = 12  # disparities farther apart than the matching window (11 px) are independent
@@ -39,8 +39,7 @@ def first_frame(depth: Any) -> Any:
 
 def depth_stack(depth: Any, depth_scale_m: float | None) -> tuple[AnyArray, float | None]:
     """The stack (N, H, W) as it came, and its unit; frames bring both."""
-    if hasattr(depth, "__len__") and len(depth) == 0:
-        raise ValueError("depth: got 0 frames, want at least one")
+    refuse(hasattr(depth, "__len__") and len(depth) == 0, "depth: got 0 frames, want at least one")
     if hasattr(first_frame(depth), "depth_scale_m"):
         depth, depth_scale_m = np.stack([f.depth for f in depth]), depth[0].depth_scale_m
     stack = np.asarray(depth)
@@ -496,8 +495,7 @@ def averaging_curve(series_m: ArrayLike) -> AveragingCurve:
         values = np.where((values > 0) & (values < np.inf), values, np.nan)
     pixels = values.reshape(n, -1)
     pixels = pixels[:, np.isfinite(pixels).all(axis=0)]
-    if pixels.shape[1] == 0:
-        raise ValueError("series_m: no pixel is valid in every frame")
+    refuse(pixels.shape[1] == 0, "series_m: no pixel is valid in every frame")
     deviation = pixels - pixels.mean(axis=0)
     effective, interval = effective_frames(deviation)
     floor = None

@@ -188,9 +188,11 @@ def submit(
     )
     data = bundle.bundle_bytes(whole)  # Refused for what no bundle can hold
     path = (Path(folder) if folder else results.folder()) / bundle_name(name)
-    if name and path.exists() and not overwrite:
-        return Handed(None, say("submission.there_already", file=relative(path)))
     says = shortcomings(whole)
+    if name and path.exists() and not overwrite:
+        would = " Of what you say now the grader would say:" if says else ""
+        there = say("submission.there_already", file=relative(path), would=would)
+        return Handed(None, there, says)
     if not name:
         would = " This is what the grader would say:" if says else ""
         return Handed(None, say("submission.no_name", would=would), says)
