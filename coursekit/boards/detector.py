@@ -172,8 +172,7 @@ def detect_all(
             except BoardNotFound as reason:
                 skipped.append(Skipped(name, str(reason), reason.kind))
     except KeyboardInterrupt:
-        done = len(views) + len(skipped)
-        print(f"Stopped after {done} of {len(sources)} images; they are kept.")
+        print(f"Stopped after {len(views) + len(skipped)} of {len(sources)} images; they are kept.")
     return _of_one_size(views, skipped, [name for name, _ in sources])
 
 

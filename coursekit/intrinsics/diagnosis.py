@@ -341,8 +341,8 @@ _FIGURES: tuple[tuple[tuple[str, ...], Callable[[_Search, _Steps, Calibration], 
     ((causes.SHUTTER,), _shutter),
     ((causes.LENS,), _lens),
 )
-_OF_PRINT = (causes.PRINT, causes.STRETCH)
-_ENTRY = {causes.HEIGHTS: "bowed_board", **dict.fromkeys(_OF_PRINT, "uneven_print")}
+# Of the board's shape: out of the plane, and the last two in it.
+_ENTRY = {causes.HEIGHTS: "bowed_board", **dict.fromkeys(causes.SHAPE[2:], "uneven_print")}
 
 
 def _unexplained(model: Calibration, result: IntrinsicsResult, some: bool) -> Iterator[Finding]:

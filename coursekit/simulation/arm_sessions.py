@@ -51,6 +51,7 @@ X_JITTER = np.repeat([np.radians(1.0), 4e-3], 3)  # rad, m: no two rigs are moun
 Y_JITTER = np.repeat([np.radians(4.0), 8e-3], 3)
 FLAT_ON_TABLE = np.array([0.0, 0.0, 1.0, 1.0, 1.0, 0.0])  # of Y_JITTER, what leaves a board flat
 SECONDS = 4.0  # from one image to the next
+OUTLIER_M, OUTLIER_DEG = 0.03, 5.0  # that a bumped arm is off
 PLACES_TRIED = 20  # of camera and board, before the default ones are taken
 PARTIAL = 0.6  # of the corners in view are enough in a degenerate session
 SIMULATED = "simulated"  # what session.json calls its source
@@ -75,7 +76,7 @@ class HandEyeMistakes:
     have their translation in mm. inverted_poses: T_gripper_base for T_base_gripper;
     inverted_detections: T_board_camera for T_camera_board. square_scale: a square's real size over
     what is claimed. wrong_mount: the other mount is declared. outliers: in so many views the arm is
-    not where it reports, by outlier_m and outlier_deg. joint_offset_deg: the zero of one joint
+    not where it reports, by 30 mm and 5 degrees. joint_offset_deg: the zero of one joint
     between shoulder and wrist is off by so much.
 
     No mistake, but what arms do: scatter_m, scatter_deg: at every pose the gripper is somewhere
@@ -98,8 +99,6 @@ class HandEyeMistakes:
     square_scale: float = 1.0
     wrong_mount: bool = False
     outliers: int = 0
-    outlier_m: float = 0.03
-    outlier_deg: float = 5.0
     joint_offset_deg: float = 0.0
     scatter_m: float = 0.0
     scatter_deg: float = 0.0
@@ -298,7 +297,7 @@ def _poses(
     outliers = _stream(seed, b"outliers").permutation(len(q))[: mistakes.outliers]
     bumps = _stream(seed, b"bumps")
     for view in outliers:  # the image was taken while the arm swung, or somebody leant on it
-        true[view] = turned(true[view], _twist(bumps, mistakes.outlier_m, mistakes.outlier_deg))
+        true[view] = turned(true[view], _twist(bumps, OUTLIER_M, OUTLIER_DEG))
     true = turned(true, _scatter(_stream(seed, b"scatter"), len(q), mistakes))
     Y, slipped_at = np.repeat(rig.Y[None], len(q), axis=0), None
     if mistakes.slip_m or mistakes.slip_deg:
