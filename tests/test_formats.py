@@ -49,10 +49,7 @@ def wrote(folder, name, text, encoding="utf-8"):
 def test_ros_file_has_every_field_of_the_format() -> None:
     text = ck.export(LENS, "ros").text
     found = yaml.safe_load(text)
-    assert list(found) == [
-        "image_width", "image_height", "camera_name", "camera_matrix", "distortion_model",
-        "distortion_coefficients", "rectification_matrix", "projection_matrix",
-    ]  # fmt: skip
+    assert list(found) == EXPECTED["fields"]["ros"]
     assert (found["image_width"], found["image_height"]) == LENS.size
     assert found["distortion_model"] == "plumb_bob"
     matrix = {key: found[key]["data"] for key in found if isinstance(found[key], dict)}
@@ -218,11 +215,7 @@ test_lenses_that_are_not_supported = refusals(
 
 FOREIGN = {kind: text.encode("latin-1") for kind, text in FILES["foreign"].items()}
 FOREIGN["binary, or UTF-16 without"] = "width: 640\n".encode("utf-16-le")
-NO_LENS = FOREIGN | {
-    "a table of poses": b"file,x,y,z,qx,qy,qz,qw\na.png,1,2,3,0,0,0,1\n",
-    "easy_handeye2": b"parameters:\n  calibration_type: eye_in_hand\ntransform: {}\n",
-    "pose samples of MoveIt": b"- effector_wrt_world: [1]\n  object_wrt_sensor: [1]\n",
-}
+NO_LENS = FOREIGN | {kind: text.encode() for kind, text in FILES["of_poses"].items()}
 NO_TABLE = FOREIGN | {
     "camera_info of ROS": ROS.encode(),
     "OpenCV's FileStorage": OPENCV.encode(),
@@ -377,18 +370,8 @@ def test_notations_give_one_camera(tmp_path, kind, mark, decimal) -> None:
     assert np.abs(found - HandEyeSession("eye_in_hand", ARM, SEEN).solve("park").X).max() < 1e-9
 
 
-UNSAID = {
-    "how": (IN_DEG, {}, "do not say how they turn"),
-    "unit": (THREE, {"rotation": "xyz"}, "whether in rad or in deg"),
-    "roll unit": ("x,y,z,roll,pitch,yaw", {}, "whether in rad or in deg"),
-    "both": (THREE, {}, "do not say how they turn"),
-    "letters": ("x,y,z,a,b,c", {"angle": "deg"}, "do not say how they turn"),
-}
-
-
-@pytest.mark.parametrize("kind", UNSAID)
-def test_what_is_not_said_is_not_guessed(tmp_path, kind) -> None:
-    columns, said, message = UNSAID[kind]
+@pytest.mark.parametrize(("columns", "said", "message"), EXPECTED["unsaid"])
+def test_what_is_not_said_is_not_guessed(tmp_path, columns, said, message) -> None:
     text = table(columns, (PLACES, VECTOR))
     with pytest.raises(ValueError, match=message) as refused:
         poses.read_table(wrote(tmp_path, "poses.csv", text), **said)
@@ -681,11 +664,7 @@ def from_launch(text):
 
 def from_calib(text):
     found = yaml.safe_load(text)
-    assert list(found["parameters"]) == [
-        "name", "calibration_type", "robot_base_frame", "robot_effector_frame",
-        "tracking_base_frame", "tracking_marker_frame", "freehand_robot_movement",
-        "move_group_namespace", "move_group",
-    ]  # fmt: skip
+    assert list(found["parameters"]) == EXPECTED["fields"]["easy_handeye2"]
     t, r = found["transform"]["translation"], found["transform"]["rotation"]
     T = make_transform(Rotation.from_quat([r[k] for k in "xyzw"]), [t[k] for k in "xyz"])
     in_hand = found["parameters"]["calibration_type"] == "eye_in_hand"
