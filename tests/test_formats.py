@@ -146,10 +146,7 @@ TOPIC_1 = (
 OPEN3D_VIEW = json.dumps(
     {"class_name": "PinholeCameraParameters", "extrinsic": [1, 0], "intrinsic": json.loads(OPEN3D)}
 )
-OURS = json.dumps(
-    {"width": 640, "height": 480, "fx": 600.0, "fy": 601.0, "cx": 320.0, "cy": 240.0,
-     "model": "brown_conrady", "coeffs": [0.1, -0.2, 1e-05, 0.0, 0.0]}, indent=1
-)  # fmt: skip
+OURS = FILES["OURS"]
 SESSION = json.dumps({"mount": "eye_in_hand", "intrinsics": json.loads(OURS)})
 AS_WRITTEN = {
     "ros": ROS, "ros2 topic echo": TOPIC_2, "rostopic echo": TOPIC_1, "opencv": OPENCV,
@@ -242,10 +239,7 @@ BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"{b}: &{b} [*{a}, *{a}, *{a}, *{a}, *{a}, *{a}, *{a}, *{a}, *{a}]\n"
     for a, b in zip("abcdefgh", "bcdefghi", strict=True)
 )
-LAUGHS = (
-    '<?xml version="1.0"?><!DOCTYPE l [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;">]>'
-    "<opencv_storage><x>&b;</x></opencv_storage>"
-)
+LAUGHS = FILES["LAUGHS"]
 HOSTILE = FILES["hostile"] | {
     "bomb": BOMB,
     "deep": "a: " + "[" * 5000,
@@ -753,15 +747,14 @@ def test_places_that_are_not_said(result) -> None:
 
 
 @pytest.fixture
-def kept(tmp_path, monkeypatch, result):
-    monkeypatch.setenv("COURSEKIT_RESULTS", str(tmp_path / "results"))
+def kept(own_results, result):
     camera = type("Camera", (), {"source": "live", "name": "D435", "serial": "728612070259"})()
     quantity = {"fx": results.Quantity(LENS.fx, "px", 0.9)}
     results.save("03_intrinsics", camera, quantity, lens=LENS)
     placed = results.placement(result)
     above = results.Placement("base_link", results.OPTICAL, "eye_to_hand", result.X)
     results.save("04_hand_eye", camera, {}, placement=placed, eye_to_hand=above)
-    return tmp_path / "results"
+    return own_results
 
 
 def test_results_carry_all_that_a_robot_needs(kept, result) -> None:

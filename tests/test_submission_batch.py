@@ -37,9 +37,9 @@ SAMPLES = DATA / "sample_bundles"
 GRADED = ("ada_good", "ben_weak", "cleo_wrong", "dan_copied", "eve_formula")
 
 
-def table(out: Path) -> list[dict[str, str]]:
-    """The rows of a report's grades.csv."""
-    return list(csv.DictReader(io.StringIO((out / "grades.csv").read_text(encoding="utf-8-sig"))))
+def table(out: Path, name: str = "grades.csv") -> list[dict[str, str]]:
+    """The rows of a table in a report."""
+    return list(csv.DictReader(io.StringIO((out / name).read_text(encoding="utf-8-sig"))))
 
 
 def quick(folder: Path, names: Iterable[str]) -> Path:
@@ -436,8 +436,7 @@ def test_everybody_of_a_class_has_a_row_and_nobodys_grade_is_anothers(
         names[13]: {"other_name"},
     }
     graded = {row["student"]: row["total"] for row in rows if row["counts"] == "yes"}
-    text = (out / f"{lms.lower()}.csv").read_text(encoding="utf-8-sig")
-    imported = {row[column]: row for row in csv.DictReader(io.StringIO(text))}
+    imported = {row[column]: row for row in table(out, f"{lms.lower()}.csv")}
     points = "Grade" if lms == "Moodle" else "Studio exercise 1"
     for i, name in enumerate(names):
         if name in graded or i < 2:
@@ -468,8 +467,7 @@ def test_what_the_instructor_decides_reaches_everybody(lms, in_process, tmp_path
 
     def run() -> tuple[str, dict[str, dict[str, str]], dict[str, str]]:
         said = str(batch.grade_folder("all.zip", progress=False, overwrite=True, choices=how))
-        text = (out / "canvas.csv").read_text(encoding="utf-8-sig")
-        rows = {row["Student"]: row for row in csv.DictReader(io.StringIO(text))}
+        rows = {row["Student"]: row for row in table(out, "canvas.csv")}
         with zipfile.ZipFile(out / "feedback.zip") as packed:
             pages = {name: packed.read(file).decode() for name, file in where.items()}
         return said, rows, pages
@@ -503,8 +501,7 @@ def test_what_the_instructor_decides_reaches_everybody(lms, in_process, tmp_path
     assert "<strong>0 of 100 points." in pages["Bo Lee"]
     assert "50 of 100 (yours; " in (out / "index.html").read_text(encoding="utf-8")
     if lms == "Moodle":
-        text = (out / "moodle.csv").read_text(encoding="utf-8-sig")
-        (bo,) = [row for row in csv.DictReader(io.StringIO(text)) if row["Full name"] == "Lee, Bo"]
+        (bo,) = [row for row in table(out, "moodle.csv") if row["Full name"] == "Lee, Bo"]
         assert (bo["Grade"], bo["Feedback comments"]) == ("0", "too late")
 
 

@@ -314,12 +314,7 @@ def test_the_same_words_are_a_flag_though_the_data_may_be_the_same():
 CHANGED = PARAGRAPH.replace("one pixel", "each pixel").replace("thirty", "30")
 LONGER = PARAGRAPH + " " + "I measured all of it on Tuesday with the lamp on. " * 2
 SHORT = "The bias dominates, I think."
-OWN = (
-    "At 0.45 m the bias dominates: averaging thirty frames leaves a tenth of a millimetre "
-    "of noise, but the bias is larger than that and stays, so I will calibrate the camera."
-)
-
-
+OWN = EXPECTED["paragraphs"]["own"]
 PAIRS = [
     pytest.param(PARAGRAPH, CHANGED, "nearly the same words", id="a few words changed"),
     pytest.param(PARAGRAPH, LONGER, "nearly the same words", id="sentences added"),
