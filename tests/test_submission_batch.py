@@ -509,7 +509,7 @@ def test_own_points_survive_a_regrade_which_says_what_changed(in_process, tmp_pa
     folder, out = quick(tmp_path / "in", ["a", "b"]), tmp_path / "out"
     before = graded(folder, out)
     own = out / "own_points.csv"
-    text = "who;student;paragraph;late;overrule;comment\na;a;2,5;-1;;well said\n"
+    text = "who;student;paragraph;late;overrule;comment\na;a;1,5;-1;;well said\n"
     own.write_text(text, encoding="utf-8-sig")
     kept = own.read_bytes()
     (out / "grades.csv").write_text("edited", encoding="utf-8")
@@ -521,7 +521,7 @@ def test_own_points_survive_a_regrade_which_says_what_changed(in_process, tmp_pa
     summary = graded(folder, out, overwrite=True)
     first = next(row for row in table(out) if row["student"] == "a")
     machine = float(first["points"]) - float(first["paragraph"])
-    assert float(first["total"]) == pytest.approx(machine + 2.5 - 1)
+    assert float(first["total"]) == pytest.approx(machine + 1.5 - 1)
     assert summary.changes == (
         ("a", f"{float(first['points']):g}", first["total"], "your own points changed"),
     )
@@ -534,9 +534,64 @@ def test_own_points_survive_a_regrade_which_says_what_changed(in_process, tmp_pa
     monkeypatch.setattr(batch, "grader_version", lambda: "another")
     (change,) = [c for c in graded(folder, out, overwrite=True).changes if c[0] == "b"]
     assert "the rubric or the grader changed; paragraph " in change[3]
-    own.write_text(text.replace("2,5", "many"), encoding="utf-8")
-    with pytest.raises(ValueError, match=r"own_points\.csv: a: paragraph: got 'many', want points"):
-        graded(folder, out, overwrite=True)
+
+
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [
+        ("many,,", "paragraph: got 'many', want points from 0 to 2"),
+        ("7,,", "paragraph: got '7', want points from 0 to 2"),
+        (",10,", "late: got '10', want points from -100 to 0"),
+        (",,130", "overrule: got '130', want points from 0 to 100"),
+        (",,nan", "overrule: got 'nan', want"),
+    ],
+)
+def test_own_points_that_cannot_be_are_refused_before_any_work(row, said, tmp_path):
+    out = quick(tmp_path / "out", ())
+    (out / "own_points.csv").write_text(f"who,paragraph,late,overrule\na,{row}\n", "utf-8")
+    with pytest.raises(ValueError, match=rf"^own_points\.csv: a: {said}"):
+        graded(quick(tmp_path / "in", ["a"]), out)
+
+
+def test_own_points_and_namesakes_outlive_another_roster(in_process, tmp_path, monkeypatch):
+    """Two Kim Lees and Jon, by a list with the LMS's numbers, then by its own table."""
+    monkeypatch.chdir(tmp_path)
+    people = {17: "Kim Lee", 18: "Kim Lee", 19: "Late, Jon"}
+    with zipfile.ZipFile("all.zip", "w") as packed:
+        for number, name in people.items():
+            file = f"{name}_{number}_assignsubmission_file_/s.zip"
+            packed.writestr(file, bundle_bytes(replace(ZOE, student=name)))
+    lists = {"Participant {}": "Identifier", "{}": "id", "s{}": "login"}
+    for of, column in lists.items():
+        rows = [f'{of.format(number)},"{name}"\n' for number, name in people.items()]
+        Path(f"{column}.csv").write_text(f"{column},name\n{''.join(rows)}", encoding="utf-8")
+
+    def run(column: str) -> tuple[batch.Summary, dict[str, str]]:
+        choices = batch.Choices(f"{column}.csv")
+        summary = batch.grade_folder("all.zip", overwrite=True, progress=False, choices=choices)
+        text = Path("all_report/moodle.csv").read_text(encoding="utf-8-sig")
+        rows = csv.DictReader(io.StringIO(text))
+        return summary, {row["Identifier"].split()[1]: row["Grade"] for row in rows}
+
+    summary, computed = run("id")
+    assert (summary.missing, len(table(Path("all_report")))) == ((), 3)
+    own = "who,student,overrule\n18,Kim Lee,77\n19,x,66\n20,Nobody,55\n21,Empty,\n"
+    Path("all_report/own_points.csv").write_text(own, encoding="utf-8")
+    for column, jon in (("id", "66"), ("Identifier", computed["19"])):
+        summary, grades = run(column)
+        assert grades == {"17": computed["17"], "18": "77", "19": jon}
+    assert "another row: 19 x; 20 Nobody." in str(summary)
+    own = own.replace("19,x", '19,"Jon Late"')
+    Path("all_report/own_points.csv").write_text(own, encoding="utf-8")
+    summary, grades = run("Identifier")
+    assert (grades["18"], grades["19"]) == ("77", "66")
+    assert "NOT USED, for these rows fit nobody of this class" in str(summary)
+    assert "another row: 20 Nobody." in Path("all_report/index.html").read_text(encoding="utf-8")
+    summary, grades = run("login")  # nothing tells the two apart
+    assert (summary.missing, len(table(Path("all_report")))) == ((), 3)
+    assert grades == {"17": computed["17"], "18": "77", "19": "66"}
+    flags = {row["who"]: row["flags"] for row in table(Path("all_report"))}
+    assert ["namesakes" in flags[who] for who in ("Moodle 17", "Moodle 18", "s19")] == [1, 1, 0]
 
 
 def test_without_an_lms_a_name_typed_twice_takes_nobodys_points(in_process, tmp_path):

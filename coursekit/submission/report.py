@@ -14,6 +14,7 @@ import io
 import math
 import re
 import statistics
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -36,6 +37,7 @@ from coursekit.submission.flags import (
     copies,
     flag_of,
     grouped,
+    person,
     place_of,
     same_words,
     words_of,
@@ -179,18 +181,24 @@ def across(
     lines: Sequence[ReportLine],
     roster: Roster | None = None,
     late_after: datetime | None = None,
-    own: Mapping[str, Mapping[str, str]] | None = None,
+    own: Sequence[Mapping[str, str]] = (),
 ) -> list[ReportLine]:
     """The lines with what only the class shows: who each is of and which of theirs counts, shared
     data and words, and a line for each of the roster who handed in nothing.
 
-    own: the instructor's points, by person. Without fingerprints, which are of no more use.
+    own: rows of the instructor's points. Without fingerprints, which are of no more use.
     """
-    roster, own = roster or Roster(), own or {}
+    roster = roster or Roster()
     for line in lines:  # first, so that a typed name can be known as somebody else's
         if (at := place_of(line.file)).lms:
             roster.of_place(at)
     who = {line.file: roster.of_file(line.file, line.student) for line in lines}
+    there = {one.key: one for one in who.values()}
+    enrolled = Counter(person(one.name) for one in roster.people.values() if one.row)
+    handed = Counter(person(one.name) for one in there.values())
+    for one in there.values():
+        roster.add(one)
+    rows = _own_rows(own, roster)
     done = [line for line in lines if line.points is not None]
     prints = {
         line.file: replace(line.fingerprint, student=who[line.file].key)
@@ -216,18 +224,34 @@ def across(
             facts = {"student": last.student, "file": last.file}
             facts |= {"points": _points(line.points), "better": _points(last.points)}
             flags.append(flag_of("earlier_bundle", note=True, **facts))
-        own_line = _of(line, one, own)
+        own_line = _of(line, one, rows)
         found.append(
             replace(own_line, flags=tuple(flags), counts=last is line, late=late, fingerprint=None)
         )
-    nothing, there = not_graded("", "missing"), {line.who for line in found}
-    missing = [one for one in roster.people.values() if one.key not in there]
-    return [*found, *(_of(nothing, one, own) for one in missing)]
+    nothing = not_graded("", "missing")
+    missing = [
+        one
+        for one in roster.people.values()
+        if one.key not in there and handed[person(one.name)] < enrolled[person(one.name)]
+    ]
+    return [*found, *(_of(nothing, one, rows) for one in missing)]
 
 
-def _of(line: ReportLine, one: Person, own: Mapping[str, Mapping[str, str]]) -> ReportLine:
+def _of(line: ReportLine, one: Person, rows: Mapping[str, Mapping[str, str]]) -> ReportLine:
     """The line with whose it is."""
-    return replace(line, who=one.key, name=one.name, row=one.row, own=own.get(one.key, {}))
+    return replace(line, who=one.key, name=one.name, row=one.row, own=rows.get(one.key, {}))
+
+
+def _own_rows(own: Sequence[Mapping[str, str]], roster: Roster) -> dict[str, Mapping[str, str]]:
+    """The instructor's rows by person: by `who`; of an older roster's by name and number, where
+    these are one person's who has no row."""
+    found: dict[str, Mapping[str, str]] = {}
+    for row in sorted(own, key=lambda row: row["who"] not in roster.people):
+        key = row["who"]
+        one = roster.people.get(key) or roster.named(row.get("student") or key, key)
+        if one is not None:
+            found.setdefault(one.key, row)
+    return found
 
 
 def _that_counts(some: Sequence[ReportLine]) -> tuple[ReportLine, tuple[Flag, ...]]:
@@ -486,10 +510,13 @@ def _ticks(low: float, high: float, about: int) -> list[float]:
 # --- the instructor's pages -----------------------------------------------------------------------
 
 
-def class_page(lines: Sequence[ReportLine], changes: Sequence[tuple[str, ...]] = ()) -> str:
+def class_page(
+    lines: Sequence[ReportLine], changes: Sequence[tuple[str, ...]] = (), warning: str = ""
+) -> str:
     """Distribution, misconceptions, flags, refused bundles, and a link to every student's page.
 
     lines: after `across`. A student counts once. changes: since the last report, of a regrade.
+    warning: stands first.
     """
     done = [line for line in lines if line.points is not None]
     counts = [line for line in done if line.counts]
@@ -500,6 +527,7 @@ def class_page(lines: Sequence[ReportLine], changes: Sequence[tuple[str, ...]] =
     return _page(
         what="class",
         lines=lines,
+        warning=warning,
         done=done,
         counts=counts,
         percents=percents,
