@@ -365,7 +365,7 @@ def test_one_file_under_two_names_is_to_look_at_though_its_data_are_everybodys()
     places = [f"{name}_{i}_assignsubmission_file_/s.zip" for i, name in enumerate(("Ann", "Bo"))]
     found = report.across([replace(one, file=place, flags=()) for place in places])
     assert set(notes(found, "same_file")) == set(places)
-    assert "One file under 2 names: all were packed as Student 0 on" in report.class_page(found)
+    assert "One file from 2 students: all are packed as Student 0, " in report.class_page(found)
     assert all("(Ann; Bo)" in says for says in notes(found, "same_file").values())
 
 

@@ -326,7 +326,7 @@ def _one_file(done: Sequence[ReportLine], who: Mapping[str, Person]) -> Iterator
 
 def _copy_flag(copy: Copy, who: Mapping[str, Person]) -> Flag:
     """The flag of bundles that share something, with the names of some who handed them in."""
-    some = [*dict.fromkeys(who[key].name or key for key in copy.keys)]
+    some = [*{who[key].key: who[key].name or key for key in copy.keys}.values()]
     names = "; ".join(some[:6]) + (f"; {len(some) - 6} more" * (len(some) > 6))
     return Flag(copy.code, f"{copy.says.rstrip('.')} ({names}).", copy.note)
 
