@@ -35,17 +35,11 @@ pytestmark = pytest.mark.usefixtures("ctrl_c_is_heard")
 USUAL = {"impossible_times", "not_distance_dependent"}  # of the small bundle
 SAMPLES = DATA / "sample_bundles"
 GRADED = ("ada_good", "ben_weak", "cleo_wrong", "dan_copied", "eve_formula")
-REFUSED = {
-    "hostile_bomb": "too_large",
-    "hostile_path": "unknown_member",
-    "hostile_truncated": "not_a_zip",
-    "not_a_bundle": "not_a_zip",
-}
 
 
-def table(out: Path) -> list[dict[str, str]]:
-    """The rows of a report's grades.csv."""
-    return list(csv.DictReader(io.StringIO((out / "grades.csv").read_text(encoding="utf-8-sig"))))
+def table(out: Path, name: str = "grades.csv") -> list[dict[str, str]]:
+    """The rows of a table in a report."""
+    return list(csv.DictReader(io.StringIO((out / name).read_text(encoding="utf-8-sig"))))
 
 
 def quick(folder: Path, names: Iterable[str]) -> Path:
@@ -95,7 +89,7 @@ def test_every_sample_bundle_has_its_row_in_the_order_of_names(report):
     rows = {row["file"].removesuffix(".zip"): row for row in table(report)}
     assert [row["file"] for row in rows.values()] == sorted(path.name for path in SAMPLES.iterdir())
     assert {rows[name]["status"] for name in GRADED} == {"graded"}
-    for name, reason in REFUSED.items():
+    for name, reason in EXPECTED["refused_samples"].items():
         assert rows[name]["status"] == f"not graded: {reason}"
         assert len(rows[name]["says"]) > 30
         assert rows[name]["points"] == ""
@@ -394,17 +388,7 @@ def test_a_folder_that_is_no_report_is_not_touched(mine, tmp_path):
     assert sorted(tmp_path.rglob("*")) == before
 
 
-CANNOT_GRADE = [
-    ({"folder": "nowhere"}, "there is no such folder"),
-    ({"folder": "empty"}, r"there is no bundle \(.zip\) in it or below it; want"),
-    ({"folder": "papers"}, "in it, only 1 other file; want"),
-    ({"workers": 0}, "workers: got 0, want a positive"),
-    ({"timeout_s": 0.0}, "timeout_s: got 0.0"),
-    ({"timeout_s": float("nan")}, "timeout_s: got nan"),
-]
-
-
-@pytest.mark.parametrize(("change", "message"), CANNOT_GRADE)
+@pytest.mark.parametrize(("change", "message"), EXPECTED["cannot_grade"])
 def test_what_cannot_be_is_said_before_anything_is_made(change, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     quick(tmp_path / "in", ["a"])
@@ -452,8 +436,7 @@ def test_everybody_of_a_class_has_a_row_and_nobodys_grade_is_anothers(
         names[13]: {"other_name"},
     }
     graded = {row["student"]: row["total"] for row in rows if row["counts"] == "yes"}
-    text = (out / f"{lms.lower()}.csv").read_text(encoding="utf-8-sig")
-    imported = {row[column]: row for row in csv.DictReader(io.StringIO(text))}
+    imported = {row[column]: row for row in table(out, f"{lms.lower()}.csv")}
     points = "Grade" if lms == "Moodle" else "Studio exercise 1"
     for i, name in enumerate(names):
         if name in graded or i < 2:
@@ -464,15 +447,12 @@ def test_everybody_of_a_class_has_a_row_and_nobodys_grade_is_anothers(
         )
 
 
-GRADEBOOK = EXPECTED["gradebook"]
-
-
 @pytest.mark.parametrize("lms", LMS)
 def test_what_the_instructor_decides_reaches_everybody(lms, in_process, tmp_path, monkeypatch):
     """From zip to import, with a gradebook of Canvas: a copied bundle, one that is late, a broken
     one, and nothing."""
     monkeypatch.chdir(tmp_path)
-    Path("class.csv").write_text(GRADEBOOK, encoding="utf-8")
+    Path("class.csv").write_text(EXPECTED["gradebook"], encoding="utf-8")
     typed = {"Eve Martin": "Hana Sato", "Łukasz Żółć": "lukasz zolc", "Bo Lee": ""}
     of, where = LMS[lms][0], {}
     with zipfile.ZipFile("all.zip", "w") as packed:
@@ -487,8 +467,7 @@ def test_what_the_instructor_decides_reaches_everybody(lms, in_process, tmp_path
 
     def run() -> tuple[str, dict[str, dict[str, str]], dict[str, str]]:
         said = str(batch.grade_folder("all.zip", progress=False, overwrite=True, choices=how))
-        text = (out / "canvas.csv").read_text(encoding="utf-8-sig")
-        rows = {row["Student"]: row for row in csv.DictReader(io.StringIO(text))}
+        rows = {row["Student"]: row for row in table(out, "canvas.csv")}
         with zipfile.ZipFile(out / "feedback.zip") as packed:
             pages = {name: packed.read(file).decode() for name, file in where.items()}
         return said, rows, pages
@@ -522,8 +501,7 @@ def test_what_the_instructor_decides_reaches_everybody(lms, in_process, tmp_path
     assert "<strong>0 of 100 points." in pages["Bo Lee"]
     assert "50 of 100 (yours; " in (out / "index.html").read_text(encoding="utf-8")
     if lms == "Moodle":
-        text = (out / "moodle.csv").read_text(encoding="utf-8-sig")
-        (bo,) = [row for row in csv.DictReader(io.StringIO(text)) if row["Full name"] == "Lee, Bo"]
+        (bo,) = [row for row in table(out, "moodle.csv") if row["Full name"] == "Lee, Bo"]
         assert (bo["Grade"], bo["Feedback comments"]) == ("0", "too late")
 
 

@@ -12,7 +12,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 import sample_submissions as samples
-from common import contrast
+from common import EXPECTED, contrast
 from hostile_bundles import BUNDLES
 from sample_submissions import PARAGRAPH, honest, with_part, with_row
 
@@ -274,15 +274,9 @@ def test_everybody_is_by_points_and_by_name(lines):
 
 
 def test_a_student_counts_once_with_the_newest_bundle():
-    handed = [  # who, when, and the points
-        ("Ann  Lee", "2026-03-02T10:00:00+00:00", 75.25),
-        ("ann lee ", "2026-03-04T10:00:00+00:00", 90.0),
-        ("ANN\u00a0LEE", "2026-03-03T23:00:00-05:00", 80.0),
-        ("Bob", "2026-03-02T10:00:00+00:00", 10.0),
-    ]
     some = [
         replace(said_by(name, "", made=made, points=points, of=100.0), file=f"{i}.zip")
-        for i, (name, made, points) in enumerate(handed)
+        for i, (name, made, points) in enumerate(EXPECTED["handed_in_twice"])
     ]
     found = report.across([*some, report.not_graded("x.zip", "truncated", "Half of it.")])
     assert [line.counts for line in found] == [False, True, False, True, True]
@@ -321,12 +315,7 @@ def test_the_same_words_are_a_flag_though_the_data_may_be_the_same():
 CHANGED = PARAGRAPH.replace("one pixel", "each pixel").replace("thirty", "30")
 LONGER = PARAGRAPH + " " + "I measured all of it on Tuesday with the lamp on. " * 2
 SHORT = "The bias dominates, I think."
-OWN = (
-    "At 0.45 m the bias dominates: averaging thirty frames leaves a tenth of a millimetre "
-    "of noise, but the bias is larger than that and stays, so I will calibrate the camera."
-)
-
-
+OWN = EXPECTED["paragraphs"]["own"]
 PAIRS = [
     pytest.param(PARAGRAPH, CHANGED, "nearly the same words", id="a few words changed"),
     pytest.param(PARAGRAPH, LONGER, "nearly the same words", id="sentences added"),
