@@ -346,16 +346,11 @@ def _hashes() -> Kinds:
 def _jsons() -> Kinds:
     name = "claims.json"
     claims = MEMBERS[name]
-    not_json = {
-        "no JSON": b"{'a': 1}",
-        "brackets that do not match": b"]]][[[",
-        "brackets of two kinds": b"[}",
+    not_json = {kind: text.encode("latin-1") for kind, text in BUNDLES["not_json"].items()} | {
         "half a JSON": claims[:40],
         "a byte order mark": b"\xef\xbb\xbf" + claims,
         "a string without end": b'"' + b'\\"' * 65_000,
         "UTF-16": claims.decode().encode("utf-16"),
-        "invalid UTF-8": b'{"rows": "\xff\xfe\x80"}',
-        "an overlong UTF-8": b'{"rows": "\xc0\xaf"}',
         "deep lists": b"[" * 60_000 + b"]" * 60_000,
         "deep objects": b'{"a":' * 20_000 + b"1" + b"}" * 20_000,
     }
@@ -402,11 +397,7 @@ def _arrays() -> Kinds:
     depth = {
         "a pickled object array": pickled.getvalue(),
         "a zip for an array": HONEST,
-        "a text for an array": b"1 2 3\n4 5 6\n",
-        "nothing for an array": b"",
-        "an array's magic only": b"\x93NUMPY\x01\x00",
         "a header of a list of 300 lists": npy(shape="[" * 300 + "]" * 300),
-        "a header beyond the end": b"\x93NUMPY\x01\x00\xff\xff{}",
         "sixty dimensions": npy(shape=f"({'1, ' * 60})"),
         "a dimension of 300 digits": npy(shape=f"({'9' * 300}, 4, 5)"),
     }
@@ -415,6 +406,7 @@ def _arrays() -> Kinds:
         for kind, header in BUNDLES["array_headers"].items()
     }
     depth |= {kind: npy(**header) for kind, header in given.items()}
+    depth |= {kind: text.encode("latin-1") for kind, text in BUNDLES["no_arrays"].items()}
     wild = {"NaN for a time": np.nan, "infinity for a time": np.inf, "a time of 1e300": 1e300}
     times = {k: npy("'<f8'", "(3,)", content=struct.pack("<3d", 0, 1, t)) for k, t in wild.items()}
     kinds = {k: ("bad_array", with_member("depth_0.npy", data)) for k, data in depth.items()}

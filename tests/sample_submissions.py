@@ -13,6 +13,7 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
+from common import EXPECTED
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
@@ -27,10 +28,7 @@ DISTANCES = (0.30, 0.45, 0.60)
 MADE = "2026-03-02T10:00:00+00:00"
 CLOCK_START_S = 1_772_440_000.0  # half an hour before MADE
 MATCHING_PX = 9
-PARAGRAPH = (
-    "I will mount the camera at 0.45 m. There the bias is larger than the noise of one pixel, and "
-    "the mean of thirty frames makes the noise smaller still. So the bias dominates: calibrate it."
-)
+PARAGRAPH = EXPECTED["paragraphs"]["honest"]
 SIMULATED = {"source": "simulated", "name": "Simulated D435", "serial": "seed-7"}
 OUTCOMES = {"depth_noise.twice_as_far": Outcome(True, 1), "depth_noise.width": Outcome(False, 2)}
 Counts = NDArray[Any]

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from common import NIGHTLY, refusals
+from common import NIGHTLY, derivative, refusals
 from scipy.linalg import block_diag
 
 from coursekit import arm as arms
@@ -69,12 +69,10 @@ def test_the_wrist_camera_is_where_the_description_puts_it() -> None:
 
 @pytest.mark.parametrize("tool", ["gripper", "flange"])
 def test_jacobian_is_the_numerical_one(tool: arms.Tool, anywhere: np.ndarray) -> None:
-    arm, step = widowx(), 1e-6
-    J = arm.jacobian(anywhere, tool)
-    for j in range(6):
-        change = step * np.eye(6)[j]
-        ahead, behind = arm.forward(anywhere + change, tool), arm.forward(anywhere - change, tool)
-        assert np.abs(J[..., j] - pose_difference(behind, ahead) / (2 * step)).max() < 1e-8
+    arm = widowx()
+    here = arm.forward(anywhere, tool)
+    J = derivative(lambda e: pose_difference(here, arm.forward(anywhere + e, tool)), 1e-6, 6)
+    assert np.abs(arm.jacobian(anywhere, tool) - J).max() < 1e-8
 
 
 def test_inverse_meets_the_pose_or_says_so() -> None:
@@ -208,12 +206,12 @@ def test_shared_columns_are_numerical_derivatives() -> None:
     by_joint = arm.jacobian(q)
     assert np.array_equal(model.shared[..., :6], by_joint)
     assert np.array_equal(model.shared[..., 6:12], by_joint * side[:, None, :])
-    step = 1e-6
-    for entry in range(42):
-        link = step * np.eye(42)[entry].reshape(7, 6)
-        ahead, behind = (arms.with_link_errors(arm, s * link) for s in (1, -1))
-        slope = pose_difference(behind.forward(q), ahead.forward(q)) / (2 * step)
-        assert np.abs(model.shared[..., 13 + entry] - slope).max() < 1e-8, model.names[13 + entry]
+
+    def off(links):
+        bent = arms.with_link_errors(arm, links.reshape(7, 6))
+        return pose_difference(arm.forward(q), bent.forward(q))
+
+    assert np.abs(model.shared[..., 13:] - derivative(off, 1e-6, 42)).max() < 1e-8
 
 
 def test_covariance_is_that_of_many_units() -> None:

@@ -17,7 +17,7 @@ from pathlib import Path
 import common
 import numpy as np
 import pytest
-from common import NIGHTLY, each, named, refusals
+from common import EXPECTED, NIGHTLY, each, named, refusals
 from scipy.spatial.transform import Rotation
 from scipy.stats import f, f_oneway, ncf, t
 
@@ -467,23 +467,10 @@ def test_text_comes_back_and_no_cell_is_a_formula(tmp_path, text):
     assert not cell.lstrip().startswith(("=", "+", "-", "@", "＝"))
 
 
-HEADER, EMPTY = ",".join(LEDGER_HEADER).encode() + b"\n", b"," * 15 + b"\n"
-
-
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (b"", "line 1: the header is 'nothing'"),
-        (b"a,b,c\n1,2,3\n", "line 1: the header"),
-        (HEADER + b"2026,cube,half a r", "line 2: has 3 fields"),
-        (HEADER + b"2026,cube,,many" + EMPTY, "noise_mm: got 'many'"),
-        (HEADER + b"2026,cube,,nan" + EMPTY, "noise_mm: got nan"),
-        (HEADER + b'"2026,cube', "line 2"),
-        (b"\xff\xfe\x00", "not UTF-8"),
-    ],
-)
+@pytest.mark.parametrize(("content", "words"), EXPECTED["damaged_ledgers"])
 def test_a_damaged_ledger_is_named_and_left_alone(tmp_path, content, words):
     ledger = Ledger(tmp_path / "ledger.csv")
+    content = content.replace("HEADER", ",".join(LEDGER_HEADER)).encode("latin-1")
     ledger.path.write_bytes(content)
     for act in (ledger.read, lambda: ledger.append(BUDGET)):
         with pytest.raises(ValueError, match=rf"ledger\.csv.*{words}"):

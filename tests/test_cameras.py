@@ -332,11 +332,10 @@ def test_nonsense_is_refused_with_what_is_wanted(which):
         open_camera(which)
 
 
-def test_a_name_makes_a_unit_of_ones_own(monkeypatch, tmp_path):
-    monkeypatch.setenv("COURSEKIT_RESULTS", str(tmp_path / "results"))
+def test_a_name_makes_a_unit_of_ones_own(monkeypatch, own_results):
     monkeypatch.setenv("COURSEKIT_CAMERA", "simulated")
     assert (ck.my_unit(), ck.my_unit(), open_camera().seed) == (7, 7, 7)
-    assert not (tmp_path / "results").exists()
+    assert not own_results.exists()
     mine = ck.my_unit("José Müller")
     assert mine == ck.my_unit("  jose MÜLLER ") == ck.my_unit() == open_camera().seed == 60769597
     assert open_camera("simulated", seed=8).seed == 8

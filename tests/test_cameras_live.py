@@ -223,17 +223,8 @@ def test_lock_fixes_the_exposure_that_the_camera_chose_and_waits_until_it_shows(
     before = rs.given
     sentence = camera.lock()
     assert rs.given - before == 1 + 6
-    assert rs.depth_sensor.set_calls == [
-        ("enable_auto_exposure", 0),
-        ("exposure", 8500),  # of the newest image, not the 33000 of the manual setting
-        ("gain", 16),
-    ]
-    assert rs.color_sensor.set_calls == [
-        ("enable_auto_exposure", 0),
-        ("exposure", 156),
-        ("gain", 64),
-        ("enable_auto_white_balance", 0),
-    ]
+    for sensor, calls in ((rs.depth_sensor, "depth"), (rs.color_sensor, "color")):
+        assert [*map(list, sensor.set_calls)] == EXPECTED["locked"][calls]
     assert rs.motion_sensor.set_calls == []
     assert sentence == (
         "Locked depth exposure at 8.5 ms, colour (manual setting) exposure at 15.6 ms, "

@@ -98,14 +98,8 @@ def pip_waiting(root: Path, child: subprocess.Popen) -> int:
 
 
 @pytest.fixture
-def course(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    spec = importlib.util.spec_from_file_location("course", ROOT / "course.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "course", module)
-    spec.loader.exec_module(module)
-    return module
+def course() -> ModuleType:
+    return importlib.import_module("course")
 
 
 # ---- the state of the environment ---------------------------------------------------------------

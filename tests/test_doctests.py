@@ -1,24 +1,19 @@
 """Examples in docstrings: all of them run, and functions that the notebooks use have one."""
 
-import ast
 import doctest
 import importlib
 import inspect
-import json
 import pkgutil
-from collections.abc import Iterator
-from pathlib import Path
+import re
 
 import pytest
 
 import coursekit
+from tools.build_notebooks import code_cells, find, joined, read
 
-NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 MODULES = [module.name for module in pkgutil.walk_packages(coursekit.__path__, "coursekit.")]
 ROOMS = ("geometry", "intrinsics", "stereo")  # whose functions must have an example
-WITHOUT = {
-    "intrinsics.fit_bow": "needs a whole session of views of a bowed board",
-}
+WITHOUT = {"intrinsics.fit_bow": "needs a whole session of views of a bowed board"}
 
 
 @pytest.mark.parametrize("name", MODULES)
@@ -30,23 +25,10 @@ def test_examples_run(name: str) -> None:
     assert doctest.testmod(module).failed == 0
 
 
-def used_by_notebooks() -> Iterator[str]:
-    """What the notebooks' cells name as ck.room.name, once each time."""
-    for path in NOTEBOOKS:
-        for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
-            if cell["cell_type"] != "code":
-                continue
-            lines = "".join(cell["source"]).splitlines()
-            code = "\n".join(line for line in lines if not line.startswith(("%", "!")))
-            for node in ast.walk(ast.parse(code)):
-                parts = ast.unparse(node).split(".") if isinstance(node, ast.Attribute) else []
-                if len(parts) == 3 and parts[0] == "ck":
-                    yield ".".join(parts[1:])
-
-
 def test_functions_that_notebooks_use_have_an_example() -> None:
     functions = {}
-    for name in set(used_by_notebooks()):
+    code = [joined(cell["source"]) for path in find([]) for cell in code_cells(read(path))]
+    for name in set(re.findall(r"\bck\.(\w+\.\w+)\b", "\n".join(code))):
         room, thing = name.split(".")
         if room in ROOMS and thing not in dir(importlib.import_module(f"coursekit.{room}")):
             pytest.fail(f"a notebook uses ck.{name}, which is not there")

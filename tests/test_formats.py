@@ -49,10 +49,7 @@ def wrote(folder, name, text, encoding="utf-8"):
 def test_ros_file_has_every_field_of_the_format() -> None:
     text = ck.export(LENS, "ros").text
     found = yaml.safe_load(text)
-    assert list(found) == [
-        "image_width", "image_height", "camera_name", "camera_matrix", "distortion_model",
-        "distortion_coefficients", "rectification_matrix", "projection_matrix",
-    ]  # fmt: skip
+    assert list(found) == EXPECTED["fields"]["ros"]
     assert (found["image_width"], found["image_height"]) == LENS.size
     assert found["distortion_model"] == "plumb_bob"
     matrix = {key: found[key]["data"] for key in found if isinstance(found[key], dict)}
@@ -149,10 +146,7 @@ TOPIC_1 = (
 OPEN3D_VIEW = json.dumps(
     {"class_name": "PinholeCameraParameters", "extrinsic": [1, 0], "intrinsic": json.loads(OPEN3D)}
 )
-OURS = json.dumps(
-    {"width": 640, "height": 480, "fx": 600.0, "fy": 601.0, "cx": 320.0, "cy": 240.0,
-     "model": "brown_conrady", "coeffs": [0.1, -0.2, 1e-05, 0.0, 0.0]}, indent=1
-)  # fmt: skip
+OURS = FILES["OURS"]
 SESSION = json.dumps({"mount": "eye_in_hand", "intrinsics": json.loads(OURS)})
 AS_WRITTEN = {
     "ros": ROS, "ros2 topic echo": TOPIC_2, "rostopic echo": TOPIC_1, "opencv": OPENCV,
@@ -218,11 +212,7 @@ test_lenses_that_are_not_supported = refusals(
 
 FOREIGN = {kind: text.encode("latin-1") for kind, text in FILES["foreign"].items()}
 FOREIGN["binary, or UTF-16 without"] = "width: 640\n".encode("utf-16-le")
-NO_LENS = FOREIGN | {
-    "a table of poses": b"file,x,y,z,qx,qy,qz,qw\na.png,1,2,3,0,0,0,1\n",
-    "easy_handeye2": b"parameters:\n  calibration_type: eye_in_hand\ntransform: {}\n",
-    "pose samples of MoveIt": b"- effector_wrt_world: [1]\n  object_wrt_sensor: [1]\n",
-}
+NO_LENS = FOREIGN | {kind: text.encode() for kind, text in FILES["of_poses"].items()}
 NO_TABLE = FOREIGN | {
     "camera_info of ROS": ROS.encode(),
     "OpenCV's FileStorage": OPENCV.encode(),
@@ -249,10 +239,7 @@ BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"{b}: &{b} [*{a}, *{a}, *{a}, *{a}, *{a}, *{a}, *{a}, *{a}, *{a}]\n"
     for a, b in zip("abcdefgh", "bcdefghi", strict=True)
 )
-LAUGHS = (
-    '<?xml version="1.0"?><!DOCTYPE l [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;">]>'
-    "<opencv_storage><x>&b;</x></opencv_storage>"
-)
+LAUGHS = FILES["LAUGHS"]
 HOSTILE = FILES["hostile"] | {
     "bomb": BOMB,
     "deep": "a: " + "[" * 5000,
@@ -377,18 +364,8 @@ def test_notations_give_one_camera(tmp_path, kind, mark, decimal) -> None:
     assert np.abs(found - HandEyeSession("eye_in_hand", ARM, SEEN).solve("park").X).max() < 1e-9
 
 
-UNSAID = {
-    "how": (IN_DEG, {}, "do not say how they turn"),
-    "unit": (THREE, {"rotation": "xyz"}, "whether in rad or in deg"),
-    "roll unit": ("x,y,z,roll,pitch,yaw", {}, "whether in rad or in deg"),
-    "both": (THREE, {}, "do not say how they turn"),
-    "letters": ("x,y,z,a,b,c", {"angle": "deg"}, "do not say how they turn"),
-}
-
-
-@pytest.mark.parametrize("kind", UNSAID)
-def test_what_is_not_said_is_not_guessed(tmp_path, kind) -> None:
-    columns, said, message = UNSAID[kind]
+@pytest.mark.parametrize(("columns", "said", "message"), EXPECTED["unsaid"])
+def test_what_is_not_said_is_not_guessed(tmp_path, columns, said, message) -> None:
     text = table(columns, (PLACES, VECTOR))
     with pytest.raises(ValueError, match=message) as refused:
         poses.read_table(wrote(tmp_path, "poses.csv", text), **said)
@@ -681,11 +658,7 @@ def from_launch(text):
 
 def from_calib(text):
     found = yaml.safe_load(text)
-    assert list(found["parameters"]) == [
-        "name", "calibration_type", "robot_base_frame", "robot_effector_frame",
-        "tracking_base_frame", "tracking_marker_frame", "freehand_robot_movement",
-        "move_group_namespace", "move_group",
-    ]  # fmt: skip
+    assert list(found["parameters"]) == EXPECTED["fields"]["easy_handeye2"]
     t, r = found["transform"]["translation"], found["transform"]["rotation"]
     T = make_transform(Rotation.from_quat([r[k] for k in "xyzw"]), [t[k] for k in "xyz"])
     in_hand = found["parameters"]["calibration_type"] == "eye_in_hand"
@@ -774,15 +747,14 @@ def test_places_that_are_not_said(result) -> None:
 
 
 @pytest.fixture
-def kept(tmp_path, monkeypatch, result):
-    monkeypatch.setenv("COURSEKIT_RESULTS", str(tmp_path / "results"))
+def kept(own_results, result):
     camera = type("Camera", (), {"source": "live", "name": "D435", "serial": "728612070259"})()
     quantity = {"fx": results.Quantity(LENS.fx, "px", 0.9)}
     results.save("03_intrinsics", camera, quantity, lens=LENS)
     placed = results.placement(result)
     above = results.Placement("base_link", results.OPTICAL, "eye_to_hand", result.X)
     results.save("04_hand_eye", camera, {}, placement=placed, eye_to_hand=above)
-    return tmp_path / "results"
+    return own_results
 
 
 def test_results_carry_all_that_a_robot_needs(kept, result) -> None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from common import by_opencv
+from common import by_opencv, each, named, refusals
 from scipy.spatial.transform import Rotation
 from simulated_hand_eye import BOARD, LENS, arm_session, corners_at, free_session, typical
 
@@ -351,12 +351,7 @@ def test_the_next_pose_needs_a_candidate():
         he.next_pose(replace(known.with_poses(), board=None).solve(), away)
 
 
-def test_an_error_study_of_nothing_is_refused():
-    for options, message in (
-        ({"poses": (2,)}, "poses: got 2, want a whole number of at least 3"),
-        ({"axes": (1,)}, r"axes: got \(1,\), want 2 or 3"),
-        ({"pairs": "some"}, "pairs: got 'some'"),
-        ({"ranges_deg": (0.0,)}, "ranges_deg: got 0.0"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            he.error_study(**options)
+test_an_error_study_of_nothing_is_refused = refusals(
+    *each("^poses: got 2, want a whole number of at least 3", he.error_study, "poses", (2,)),
+    *named(he.error_study, axes=[(1,)], pairs=["some"], ranges_deg=[(0.0,)]),
+)

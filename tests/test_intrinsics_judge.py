@@ -10,7 +10,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from common import refusals
+from common import EXPECTED, refusals
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import ttest_1samp
@@ -84,11 +84,7 @@ def test_few_views_are_said(good) -> None:
 
 # --- a lens that folds inside the image ---
 
-FOLDS = {  # (k1, k2, k3) and how far towards the corners boards were held
-    "in its corners": ((-0.283, 0.175, -0.316), 0),
-    "further in": ((-0.30, 0.10, -0.25), 1),
-    "a third one": ((-0.25, 0.12, -0.30), 2),
-}
+FOLDS = EXPECTED["folds"]
 
 
 def folding(coefficients, seed: int) -> Detections:

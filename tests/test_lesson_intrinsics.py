@@ -1,7 +1,6 @@
 """What notebook 03 teaches, against OpenCV, ranks of Jacobians and simulated sessions."""
 
 import shutil
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -141,9 +140,7 @@ def test_halves_tell_bow_and_shutter_from_noise_and_share_the_bias() -> None:
         name: ck.intrinsics.halves(corner_session(CHARUCO, LENS, 5, effects=effects)[0], CHARUCO)
         for name, effects in rooms.items()
     }
-    assert {name: h.noise_p_value < 1e-6 for name, h in both.items()} == {
-        "bow": True, "shutter": True, "healthy": False, "blur": False, "one": False,
-    }  # fmt: skip
+    assert {name for name, h in both.items() if h.noise_p_value < 1e-6} == {"bow", "shutter"}
     assert all(h.p_value > 0.01 for h in both.values())  # the stated sigmas count the views
     off = [half.value("fx") - LENS.fx for half in (both["bow"].first, both["bow"].second)]
     assert off == pytest.approx([-24, -12], abs=0.6)
@@ -163,14 +160,12 @@ def test_the_smallest_rms_is_that_of_scipys_fit() -> None:
             assert rms[k] == pytest.approx(np.sqrt(4 * cost / seen.size), rel=1e-3)
 
 
-def test_photographs_count_from_their_folder_to_the_file_that_is_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.usefixtures("own_results")
+def test_photographs_count_from_their_folder_to_the_file_that_is_kept(tmp_path, capsys) -> None:
     folder = tmp_path / "my_photos"
     folder.mkdir()
     for number in range(6):
         shutil.copy(ck.specifications.DATA / f"intrinsics_session/view_0{number}.jpg", folder)
-    monkeypatch.setenv("COURSEKIT_RESULTS", str(tmp_path / "results"))
     notebook = build_notebooks.read(build_notebooks.NOTEBOOKS / "03_intrinsics.ipynb")
     source = {c["id"]: build_notebooks.joined(c["source"]) for c in notebook["cells"]}
     own = source["capture"].replace("my_photos = None", f"my_photos = {str(folder)!r}")

@@ -9,6 +9,7 @@ import pytest
 from common import CHARUCO, by_opencv
 from matplotlib.colors import to_rgb
 from matplotlib.patches import Ellipse
+from test_lesson_intrinsics import X, Y, predict
 
 from coursekit import boards, budget, geometry, plots, specifications
 from coursekit.attribution import simulate_misses
@@ -219,21 +220,11 @@ def test_reciprocal_is_the_derivative() -> None:
 SESSION = specifications.DATA / "intrinsics_session"
 
 
-def toy(tilt_deg: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Corners of a board at 0.5 m, and where a camera of f = 600 px sees them."""
-    X, Y = (a.ravel() for a in np.meshgrid(np.linspace(-0.1, 0.1, 9), np.linspace(-0.06, 0.06, 6)))
-    tilt = np.radians(tilt_deg)
-    depth = 0.5 + X * np.sin(tilt)
-    u, v = 600 * X * np.cos(tilt) / depth, 600 * Y / depth
-    noise = np.random.default_rng(0).normal(0, 0.1, 2 * X.size)
-    return X, Y, np.concatenate([u, v]) + noise
-
-
 def intrinsics_figures() -> dict[str, plots.LessonFigure]:
     found, _ = corner_session(CHARUCO, D435.color, seed=1, views=10)
     flat, _ = corner_session(CHARUCO, D435.color, seed=1, views=10, effects=Effects(max_tilt_deg=8))
     two = {"P": calibrate(flat, CHARUCO), "Q": calibrate(found, CHARUCO)}
-    X, Y, seen = toy(30)
+    seen = predict(600, 0.5, np.radians(30)) + np.random.default_rng(0).normal(0, 0.1, 2 * X.size)
     shipped = [SESSION / f"view_0{n}.jpg" for n in (0, 1)]
     return {
         "best_fits": intrinsics.best_fits(X, Y, {"30 deg": seen}, 600.0),

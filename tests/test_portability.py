@@ -19,7 +19,6 @@ from typing import Any
 
 import pytest
 from common import EXPECTED
-from packaging.markers import Marker
 
 from coursekit.doctor import NEWEST_TESTED, OLDEST, pins
 
@@ -27,11 +26,6 @@ ROOT = Path(__file__).resolve().parents[1]
 BINDER = ROOT / ".binder"
 SHIPPED = ("coursekit", "tools")
 ALL = (*SHIPPED, "tests")
-SYSTEMS = {
-    "linux": {"sys_platform": "linux", "platform_system": "Linux", "os_name": "posix"},
-    "win32": {"sys_platform": "win32", "platform_system": "Windows", "os_name": "nt"},
-    "darwin": {"sys_platform": "darwin", "platform_system": "Darwin", "os_name": "posix"},
-}
 ONE_SYSTEM_ONLY = re.compile(
     "curses|fcntl|grp|msvcrt|nt|posix|pty|pwd|readline|resource|syslog|termios|tty|_?winapi|winreg"
 )
@@ -283,7 +277,7 @@ PYTHONS = [f"3.{minor}" for minor in range(OLDEST[1], NEWEST_TESTED[1] + 1)]
 def chosen(file: str, python: str, system: str, machine: str) -> dict[str, list[str]]:
     """The versions that a requirements file gives each package there."""
     about = {
-        **SYSTEMS[system],
+        **EXPECTED["systems"][system],
         "python_version": python,
         "python_full_version": f"{python}.4",
         "platform_machine": machine,
@@ -292,8 +286,8 @@ def chosen(file: str, python: str, system: str, machine: str) -> dict[str, list[
     }
     versions: dict[str, list[str]] = {}
     for pin in pins(ROOT / file):
-        if not pin.marker or Marker(pin.marker).evaluate(about):
-            versions.setdefault(pin.name, []).append(pin.version)
+        if not pin.marker or pin.marker.evaluate(about):
+            versions.setdefault(pin.name, []).append(str(pin.specifier))
     return versions
 
 

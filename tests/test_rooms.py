@@ -13,6 +13,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from common import EXPECTED
 
 import coursekit
 
@@ -21,15 +22,6 @@ README = PACKAGE.parent / "README.md"
 FILES = sorted(PACKAGE.rglob("*.py"))
 TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in FILES}
 MOST_FILES, MOST_LINES = 95, 20_000  # of the whole edition
-
-# Public names that stand in two modules, each with the reason why both are right.
-ONE_NAME_TWO_PLACES: dict[str, str] = {
-    "diagnose": "one question, asked of a camera's session and of a hand-eye session",
-    "table": "words prints any table; notebook 01 asks conventions for that of the vendor's models",
-    "cost_curve": "the figure of what the matcher's function computes",
-    "coverage": "the figure of what the fit's function counts",
-    "pixel_grid": "the figure of what geometry's function lists",
-}
 
 
 def map_rows(text: str) -> dict[str, list[str]]:
@@ -136,8 +128,8 @@ def test_a_public_name_means_one_thing() -> None:
             if not name.startswith("_"):
                 places[name].add(module(path))
     twice = {name: sorted(where) for name, where in places.items() if len(where) > 1}
-    assert len(ONE_NAME_TWO_PLACES) <= 10
-    assert set(twice) == set(ONE_NAME_TWO_PLACES), twice
+    assert set(twice) == set(EXPECTED["one_name_two_places"]), twice
+    assert len(twice) <= 10
 
 
 def test_no_private_name_is_used_from_another_module() -> None:

@@ -231,21 +231,14 @@ def test_paths_are_said_as_somebody_in_the_course_would_type_them(tmp_path, monk
 
 
 def test_what_was_answered_goes_along(kept, own_results):
-    kinds = {
-        "depth_noise.width": ("wrong", "right"),
-        "depth_noise.robust_depth": ("core right",),
-        "pinhole.zoom": ("right",),
-    }
     tried = {
         name: [{"kind": kind, "answer": "", "date": results.now()} for kind in tries]
-        for name, tries in kinds.items()
+        for name, tries in EXPECTED["answered"]["kinds"].items()
     }
     results.write_json(own_results / questions.RECORD, tried)
     found = handing_in.outcomes()
-    assert {name: (o.right, o.attempts) for name, o in found.items()} == {
-        "depth_noise.width": (True, 2),
-        "depth_noise.robust_depth": (False, 1),
-    }
+    counted = {name: [o.right, o.attempts] for name, o in found.items()}
+    assert counted == EXPECTED["answered"]["outcomes"]
     assert read_bundle(submit("Ada").path).outcomes == found
 
 

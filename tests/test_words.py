@@ -5,6 +5,7 @@ import string
 from pathlib import Path
 
 import pytest
+from common import EXPECTED
 
 from coursekit import doctor, words
 from coursekit.words import Finding, Findings
@@ -36,11 +37,7 @@ def test_each_finding_shows_what_it_is_its_evidence_and_its_remedy() -> None:
 
 def test_nothing_found_says_what_was_looked_for_and_what_was_not_tested() -> None:
     text = repr(Findings([], ["a bowed board", "blur"], ["a wrong square size; use a ruler."]))
-    assert text.splitlines() == [
-        "Nothing found.",
-        "Looked for: a bowed board; blur.",
-        "Not tested: a wrong square size; use a ruler.",
-    ]
+    assert text.splitlines() == EXPECTED["nothing_found"]
     assert not Findings()
 
 

@@ -147,8 +147,8 @@ class Summary:
 
 
 def _some(names: Sequence[str]) -> str:
-    """The first five of them."""
-    return "; ".join(names[:5]) + ("; ..." if len(names) > 5 else "")
+    """The first twenty of them."""
+    return "; ".join(names[:20]) + ("; ..." if len(names) > 20 else "")
 
 
 # ---- a batch ------------------------------------------------------------------------------------
@@ -658,10 +658,12 @@ def _finish(
     changes = list(_changes(_json(out / ROWS / CLASS), state))
     table = report.grades_csv(lines, how.separator)
     imports, notes = report.exports(lines, how.separator, how.assignment)
+    warning = _unused(own, lines)
+    notes = (*notes, *filter(None, [warning]))
     texts = {
         PARAGRAPHS: report.paragraphs_page(lines),
         SECOND: report.paragraphs_page(lines, named=False),
-        PAGE: report.class_page(lines, changes),
+        PAGE: report.class_page(lines, changes, warning),
         CSV: table,
         **imports,
         f"{ROWS}/{CLASS}": json.dumps({"csv": _digest(table), "state": state}),
@@ -708,18 +710,32 @@ def _write_pages(out: Path, bundles: list[Bundle], lines: Sequence[report.Report
     results.write_bytes(out / FEEDBACK, buffer.getvalue())
 
 
-def _own_points(path: Path) -> dict[str, dict[str, str]]:
-    """The instructor's own points, by person; none if there is no such file. Raises ValueError."""
-    found = {}
-    for row in class_table(path) if path.exists() else ():
-        for column in ("paragraph", "late", "overrule"):
-            try:
-                report.number_of(row.get(column, ""))
-            except ValueError:
-                facts = {"student": row.get("student"), "column": column, "got": row[column]}
-                raise ValueError(say("submission.no_points", file=path.name, **facts)) from None
-        found[row.get("who", "").removeprefix("'")] = row
-    return found
+def _own_points(path: Path) -> list[dict[str, str]]:
+    """The rows of the instructor's own points; none without such a file. Raises ValueError."""
+    rows = class_table(path) if path.exists() else []
+    worth = grading_rules()["points"]["paragraph"]
+    possible = {"paragraph": (0, worth), "late": (-100, 0), "overrule": (0, 100)}
+    for row in rows:
+        row["who"] = row.get("who", "").removeprefix("'")
+        row["student"] = row.get("student") or row["who"]
+        for column, (low, high) in possible.items():
+            got = row.get(column, "")
+            with contextlib.suppress(ValueError):
+                if low <= report.number_of(got) <= high:
+                    continue
+            limits = {"file": path.name, "low": low, "high": high}
+            raise ValueError(say("submission.no_points", row=row, column=column, got=got, **limits))
+    return rows
+
+
+def _unused(own: list[dict[str, str]], lines: Sequence[report.ReportLine]) -> str:
+    """Which of the instructor's rows with something in them reach nobody; "" for none."""
+    used = {id(line.own) for line in lines}
+    unused = (
+        row for row in own if id(row) not in used and any(map(row.get, report.OWN_COLUMNS[2:]))
+    )
+    names = "; ".join(f"{row['student']} ({row['who']})" for row in unused)
+    return say("submission.own_unused", file=OWN_POINTS, names=names) if names else ""
 
 
 def _state(line: report.ReportLine) -> list[Any]:
@@ -732,8 +748,12 @@ def _state(line: report.ReportLine) -> list[Any]:
 
 def _changes(before: dict[str, Any], state: dict[str, Any]) -> Iterator[tuple[str, ...]]:
     """Whose points changed since the last report: name, from, to, why."""
+    old = before.get("state", {})
+    files = {
+        was[3]: was for was in old.values() if was[3]
+    }  # with another roster who has another key
     for who, (name, total, topics, *bundle) in state.items():
-        was = before.get("state", {}).get(who)
+        was = old.get(who) or files.get(bundle[0])
         if was is None or was[1] == total:
             continue
         why = [

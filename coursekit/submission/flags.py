@@ -519,16 +519,17 @@ def _copy(
         where = " and ".join(f"{z:.2f} m" for z in sorted({z for z, _ in parts}))
         says = f"{many} {'the same' if exact else 'nearly the same'} frames at {where}"
         code = "nearly_identical"
-    innocent = ""
+    innocent, note = "", False
     if len({person(one.student) for one in some}) == 1:
-        innocent = ": they are of one student"
+        innocent, note = ": they are of one student", True
     elif (
         exact
         and {one.source for one in some} == {"simulated"}
         and len({one.camera for one in some}) == 1
     ):
-        innocent = f": {some[0].camera} gives everybody the same"
-    return Copy(tuple(keys), code, f"{says}{innocent}.", bool(innocent))
+        note = some[0].camera.endswith(f"seed-{grading_rules()['flags']['common_seed']:g}")
+        innocent = SEEN["common_seed" if note else "one_seed"].format(camera=some[0].camera)
+    return Copy(tuple(keys), code, f"{says}{innocent}.", note)
 
 
 # --- who is who -----------------------------------------------------------------------------
@@ -580,6 +581,11 @@ def spellings(name: str) -> set[str]:
     return {"".join(words[i:] + words[:i]) for i in range(len(words))}
 
 
+def bare(number: str) -> str:
+    """An id without the word that an LMS, or a report, puts before it: "Participant 17" is "17"."""
+    return re.sub(r"^(participant|moodle|canvas) (?=\d+$)", "", number.casefold())
+
+
 def person(name: str) -> str:
     """A name for telling whether two are one."""
     return min(spellings(name), default="")
@@ -610,30 +616,40 @@ class Roster:
             key = next(iter(ids.values()), person(name))
             want(key not in self.people, "roster", key, "every student once")
             clues = [*(f"#{column} {value}" for column, value in ids.items()), *ids.values()]
-            self._add(Person(key, name or key, row), clues)
+            self.add(Person(key, name or key, row), clues)
 
-    def _add(self, one: Person, clues: Iterable[str]) -> None:
+    def add(self, one: Person, clues: Sequence[str] = ()) -> None:
+        """One more of the class, who is found by the name and these."""
         self.people[one.key] = one
-        for clue in {*spellings(one.name), *map(str.casefold, clues)}:
+        for clue in {*spellings(one.name), *map(str.casefold, clues), *map(bare, clues)}:
             self._known.setdefault(clue, set()).add(one.key)
 
     def find(self, *clues: str) -> Person | None:
         """Who it is by the first of these names or ids that is one person's."""
-        for clue in clues:
-            hits: set[str] = set(self._known.get(clue.casefold(), ()))
-            hits = hits.union(*(self._known.get(spelling, ()) for spelling in spellings(clue)))
+        for hits in map(self._hits, clues):
             if len(hits) == 1:
                 return self.people[hits.pop()]
         return None
+
+    def named(self, name: str, number: str) -> Person | None:
+        """Who has a name; of several of that name the one with this number."""
+        hits = self._hits(name)
+        hits = hits & self._hits(bare(number)) if len(hits) > 1 else hits
+        return self.people[hits.pop()] if len(hits) == 1 else None
+
+    def _hits(self, clue: str) -> set[str]:
+        """The keys of all whom a name or an id fits."""
+        hits = (self._known.get(known, set()) for known in {clue.casefold(), *spellings(clue)})
+        return set().union(*hits)
 
     def of_place(self, at: Place) -> Person:
         """Who hands in from a place of an LMS: of the roster, or new."""
         key = f"{at.lms} {at.id}"
         clue = f"#identifier participant {at.id}" if at.lms == "Moodle" else f"#id {at.id}"
-        known = self.people.get(key) or self.find(clue, at.name)
+        known = self.people.get(key) or self.find(clue) or self.named(at.name, at.id)
         if known is None or (known.key != key and not known.row):  # another of the same name
             known = Person(key, at.name)
-            self._add(known, [key])
+            self.add(known, [key])
         return known
 
     def of_file(self, file: str, typed: str) -> Person:
@@ -646,7 +662,11 @@ class Roster:
         return found or Person(person(typed) or f"file {file}", typed)
 
     def other_name(self, one: Person, typed: str) -> Iterator[Flag]:
-        """What to say where the name in a bundle is not that of who handed it in."""
+        """What to say where the name in a bundle is not that of who handed it in, or could be that
+        of several."""
+        keys = sorted(key for key in self._hits(one.name) if self.people[key].row)
+        if len(keys) > 1 and not one.row:
+            yield flag_of("namesakes", name=one.name, n=len(keys), ids="; ".join(keys))
         if not typed or spellings(typed) & spellings(one.name) or typed.strip() in one.row.values():
             return
         other = self.find(typed)

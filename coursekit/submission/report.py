@@ -14,6 +14,7 @@ import io
 import math
 import re
 import statistics
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -36,6 +37,7 @@ from coursekit.submission.flags import (
     copies,
     flag_of,
     grouped,
+    person,
     place_of,
     same_words,
     words_of,
@@ -48,7 +50,6 @@ from coursekit.words import counted
 HEADER = (*HEADINGS["first"], *LABELS, *HEADINGS["last"])  # of grades.csv
 FAILED = ("timeout", "died", "memory", "error", "lost")  # reasons; tried anew by the next run
 NOTHING, GONE = WORDS["failed"]["missing"], WORDS["failed"]["gone"]
-AGAIN = "Your file could not be read: hand it in again."
 MOODLE_COLUMNS, CANVAS_COLUMNS, OWN_COLUMNS = (HEADINGS[k] for k in ("moodle", "canvas", "own"))
 FORMULA = tuple("=+-@\t\r\n＝＋－＠")  # what makes a spreadsheet calculate a cell
 HERE = Path(__file__).parent
@@ -101,10 +102,14 @@ class ReportLine:
             return number_of(self.own["overrule"])
         if self.points is None:
             return None
-        machine = sum(item.points for item in self.items if item.topic == "paragraph")
         own = self.own.get("paragraph")
-        paragraph = number_of(own) if own else machine
-        return round(self.points - machine + paragraph + number_of(self.own.get("late", "")), 2)
+        more = number_of(own) - self.computed_paragraph if own else 0.0
+        return round(self.points + more + number_of(self.own.get("late", "")), 2)
+
+    @property
+    def computed_paragraph(self) -> float:
+        """The points that the program gave for the paragraph."""
+        return sum(item.points for item in self.items if item.topic == "paragraph")
 
     @property
     def code(self) -> str:
@@ -179,18 +184,24 @@ def across(
     lines: Sequence[ReportLine],
     roster: Roster | None = None,
     late_after: datetime | None = None,
-    own: Mapping[str, Mapping[str, str]] | None = None,
+    own: Sequence[Mapping[str, str]] = (),
 ) -> list[ReportLine]:
     """The lines with what only the class shows: who each is of and which of theirs counts, shared
     data and words, and a line for each of the roster who handed in nothing.
 
-    own: the instructor's points, by person. Without fingerprints, which are of no more use.
+    own: rows of the instructor's points. Without fingerprints, which are of no more use.
     """
-    roster, own = roster or Roster(), own or {}
+    roster = roster or Roster()
     for line in lines:  # first, so that a typed name can be known as somebody else's
         if (at := place_of(line.file)).lms:
             roster.of_place(at)
     who = {line.file: roster.of_file(line.file, line.student) for line in lines}
+    there = {one.key: one for one in who.values()}
+    enrolled = Counter(person(one.name) for one in roster.people.values() if one.row)
+    handed = Counter(person(one.name) for one in there.values())
+    for one in there.values():
+        roster.add(one)
+    rows = _own_rows(own, roster)
     done = [line for line in lines if line.points is not None]
     prints = {
         line.file: replace(line.fingerprint, student=who[line.file].key)
@@ -198,8 +209,8 @@ def across(
         if line.fingerprint is not None
     }
     said = {line.file: (who[line.file].key, line.paragraph) for line in done}
-    shared = [*copies(prints), *same_words(said)]
-    about = grouped((key, _copy_flag(copy)) for copy in shared for key in copy.keys)
+    shared = [*copies(prints), *same_words(said), *_one_file(done, who)]
+    about = grouped((key, _copy_flag(copy, who)) for copy in shared for key in copy.keys)
     theirs = grouped((who[line.file].key, line) for line in lines)
     chosen = {
         key: _that_counts([line for line in some if line.points is not None] or some)
@@ -209,25 +220,37 @@ def across(
     for line in lines:
         one = who[line.file]
         last, more = chosen[one.key]
-        late = _late(line, late_after)
         flags = [*line.flags, *about.get(line.file, ()), *more, *_clock(line)]
         flags += roster.other_name(one, line.student)
         if last is not line and line.points is not None:
             facts = {"student": last.student, "file": last.file}
             facts |= {"points": _points(line.points), "better": _points(last.points)}
             flags.append(flag_of("earlier_bundle", note=True, **facts))
-        own_line = _of(line, one, own)
-        found.append(
-            replace(own_line, flags=tuple(flags), counts=last is line, late=late, fingerprint=None)
-        )
-    nothing, there = not_graded("", "missing"), {line.who for line in found}
-    missing = [one for one in roster.people.values() if one.key not in there]
-    return [*found, *(_of(nothing, one, own) for one in missing)]
+        own_line = replace(_of(line, one, rows), flags=tuple(flags), fingerprint=None)
+        found.append(replace(own_line, counts=last is line, late=_late(line, late_after)))
+    nothing = not_graded("", "missing")
+    missing = [
+        one
+        for one in roster.people.values()
+        if one.key not in there and handed[person(one.name)] < enrolled[person(one.name)]
+    ]
+    return [*found, *(_of(nothing, one, rows) for one in missing)]
 
 
-def _of(line: ReportLine, one: Person, own: Mapping[str, Mapping[str, str]]) -> ReportLine:
+def _of(line: ReportLine, one: Person, rows: Mapping[str, Mapping[str, str]]) -> ReportLine:
     """The line with whose it is."""
-    return replace(line, who=one.key, name=one.name, row=one.row, own=own.get(one.key, {}))
+    return replace(line, who=one.key, name=one.name, row=one.row, own=rows.get(one.key, {}))
+
+
+def _own_rows(own: Sequence[Mapping[str, str]], roster: Roster) -> dict[str, Mapping[str, str]]:
+    """The instructor's rows by person: by `who`; of an older roster's by name and number, where
+    these are one person's who has no row."""
+    found: dict[str, Mapping[str, str]] = {}
+    for row in sorted(own, key=lambda row: row["who"] not in roster.people):
+        one = roster.people.get(row["who"]) or roster.named(row["student"], row["who"])
+        if one is not None:
+            found.setdefault(one.key, row)
+    return found
 
 
 def _that_counts(some: Sequence[ReportLine]) -> tuple[ReportLine, tuple[Flag, ...]]:
@@ -239,9 +262,7 @@ def _that_counts(some: Sequence[ReportLine]) -> tuple[ReportLine, tuple[Flag, ..
     newest = max(some, key=_moment)
     if len(some) == 1 or place_of(newest.file).lms:
         return newest, ()
-    best = max(some, key=lambda line: line.points or 0.0)
-    if (newest.points or 0.0) >= (best.points or 0.0):
-        best = newest
+    best = max(some, key=lambda line: (line.points or 0.0, _moment(line)))
     folders = {line.file.rpartition("/")[0] for line in some}
     if best is newest and len(folders) == 1:
         return best, ()
@@ -277,8 +298,10 @@ def _late(line: ReportLine, late_after: datetime | None) -> str:
     when = line.handed_in or line.made
     over = _moment(line) - late_after.timestamp() if late_after is not None else 0.0
     if over > 0:
-        hours = math.ceil(over / 3600)
-        much = counted(hours, "hour") if hours < 24 else counted(math.ceil(hours / 24), "day")
+        hours, minutes = divmod(math.ceil(over / 60), 60)
+        much = f"{hours} h {minutes} min"
+        if hours >= 24:
+            much = f"{counted(hours // 24, 'day')} {hours % 24} h"
         return f"{_date(when)}: {much} late"
     return f"{_date(when)}: late, as Canvas says" if place_of(line.file).late else ""
 
@@ -291,9 +314,20 @@ def _date(moment: str) -> str:
     return f"{then.day} {then:%B %Y, %H:%M} {then.tzname() or ''}".strip()
 
 
-def _copy_flag(copy: Copy) -> Flag:
-    """The flag of bundles that share something, with the names of some of them."""
-    names = ", ".join(copy.keys[:6]) + (f", {len(copy.keys) - 6} more" * (len(copy.keys) > 6))
+def _one_file(done: Sequence[ReportLine], who: Mapping[str, Person]) -> Iterator[Copy]:
+    """Files that several people handed in: whoever packs writes a name and the second."""
+    packed = grouped(((line.student, line.made), line.file) for line in done)
+    for (typed, made), files in packed.items():
+        n = len({who[file].key for file in files})
+        if n > 1:
+            says = flag_of("same_file", n=n, typed=typed, made=_date(made)).says
+            yield Copy(tuple(files), "same_file", says)
+
+
+def _copy_flag(copy: Copy, who: Mapping[str, Person]) -> Flag:
+    """The flag of bundles that share something, with the names of some who handed them in."""
+    some = [*{who[key].key: who[key].name or key for key in copy.keys}.values()]
+    names = "; ".join(some[:6]) + (f"; {len(some) - 6} more" * (len(some) > 6))
     return Flag(copy.code, f"{copy.says.rstrip('.')} ({names}).", copy.note)
 
 
@@ -311,19 +345,22 @@ def student_page(line: ReportLine, body: str) -> str:
 
 def _decided(line: ReportLine) -> str:
     """Which points the instructor gave, for the student; "" for none."""
-    words = {"paragraph": "for the paragraph", "late": "for late days", "overrule": "in all"}
-    given = [key for key in words if line.own.get(key)]
-    given = ["overrule"] if "overrule" in given else given
-    said = [f"{_points(number_of(line.own[key]))} {words[key]}" for key in given]
-    computed = "" if line.points is None else f" ({_points(line.points)} were computed)"
-    return f"Points that your instructor set: {', '.join(said)}{computed}." if said else ""
+    facts = {"points": _points(line.points), "of": _points(line.of)}
+    computed = "" if line.points is None else SAYS["computed"].format(**facts)
+    if line.own.get("overrule"):
+        return SAYS["total_set"] + computed
+    instead = f"for the paragraph, in place of {_points(line.computed_paragraph)}"
+    words = {"paragraph": instead, "late": "for late days"}
+    said = [f"{_points(number_of(line.own[k]))} {words[k]}" for k in words if line.own.get(k)]
+    return f"Points that your instructor set: {'; '.join(said)}.{computed}" if said else ""
 
 
 def _told(line: ReportLine) -> str:
     """What somebody without points is told; nothing where it is the grader that failed."""
     if line.total is not None or line.reason in FAILED:
         return ""
-    return line.says if line.reason == "missing" else AGAIN
+    again = SAYS["again"].format(file=line.file.rpartition("/")[2], says=line.says)
+    return line.says if line.reason == "missing" else again
 
 
 def page_body(grade: Grade, submission: Submission) -> str:
@@ -486,10 +523,13 @@ def _ticks(low: float, high: float, about: int) -> list[float]:
 # --- the instructor's pages -----------------------------------------------------------------------
 
 
-def class_page(lines: Sequence[ReportLine], changes: Sequence[tuple[str, ...]] = ()) -> str:
+def class_page(
+    lines: Sequence[ReportLine], changes: Sequence[tuple[str, ...]] = (), warning: str = ""
+) -> str:
     """Distribution, misconceptions, flags, refused bundles, and a link to every student's page.
 
     lines: after `across`. A student counts once. changes: since the last report, of a regrade.
+    warning: stands first.
     """
     done = [line for line in lines if line.points is not None]
     counts = [line for line in done if line.counts]
@@ -500,6 +540,7 @@ def class_page(lines: Sequence[ReportLine], changes: Sequence[tuple[str, ...]] =
     return _page(
         what="class",
         lines=lines,
+        warning=warning,
         done=done,
         counts=counts,
         percents=percents,

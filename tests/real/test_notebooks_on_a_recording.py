@@ -2,20 +2,13 @@
 
 import nbformat
 import pytest
-from common import nightly
+from common import EXPECTED, nightly
 
 from tools import build_notebooks
 
 pytest.importorskip("pyrealsense2", reason="no pyrealsense2 for this platform")
 pytestmark = pytest.mark.real
 PATHS = build_notebooks.find([])
-HONEST = {  # what two frames of one scene cannot give, by cell
-    "02_depth_noise": {
-        "fit": "no law can be fitted",
-        "averaging-figure": "nothing can be said about averaging",
-        "studio-capture": "needs a camera or a set",
-    },
-}
 
 
 @pytest.mark.parametrize(  # the later ones take little more than a name from the camera
@@ -32,5 +25,5 @@ def test_every_cell_runs_on_the_recording_and_says_what_it_is(path, real_data, t
     said = {cell.id: str(cell.outputs) for cell in cells}
     assert "Intel RealSense D435 (recording single_depth_color_640x480.bag)" in said["setup"]
     assert [o for cell in cells for o in cell.outputs if o.get("name") == "stderr"] == []
-    for cell, words in HONEST.get(path.stem, {}).items():
+    for cell, words in EXPECTED["of_two_frames"].get(path.stem, {}).items():
         assert words in said[cell]
