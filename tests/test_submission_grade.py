@@ -470,8 +470,10 @@ def test_a_copy_is_found_whichever_came_first(how, unit):
         assert not found.note
 
 
+SEED_22 = replace(SIMULATED, camera=replace(SIMULATED.camera, serial="seed-22"))
 SAME_DEPTHS = {
     "two simulations": (SIMULATED, replace(SIMULATED, student="Two"), "gives everybody the same"),
+    "another's seed": (SEED_22, replace(SEED_22, student="Two"), ""),
     "one as live": (SIMULATED, replace(SIMULATED, camera=samples.camera(3), student="Two"), ""),
     "handed in twice": (GOOD, replace(GOOD, student=GOOD.student.upper()), "of one student"),
     "one real camera": (GOOD, replace(GOOD, student="Two"), ""),
@@ -483,6 +485,7 @@ def test_the_same_by_right_is_a_note(one, two, note):
     found = shared(one, two)
     assert found.note == bool(note)
     assert note in found.says
+    assert ("only if you gave them all this seed" in found.says) == (one is SEED_22)
 
 
 def test_strangers_and_two_measurements_with_one_camera_at_one_place_are_not_copies():

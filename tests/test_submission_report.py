@@ -5,6 +5,7 @@ import io
 import json
 import re
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from html import escape
 from html.parser import HTMLParser
 
@@ -345,7 +346,67 @@ def test_twins_of_a_bundle_with_a_near_copy_are_all_flagged():
     handed = {"a.zip": GOOD, "b.zip": replace(GOOD, student="Twin"), "c.zip": near}
     found = report.across([line_of(submission, file) for file, submission in handed.items()])
     assert set(notes(found, "nearly_identical")) == set(handed)
-    assert "(a.zip, b.zip, c.zip)" in notes(found, "nearly_identical")["b.zip"]
+    assert "(Student 0; Twin; Copying Student)" in notes(found, "nearly_identical")["b.zip"]
+
+
+def test_one_file_under_two_names_is_to_look_at_though_its_data_are_everybodys():
+    one = line_of(honest(0, 20, samples.SIMULATED))
+    places = [f"{name}_{i}_assignsubmission_file_/s.zip" for i, name in enumerate(("Ann", "Bo"))]
+    found = report.across([replace(one, file=place, flags=()) for place in places])
+    assert set(notes(found, "same_file")) == set(places)
+    assert "One file from 2 students: all are packed as Student 0, " in report.class_page(found)
+    assert all("(Ann; Bo)" in says for says in notes(found, "same_file").values())
+
+
+@pytest.mark.parametrize(
+    ("handed", "typed", "known"),
+    [
+        ("lovelaceada_17_18_s.zip", "Ada  LOVELACE", "Lovelace, Ada"),
+        ("Dan Copied_17_assignsubmission_file_/s.zip", "Copied, Dan", "Dan Copied"),
+        ("obriensean_17_18_s.zip", "Sean O\u2019Brien", "O'Brien, Sean"),
+        ("Zoe Muller_17_assignsubmission_file_/s.zip", "zoë müller-", "Müller, Zoë"),
+    ],
+)
+def test_a_name_written_in_another_way_is_not_held_against_anybody(handed, typed, known):
+    first = " ".join(reversed(known.split(", ")))
+    line = replace(line_of(GOOD), student=typed, file=handed)
+    (same,) = report.across([line], report.Roster([{"name": known}]))
+    text = report.student_page(same, "")
+    assert f"Studio exercise 1: {first}" in check_page(text).text
+    assert "The name in the file is" not in text
+    (other,) = report.across([replace(line, student="Eve")], report.Roster([{"name": known}]))
+    assert "The name in the file is Eve." in report.student_page(other, "")
+
+
+def test_the_students_page_says_what_the_instructor_set():
+    line = line_of(WRONG["sign"][1])
+    own = {"paragraph": "1", "late": "-10"}
+    text = report.student_page(replace(line, own=own), "")
+    said = "Points that your instructor set: 1 for the paragraph, in place of 2; -10 for late days."
+    assert f"{said} Computed were {line.points:g} of 100 points" in text
+    assert "cost some" in text
+    text = report.student_page(replace(line, own={"overrule": "75"}), "")
+    assert "<strong>75 of 100 points." in text
+    assert "Your instructor set the total. Computed were" in text
+    assert "cost some" not in text
+
+
+@pytest.mark.parametrize(
+    ("after", "said"),
+    [(861, "14 h 21 min"), (1440, "1 day 0 h"), (3000, "2 days 2 h"), (1, "0 h 1 min")],
+)
+def test_late_is_said_to_the_minute_not_rounded_up(after, said):
+    due = datetime(2026, 3, 2, 12, tzinfo=UTC)
+    line = replace(line_of(GOOD), made=(due + timedelta(minutes=after)).isoformat())
+    (late,) = report.across([line], late_after=due)
+    assert late.late.endswith(f": {said} late")
+
+
+def test_whoever_hands_in_an_essay_reads_which_file_and_what_is_wanted():
+    line = report.not_graded("Bo_17_assignsubmission_file_/e.docx", "no_bundle", files="e.docx")
+    text = report.student_page(line, "")
+    assert "Your file e.docx could not be read, so hand it in again." in text
+    assert "Wanted is the .zip" in text
 
 
 def test_all_paragraphs_are_on_a_page_with_name_and_link(lines):

@@ -147,8 +147,8 @@ class Summary:
 
 
 def _some(names: Sequence[str]) -> str:
-    """The first five of them."""
-    return "; ".join(names[:5]) + ("; ..." if len(names) > 5 else "")
+    """The first twenty of them."""
+    return "; ".join(names[:20]) + ("; ..." if len(names) > 20 else "")
 
 
 # ---- a batch ------------------------------------------------------------------------------------
@@ -717,28 +717,25 @@ def _own_points(path: Path) -> list[dict[str, str]]:
     possible = {"paragraph": (0, worth), "late": (-100, 0), "overrule": (0, 100)}
     for row in rows:
         row["who"] = row.get("who", "").removeprefix("'")
+        row["student"] = row.get("student") or row["who"]
         for column, (low, high) in possible.items():
             got = row.get(column, "")
             with contextlib.suppress(ValueError):
                 if low <= report.number_of(got) <= high:
                     continue
-            name, at = row.get("student") or row["who"], {"file": path.name, "column": column}
-            raise ValueError(
-                say("submission.no_points", student=name, got=got, low=low, high=high, **at)
-            )
+            limits = {"file": path.name, "low": low, "high": high}
+            raise ValueError(say("submission.no_points", row=row, column=column, got=got, **limits))
     return rows
 
 
 def _unused(own: list[dict[str, str]], lines: Sequence[report.ReportLine]) -> str:
     """Which of the instructor's rows with something in them reach nobody; "" for none."""
     used = {id(line.own) for line in lines}
-    lost = [
-        f"{row['who']} {row.get('student', '')}".strip()
-        for row in own
-        if id(row) not in used and any(map(row.get, report.OWN_COLUMNS[2:]))
-    ]
-    names = "; ".join(lost)
-    return say("submission.own_unused", file=OWN_POINTS, names=names) if lost else ""
+    unused = (
+        row for row in own if id(row) not in used and any(map(row.get, report.OWN_COLUMNS[2:]))
+    )
+    names = "; ".join(f"{row['student']} ({row['who']})" for row in unused)
+    return say("submission.own_unused", file=OWN_POINTS, names=names) if names else ""
 
 
 def _state(line: report.ReportLine) -> list[Any]:

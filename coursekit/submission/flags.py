@@ -519,16 +519,17 @@ def _copy(
         where = " and ".join(f"{z:.2f} m" for z in sorted({z for z, _ in parts}))
         says = f"{many} {'the same' if exact else 'nearly the same'} frames at {where}"
         code = "nearly_identical"
-    innocent = ""
+    innocent, note = "", False
     if len({person(one.student) for one in some}) == 1:
-        innocent = ": they are of one student"
+        innocent, note = ": they are of one student", True
     elif (
         exact
         and {one.source for one in some} == {"simulated"}
         and len({one.camera for one in some}) == 1
     ):
-        innocent = f": {some[0].camera} gives everybody the same"
-    return Copy(tuple(keys), code, f"{says}{innocent}.", bool(innocent))
+        note = some[0].camera.endswith(f"seed-{grading_rules()['flags']['common_seed']:g}")
+        innocent = SEEN["common_seed" if note else "one_seed"].format(camera=some[0].camera)
+    return Copy(tuple(keys), code, f"{says}{innocent}.", note)
 
 
 # --- who is who -----------------------------------------------------------------------------
@@ -636,11 +637,6 @@ class Roster:
         hits = hits & self._hits(bare(number)) if len(hits) > 1 else hits
         return self.people[hits.pop()] if len(hits) == 1 else None
 
-    def namesakes(self, one: Person) -> list[Person]:
-        """Of the roster, all who have the name of somebody who could be any of them."""
-        some = [self.people[key] for key in self._hits(one.name) if self.people[key].row]
-        return some if len(some) > 1 and not one.row else []
-
     def _hits(self, clue: str) -> set[str]:
         """The keys of all whom a name or an id fits."""
         hits = (self._known.get(known, set()) for known in {clue.casefold(), *spellings(clue)})
@@ -668,9 +664,9 @@ class Roster:
     def other_name(self, one: Person, typed: str) -> Iterator[Flag]:
         """What to say where the name in a bundle is not that of who handed it in, or could be that
         of several."""
-        if several := self.namesakes(one):
-            ids = "; ".join(other.key for other in several)
-            yield flag_of("namesakes", name=one.name, n=len(several), ids=ids)
+        keys = sorted(key for key in self._hits(one.name) if self.people[key].row)
+        if len(keys) > 1 and not one.row:
+            yield flag_of("namesakes", name=one.name, n=len(keys), ids="; ".join(keys))
         if not typed or spellings(typed) & spellings(one.name) or typed.strip() in one.row.values():
             return
         other = self.find(typed)

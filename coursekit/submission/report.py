@@ -50,7 +50,6 @@ from coursekit.words import counted
 HEADER = (*HEADINGS["first"], *LABELS, *HEADINGS["last"])  # of grades.csv
 FAILED = ("timeout", "died", "memory", "error", "lost")  # reasons; tried anew by the next run
 NOTHING, GONE = WORDS["failed"]["missing"], WORDS["failed"]["gone"]
-AGAIN = "Your file could not be read: hand it in again."
 MOODLE_COLUMNS, CANVAS_COLUMNS, OWN_COLUMNS = (HEADINGS[k] for k in ("moodle", "canvas", "own"))
 FORMULA = tuple("=+-@\t\r\n＝＋－＠")  # what makes a spreadsheet calculate a cell
 HERE = Path(__file__).parent
@@ -103,10 +102,14 @@ class ReportLine:
             return number_of(self.own["overrule"])
         if self.points is None:
             return None
-        machine = sum(item.points for item in self.items if item.topic == "paragraph")
         own = self.own.get("paragraph")
-        paragraph = number_of(own) if own else machine
-        return round(self.points - machine + paragraph + number_of(self.own.get("late", "")), 2)
+        more = number_of(own) - self.computed_paragraph if own else 0.0
+        return round(self.points + more + number_of(self.own.get("late", "")), 2)
+
+    @property
+    def computed_paragraph(self) -> float:
+        """The points that the program gave for the paragraph."""
+        return sum(item.points for item in self.items if item.topic == "paragraph")
 
     @property
     def code(self) -> str:
@@ -206,8 +209,8 @@ def across(
         if line.fingerprint is not None
     }
     said = {line.file: (who[line.file].key, line.paragraph) for line in done}
-    shared = [*copies(prints), *same_words(said)]
-    about = grouped((key, _copy_flag(copy)) for copy in shared for key in copy.keys)
+    shared = [*copies(prints), *same_words(said), *_one_file(done, who)]
+    about = grouped((key, _copy_flag(copy, who)) for copy in shared for key in copy.keys)
     theirs = grouped((who[line.file].key, line) for line in lines)
     chosen = {
         key: _that_counts([line for line in some if line.points is not None] or some)
@@ -217,17 +220,14 @@ def across(
     for line in lines:
         one = who[line.file]
         last, more = chosen[one.key]
-        late = _late(line, late_after)
         flags = [*line.flags, *about.get(line.file, ()), *more, *_clock(line)]
         flags += roster.other_name(one, line.student)
         if last is not line and line.points is not None:
             facts = {"student": last.student, "file": last.file}
             facts |= {"points": _points(line.points), "better": _points(last.points)}
             flags.append(flag_of("earlier_bundle", note=True, **facts))
-        own_line = _of(line, one, rows)
-        found.append(
-            replace(own_line, flags=tuple(flags), counts=last is line, late=late, fingerprint=None)
-        )
+        own_line = replace(_of(line, one, rows), flags=tuple(flags), fingerprint=None)
+        found.append(replace(own_line, counts=last is line, late=_late(line, late_after)))
     nothing = not_graded("", "missing")
     missing = [
         one
@@ -247,8 +247,7 @@ def _own_rows(own: Sequence[Mapping[str, str]], roster: Roster) -> dict[str, Map
     these are one person's who has no row."""
     found: dict[str, Mapping[str, str]] = {}
     for row in sorted(own, key=lambda row: row["who"] not in roster.people):
-        key = row["who"]
-        one = roster.people.get(key) or roster.named(row.get("student") or key, key)
+        one = roster.people.get(row["who"]) or roster.named(row["student"], row["who"])
         if one is not None:
             found.setdefault(one.key, row)
     return found
@@ -263,9 +262,7 @@ def _that_counts(some: Sequence[ReportLine]) -> tuple[ReportLine, tuple[Flag, ..
     newest = max(some, key=_moment)
     if len(some) == 1 or place_of(newest.file).lms:
         return newest, ()
-    best = max(some, key=lambda line: line.points or 0.0)
-    if (newest.points or 0.0) >= (best.points or 0.0):
-        best = newest
+    best = max(some, key=lambda line: (line.points or 0.0, _moment(line)))
     folders = {line.file.rpartition("/")[0] for line in some}
     if best is newest and len(folders) == 1:
         return best, ()
@@ -301,8 +298,10 @@ def _late(line: ReportLine, late_after: datetime | None) -> str:
     when = line.handed_in or line.made
     over = _moment(line) - late_after.timestamp() if late_after is not None else 0.0
     if over > 0:
-        hours = math.ceil(over / 3600)
-        much = counted(hours, "hour") if hours < 24 else counted(math.ceil(hours / 24), "day")
+        hours, minutes = divmod(math.ceil(over / 60), 60)
+        much = f"{hours} h {minutes} min"
+        if hours >= 24:
+            much = f"{counted(hours // 24, 'day')} {hours % 24} h"
         return f"{_date(when)}: {much} late"
     return f"{_date(when)}: late, as Canvas says" if place_of(line.file).late else ""
 
@@ -315,9 +314,20 @@ def _date(moment: str) -> str:
     return f"{then.day} {then:%B %Y, %H:%M} {then.tzname() or ''}".strip()
 
 
-def _copy_flag(copy: Copy) -> Flag:
-    """The flag of bundles that share something, with the names of some of them."""
-    names = ", ".join(copy.keys[:6]) + (f", {len(copy.keys) - 6} more" * (len(copy.keys) > 6))
+def _one_file(done: Sequence[ReportLine], who: Mapping[str, Person]) -> Iterator[Copy]:
+    """Files that several people handed in: whoever packs writes a name and the second."""
+    packed = grouped(((line.student, line.made), line.file) for line in done)
+    for (typed, made), files in packed.items():
+        n = len({who[file].key for file in files})
+        if n > 1:
+            says = flag_of("same_file", n=n, typed=typed, made=_date(made)).says
+            yield Copy(tuple(files), "same_file", says)
+
+
+def _copy_flag(copy: Copy, who: Mapping[str, Person]) -> Flag:
+    """The flag of bundles that share something, with the names of some who handed them in."""
+    some = [*{who[key].key: who[key].name or key for key in copy.keys}.values()]
+    names = "; ".join(some[:6]) + (f"; {len(some) - 6} more" * (len(some) > 6))
     return Flag(copy.code, f"{copy.says.rstrip('.')} ({names}).", copy.note)
 
 
@@ -335,19 +345,22 @@ def student_page(line: ReportLine, body: str) -> str:
 
 def _decided(line: ReportLine) -> str:
     """Which points the instructor gave, for the student; "" for none."""
-    words = {"paragraph": "for the paragraph", "late": "for late days", "overrule": "in all"}
-    given = [key for key in words if line.own.get(key)]
-    given = ["overrule"] if "overrule" in given else given
-    said = [f"{_points(number_of(line.own[key]))} {words[key]}" for key in given]
-    computed = "" if line.points is None else f" ({_points(line.points)} were computed)"
-    return f"Points that your instructor set: {', '.join(said)}{computed}." if said else ""
+    facts = {"points": _points(line.points), "of": _points(line.of)}
+    computed = "" if line.points is None else SAYS["computed"].format(**facts)
+    if line.own.get("overrule"):
+        return SAYS["total_set"] + computed
+    instead = f"for the paragraph, in place of {_points(line.computed_paragraph)}"
+    words = {"paragraph": instead, "late": "for late days"}
+    said = [f"{_points(number_of(line.own[k]))} {words[k]}" for k in words if line.own.get(k)]
+    return f"Points that your instructor set: {'; '.join(said)}.{computed}" if said else ""
 
 
 def _told(line: ReportLine) -> str:
     """What somebody without points is told; nothing where it is the grader that failed."""
     if line.total is not None or line.reason in FAILED:
         return ""
-    return line.says if line.reason == "missing" else AGAIN
+    again = SAYS["again"].format(file=line.file.rpartition("/")[2], says=line.says)
+    return line.says if line.reason == "missing" else again
 
 
 def page_body(grade: Grade, submission: Submission) -> str:
