@@ -36,12 +36,9 @@ def write(camera: SimpleNamespace, scale: float = 1.0) -> None:
     groups = {"intrinsics": Covariance(K, R * np.outer(sigma, sigma))}
     results.save("03_intrinsics", camera, lens, groups)
     turn, shift = np.array([0.05, 0.06, 0.07]) * scale, np.array([0.6, 0.8, 1.0]) * scale
-    results.save("04_hand_eye", camera, mounted((*turn, *shift)))
-
-
-def mounted(sigmas) -> dict[str, Quantity]:
-    units = zip(TWIST, ["deg"] * 3 + ["mm"] * 3, sigmas, strict=True)
-    return {name: Quantity(0.0, unit, sigma) for name, unit, sigma in units}
+    units = zip(TWIST, ["deg"] * 3 + ["mm"] * 3, (*turn, *shift), strict=True)
+    mount = {name: Quantity(0.0, unit, sigma) for name, unit, sigma in units}
+    results.save("04_hand_eye", camera, mount)
 
 
 @pytest.fixture

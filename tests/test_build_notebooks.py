@@ -143,15 +143,6 @@ def change(name, **fields):
     return lambda notebook: cell_of(notebook, name).update(fields)
 
 
-def output(text, name="stdout"):
-    return [{"output_type": "stream", "name": name, "text": [text]}]
-
-
-def data(**content):
-    stored = {"text/plain": ["A"], **content}
-    return [{"output_type": "display_data", "metadata": {}, "data": stored}]
-
-
 def strip(notebook):
     for cell in code_cells(notebook):
         cell.update(outputs=[], execution_count=None)
@@ -220,7 +211,8 @@ def test_cells_that_do_not_repeat_or_are_out_of_date_are_named(tmp_path, monkeyp
     }
     path = toy(sources, tmp_path / "01_toy.ipynb")
     build_notebooks.build(path)
-    edit(path, change("table", outputs=data(**{"text/html": ["<b>3</b>"]})))
+    stored = {"text/plain": ["A"], "text/html": ["<b>3</b>"]}
+    edit(path, lambda n: cell_of(n, "table")["outputs"][0].update(data=stored))
     edit(path, lambda n: picture(n).update({"image/png": "AAAA"}))  # a pixel drawn elsewhere
     monkeypatch.setattr(build_notebooks, "NOTEBOOKS", tmp_path)
     assert build_notebooks.main(["--check", "--run"]) == 1
@@ -250,7 +242,8 @@ def picture(notebook):
 
 def test_nbval_fails_on_one_changed_digit(light, tmp_path):
     """And passes what is stripped, which is why --check exists."""
-    edit(light, change("sum", outputs=output("0.477 m, camera simulated\n")))
+    said = ["0.477 m, camera simulated\n"]
+    edit(light, lambda n: cell_of(n, "sum")["outputs"][0].update(text=said))
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-c", os.devnull]
     command += ["--rootdir", str(tmp_path), "--nbval", "--nbval-current-env", str(tmp_path)]
     environment = build_notebooks.kernel_environment(tmp_path)

@@ -137,16 +137,14 @@ def test_inverse_brown_conrady_is_fitted_to_what_the_library_projects() -> None:
 # --- lenses in, as their tools write them ---
 
 FILES = tomllib.loads(Path(__file__).with_name("lens_files.toml").read_text("utf-8"))
-ROS, TOPIC_2, OPENCV, KALIBR, COLMAP, OPEN3D = (
-    FILES[name] for name in ("ROS", "TOPIC_2", "OPENCV", "KALIBR", "COLMAP", "OPEN3D")
-)
+LENSES = ("ROS", "TOPIC_2", "OPENCV", "KALIBR", "COLMAP", "OPEN3D", "OURS", "LAUGHS")
+ROS, TOPIC_2, OPENCV, KALIBR, COLMAP, OPEN3D, OURS, LAUGHS = (FILES[name] for name in LENSES)
 TOPIC_1 = (
     TOPIC_2.replace("\nd:", "\nD:").replace("\nk:", "\nK:").replace("plumb_bob", '"plumb_bob"')
 )
 OPEN3D_VIEW = json.dumps(
     {"class_name": "PinholeCameraParameters", "extrinsic": [1, 0], "intrinsic": json.loads(OPEN3D)}
 )
-OURS = FILES["OURS"]
 SESSION = json.dumps({"mount": "eye_in_hand", "intrinsics": json.loads(OURS)})
 AS_WRITTEN = {
     "ros": ROS, "ros2 topic echo": TOPIC_2, "rostopic echo": TOPIC_1, "opencv": OPENCV,
@@ -239,7 +237,6 @@ BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"{b}: &{b} [*{a}, *{a}, *{a}, *{a}, *{a}, *{a}, *{a}, *{a}, *{a}]\n"
     for a, b in zip("abcdefgh", "bcdefghi", strict=True)
 )
-LAUGHS = FILES["LAUGHS"]
 HOSTILE = FILES["hostile"] | {
     "bomb": BOMB,
     "deep": "a: " + "[" * 5000,

@@ -142,8 +142,7 @@ CANDIDATES = ("inverted_poses", "inverted_detections", "wrong_mount")
 def test_candidates_are_listed_and_the_true_one_has_the_true_X(seed: int, kind: str) -> None:
     given, truth = session(seed, M(**{kind: True}), arm_errors=None)
     [finding] = diagnose(given)
-    words = {"inverted_poses": "arm poses", "inverted_detections": "board poses",
-             "wrong_mount": "another mount"}  # fmt: skip
+    words = dict(zip(CANDIDATES, ("arm poses", "board poses", "another mount"), strict=True))
     for number, name in enumerate(words.values(), 1):
         assert f"({number}) {name}" in finding.evidence
     inverted = invert_transform(given.T_base_gripper)

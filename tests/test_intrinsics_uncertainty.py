@@ -25,19 +25,14 @@ PIXELS = np.array([[320.0, 240.0], [20, 20], [620, 460], [600, 100], [150, 400]]
 RANGES_M = (0.45, 2.0)
 
 
-def points_at(lens, range_m: float) -> np.ndarray:
-    """What the camera sees at PIXELS, (5, 3), so far from its centre."""
-    rays = deproject(PIXELS, np.ones(len(PIXELS)), lens.K, lens.dist)
-    return range_m * rays / np.linalg.norm(rays, axis=1, keepdims=True)
-
-
 def seen_again(result: intrinsics.IntrinsicsResult, poses: np.ndarray, range_m: float):
     """Where the fitted camera sees what the true one sees at PIXELS.
 
     With the point fixed to the boards: its place in the fitted camera's frame is the mean of
     what each board says. And with the point fixed in the camera's frame.
     """
-    points = points_at(LENS, range_m)
+    rays = deproject(PIXELS, np.ones(len(PIXELS)), LENS.K, LENS.dist)
+    points = range_m * rays / np.linalg.norm(rays, axis=1, keepdims=True)
     moves = result.T_camera_board @ invert_transform(poses)
     in_fitted = np.mean([transform_points(move, points) for move in moves], axis=0)
     K, dist = result.intrinsics.K, result.intrinsics.dist

@@ -259,10 +259,8 @@ def test_maps_of_two_sessions_share_their_scale(figures) -> None:
 
 
 def hand_eye_figures() -> dict[str, plots.LessonFigure]:
-    rigs = {
-        "eye-in-hand": default_setup("eye_in_hand"),
-        "eye-to-hand": default_setup("eye_to_hand"),
-    }
+    mounts = ("eye_in_hand", "eye_to_hand")
+    rigs = {mount.replace("_", "-"): default_setup(mount) for mount in mounts}
     joints = dict.fromkeys(rigs, (0.0, 0.7, 1.3, 0.7, 0.0, 0.0))
     counts = (12, 25)
     return {

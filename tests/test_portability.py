@@ -151,24 +151,11 @@ def test_the_code_keeps_the_rule(is_fault: Callable[[Any], bool]) -> None:
     assert found(is_fault, *ALL) == []
 
 
-FAULTS = {
-    without_encoding: (
-        "open('a') | open('a', 'w') | p.open() | p.open('a+') | p.read_text() | "
-        "p.read_text(errors='replace') | p.write_text('x') | NamedTemporaryFile(mode='w')",
-        "open('a', 'rb') | open('a', encoding='utf-8') | p.open(mode='wb') | p.read_text('utf-8') "
-        "| p.write_text('x', 'utf-8') | sensor.open(profiles) | TemporaryFile(dir=d)",
-    ),
-    starts_a_process_its_own_way: (
-        "get_context('fork') | ProcessPoolExecutor(2) | multiprocessing.Pool()",
-        "get_context('spawn') | ProcessPoolExecutor(2, mp_context=c)",
-    ),
-}
-
-
-@pytest.mark.parametrize("is_fault", FAULTS)
-def test_the_search_for_a_fault_finds_what_it_should(is_fault: Callable[[Any], bool]) -> None:
-    for codes, fault in zip(FAULTS[is_fault], (True, False), strict=True):
-        for code in codes.split(" | "):
+@pytest.mark.parametrize("rule", RULES)
+def test_the_search_for_a_fault_finds_what_it_should(rule: str) -> None:
+    is_fault = RULES[rule]
+    for codes, fault in zip(EXPECTED["faults"][rule], (True, False), strict=True):
+        for code in codes:
             assert is_fault(ast.parse(code, mode="eval").body) is fault, code
 
 

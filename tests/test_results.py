@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from common import named, refusals
+from common import EXPECTED, named, refusals
 
 from coursekit import results
 from coursekit.results import Covariance, Quantity
@@ -47,11 +47,7 @@ def test_damaged_files_are_named() -> None:
         "",
         "[]",
         "\x00",
-        text.replace('"format": 2', '"format": 99'),
-        text.replace('"value": 1.0', '"value": null'),
-        text.replace('"unit"', '"units"'),
-        text.replace('"simulated"', '"invented"'),
-        text.replace('"quantities"', '"quantity"'),
+        *(text.replace(was, now) for was, now in EXPECTED["damaged_results"]),
     ):
         assert damaged != text
         path.write_text(damaged, encoding="utf-8")

@@ -536,16 +536,7 @@ def test_own_points_survive_a_regrade_which_says_what_changed(in_process, tmp_pa
     assert "the rubric or the grader changed; paragraph " in change[3]
 
 
-@pytest.mark.parametrize(
-    ("row", "said"),
-    [
-        ("many,,", "paragraph: got 'many', want points from 0 to 2"),
-        ("7,,", "paragraph: got '7', want points from 0 to 2"),
-        (",10,", "late: got '10', want points from -100 to 0"),
-        (",,130", "overrule: got '130', want points from 0 to 100"),
-        (",,nan", "overrule: got 'nan', want"),
-    ],
-)
+@pytest.mark.parametrize(("row", "said"), EXPECTED["bad_own_points"])
 def test_own_points_that_cannot_be_are_refused_before_any_work(row, said, tmp_path):
     out = quick(tmp_path / "out", ())
     (out / "own_points.csv").write_text(f"who,paragraph,late,overrule\na,{row}\n", "utf-8")
@@ -569,8 +560,7 @@ def test_own_points_and_namesakes_outlive_another_roster(in_process, tmp_path, m
     def run(column: str) -> tuple[batch.Summary, dict[str, str]]:
         choices = batch.Choices(f"{column}.csv")
         summary = batch.grade_folder("all.zip", overwrite=True, progress=False, choices=choices)
-        text = Path("all_report/moodle.csv").read_text(encoding="utf-8-sig")
-        rows = csv.DictReader(io.StringIO(text))
+        rows = table(Path("all_report"), "moodle.csv")
         return summary, {row["Identifier"].split()[1]: row["Grade"] for row in rows}
 
     summary, computed = run("id")

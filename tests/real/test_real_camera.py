@@ -32,10 +32,8 @@ def camera(rs, folder):
 
 def test_reports_what_its_owners_published(camera, folder):
     published = json.loads((folder / "intrinsics.json").read_text(encoding="utf-8"))
-    for intrinsics, expected in (
-        (camera.depth, published["depth"]),
-        (camera.color, published["color"]),
-    ):
+    for stream in ("depth", "color"):
+        intrinsics, expected = getattr(camera, stream), published[stream]
         assert intrinsics.size == (expected["width"], expected["height"])
         assert (intrinsics.fx, intrinsics.fy) == (expected["fx"], expected["fy"])
         assert (intrinsics.cx, intrinsics.cy) == (expected["ppx"], expected["ppy"])
