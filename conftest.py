@@ -37,7 +37,7 @@ def pytest_collection_modifyitems(items):
             if module[0].path.suffix != ".ipynb":
                 order.shuffle(module)
             if module[0].get_closest_marker("browser"):  # the tests of a page share its Run All
-                module.sort(key=_page)
+                module.sort(key=lambda item: (_page(item), "next_day" in item.name))  # closes it
         items[:] = chain.from_iterable(order.sample(list(modules.values()), len(modules)))
 
 
