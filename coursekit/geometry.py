@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coursekit import checks, kernels
+from coursekit import checks
 from coursekit.arrays import ArrayLike, Floats, NDArray
 from coursekit.checks import array, instance, number, positive, transform, transforms, want, whole
 from coursekit.formats.lens import read_lens
@@ -345,6 +345,8 @@ def deproject_image(
     scale = positive("depth_scale_m", depth_scale_m) if counts else 1.0
     points = np.empty((*shape, 3), np.float32)
     if i.dist is None:
+        from coursekit import kernels  # here, for numba takes most of a second
+
         kernels.deproject_pinhole(image, scale, i.fx, i.fy, i.cx, i.cy, points)
     else:
         z = np.where((image > 0) & (image < np.inf), image, np.nan) * scale
@@ -380,6 +382,8 @@ def align_depth_to_color(
         return np.floor(project(transform_points(T, points), to.K, to.dist) + 0.5)
 
     first, last = landing(rays[:-1, :-1]), landing(rays[1:, 1:])
+    from coursekit import kernels
+
     source = kernels.nearest_footprint(depth, first, last, to.width, to.height)
     points = deproject(pixel_grid(*of.size), depth, of.K, of.dist)
     z_color = (points @ T[2, :3] + T[2, 3]).ravel()

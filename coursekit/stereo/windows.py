@@ -302,16 +302,17 @@ def _temporal(deviation: Floats) -> tuple[float, float, Floats]:
     if n < 2 or pixels == 0:
         return math.nan, 0.0, np.zeros(n) if pixels or n == 1 else np.full(n, np.nan)
     known = np.isfinite(deviation)
+    squares = float(np.square(deviation[known]).sum())
     complete = deviation[:, known.all(axis=0)]
     drift = np.nan_to_num(valid_mean(deviation, axis=1))
     drift -= drift.mean()
     if complete.shape[1] < 2 or not complete.any():
-        return math.sqrt(float(np.nansum(deviation**2)) / (known.sum() - pixels)), n - 1.0, drift
+        return math.sqrt(squares / (known.sum() - pixels)), n - 1.0, drift
     own = complete - complete.mean(axis=1, keepdims=True)
     gram = own @ own.T
     # The mean of frames that correlate follows them: it costs tau squares a pixel, not one.
     tau = _correlation_time(gram) if n > 4 else 1.0
-    variance = float(np.nansum(deviation**2)) / (known.sum() - pixels * min(tau, n / 2))
+    variance = squares / (known.sum() - pixels * min(tau, n / 2))
     common = min(float(drift @ drift) / (n - 1), variance)
     of_noise = (variance - common) ** 2 / _pixel_dof(gram, own.shape[1])
     shares = of_noise + common**2 / series_std(drift)[1]
@@ -537,7 +538,8 @@ def off_plane(images: Floats) -> float:
     0.0028 m
     """
     off = about_plane(images)[0]
-    return math.sqrt(np.nanmean(np.square(off))) if np.isfinite(off).any() else math.nan
+    known = off[np.isfinite(off)]
+    return math.sqrt(known @ known / known.size) if known.size else math.nan
 
 
 def about_plane(images: Floats) -> tuple[Floats, Floats]:
@@ -565,7 +567,8 @@ def fit_plane(images: Floats) -> Floats:
 
 def plane_image(planes: Floats, shape: tuple[int, ...]) -> Floats:
     """1/Z of planes (..., 3) at the pixels of a patch: (..., h, w)."""
-    return np.einsum("...i,hwi->...hw", planes, _plane_design(shape))
+    flat = planes @ _plane_design(shape).reshape(-1, 3).T
+    return np.asarray(flat.reshape(*planes.shape[:-1], *shape))
 
 
 def _plane_design(shape: tuple[int, ...]) -> Floats:

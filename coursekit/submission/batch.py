@@ -70,9 +70,11 @@ HASHED_BYTES = 6 * 2**20  # of a file; larger ones are refused anyway
 CSV, PAGE, PARAGRAPHS = "grades.csv", "index.html", "paragraphs.html"
 SECOND, OWN_POINTS, FEEDBACK = "second_marker.html", "own_points.csv", "feedback.zip"
 STUDENTS, ROWS, CLASS = "students", ".rows", "class.json"
-ONE_THREAD = {
+# One thread a process; and glibc keeps what is freed, which saves an eighth of the time.
+OF_A_WORKER = {
     f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL", "NUMBA", "BLIS")
-} | {"VECLIB_MAXIMUM_THREADS": "1"}
+} | {"VECLIB_MAXIMUM_THREADS": "1", "MALLOC_MMAP_THRESHOLD_": "67108864"}
+OF_A_WORKER["MALLOC_TRIM_THRESHOLD_"] = "268435456"
 
 NOT_GRADED = "not graded (time, memory or a crash)"
 SUMMED = {"graded": "graded", "refused": "refused", "failed": NOT_GRADED, "flagged": "flagged"}
@@ -512,8 +514,8 @@ def _ending(code: int) -> str:
 @contextlib.contextmanager
 def _pool(limits: Limits) -> Iterator[ProcessPool]:
     """A started pool; its processes have one thread for linear algebra and never see a Ctrl-C."""
-    before = {name: os.environ[name] for name in ONE_THREAD if name in os.environ}
-    os.environ.update(ONE_THREAD)
+    before = {name: os.environ[name] for name in OF_A_WORKER if name in os.environ}
+    os.environ.update(OF_A_WORKER)
     pool = ProcessPool(
         max_workers=limits.workers,
         max_tasks=MAX_TASKS,
@@ -532,7 +534,7 @@ def _pool(limits: Limits) -> Iterator[ProcessPool]:
     finally:
         pool.stop()
         pool.join()
-        for name in ONE_THREAD:
+        for name in OF_A_WORKER:
             os.environ.pop(name, None)
         os.environ.update(before)
 
