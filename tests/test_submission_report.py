@@ -406,12 +406,24 @@ def test_all_paragraphs_are_on_a_page_with_name_and_link(lines):
         assert line.paragraph.strip() in page.text
         assert line.student in page.text
         assert f'href="{line.page.replace(" ", "%20")}"' in text
-    assert "6 paragraphs, by name." in page.text
+    assert "6 paragraphs, by name, worth 2 points each." in page.text
     assert 'No paragraph: <a href="students/Silent.html">Silent</a>' in text
     assert "words of old" not in page.text
     assert text.count("shares its words") == 0
     shared = report.across([said_by("Ann", PARAGRAPH), said_by("Bob", PARAGRAPH)])
     assert report.paragraphs_page(shared).count("shares its words") == 2
+    assert report.paragraphs_page(shared, named=False).count("shares its words") == 0  # no bias
+    verdict = next(item for item in lines[0].items if item.topic == "verdict")
+    assert verdict.says.startswith("Bias or noise: you say ")
+    assert verdict.says in page.text  # what was chosen, beside the paragraph that argues for it
+
+
+def test_a_second_marker_finds_the_row_to_write_into(lines):
+    rows = read(report.own_table(lines))
+    codes = re.findall("<h2>([0-9a-f]{6})</h2>", report.paragraphs_page(lines, named=False))
+    assert len(codes) == len(set(codes)) == 6
+    those = {row["student"].removeprefix("'") for row in rows if row["code"] in codes}
+    assert those == {line.name for line in lines[:-1]}
 
 
 # --- the table ------------------------------------------------------------------------------------

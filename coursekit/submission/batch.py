@@ -734,7 +734,7 @@ def _unused(own: list[dict[str, str]], lines: Sequence[report.ReportLine]) -> st
     """Which of the instructor's rows with something in them reach nobody; "" for none."""
     used = {id(line.own) for line in lines}
     unused = (
-        row for row in own if id(row) not in used and any(map(row.get, report.OWN_COLUMNS[2:]))
+        row for row in own if id(row) not in used and any(map(row.get, report.OWN_COLUMNS[3:]))
     )
     names = "; ".join(f"{row['student']} ({row['who']})" for row in unused)
     return say("submission.own_unused", file=OWN_POINTS, names=names) if names else ""

@@ -43,7 +43,15 @@ from coursekit.submission.flags import (
     words_of,
 )
 from coursekit.submission.format import WORDS, Plot, Refused, Submission, TableRow, read_bundle
-from coursekit.submission.recompute import HEADINGS, LABELS, MISTAKES, REPEAT, SAYS, Recomputed
+from coursekit.submission.recompute import (
+    HEADINGS,
+    LABELS,
+    MISTAKES,
+    REPEAT,
+    SAYS,
+    Recomputed,
+    grading_rules,
+)
 from coursekit.submission.rubric import Grade, Item, grade
 from coursekit.words import counted
 
@@ -151,7 +159,10 @@ def graded(file: str, grade: Grade, submission: Submission) -> ReportLine:
         paragraph=submission.conclusion.paragraph,
         points=grade.points,
         of=grade.of,
-        items=tuple(replace(item, says="", tolerance=None) for item in grade.items),
+        items=tuple(
+            replace(item, says=item.says * (item.topic == "verdict"), tolerance=None)
+            for item in grade.items
+        ),
         flags=grade.flags,
         fingerprint=grade.fingerprint,
     )
@@ -619,7 +630,8 @@ def paragraphs_page(lines: Sequence[ReportLine], named: bool = True) -> str:
         some = sorted((replace(n, name=n.code, page="") for n in some), key=lambda n: n.name)
     said = [line for line in some if line.paragraph.strip()]
     silent = [line for line in some if not line.paragraph.strip()]
-    return _page(what="paragraphs", said=said, silent=silent, named=named)
+    worth = grading_rules()["points"]["paragraph"]
+    return _page(what="paragraphs", said=said, silent=silent, named=named, worth=worth)
 
 
 def _said(item: Item) -> str:
@@ -709,10 +721,9 @@ def exports(
 
 def own_table(lines: Sequence[ReportLine], separator: str = ",") -> str:
     """A table for the instructor's own points, with a row for everybody."""
-    names = {line.who: line.name or line.student for line in lines if line.name}
-    return _csv(
-        [OWN_COLUMNS, *((who, name, "", "", "", "") for who, name in names.items())], separator
-    )
+    counts = {line.who: line for line in lines if line.who and line.counts}
+    rows = ((who, n.name or n.student, n.code, "", "", "", "") for who, n in counts.items())
+    return _csv([OWN_COLUMNS, *rows], separator)
 
 
 def _feedback(line: ReportLine) -> str:
