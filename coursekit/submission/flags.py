@@ -59,11 +59,15 @@ SHARED_RUNS = 0.7  # part of the runs of the shorter of two paragraphs that the 
 
 @dataclass(frozen=True)
 class Flag:
-    """code: one word; says: a sentence, with the numbers. note: true where it is no suspicion."""
+    """code: one word; says: a sentence, with the numbers. note: true where it is no suspicion.
+
+    among: the files that share it.
+    """
 
     code: str
     says: str
     note: bool = False
+    among: str = ""
 
 
 def flag_of(code: str, note: bool = False, **facts: Any) -> Flag:

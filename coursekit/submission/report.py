@@ -221,7 +221,11 @@ def across(
     }
     said = {line.file: (who[line.file].key, line.paragraph) for line in done}
     shared = [*copies(prints), *same_words(said), *_one_file(done, who)]
-    about = grouped((key, _copy_flag(copy, who)) for copy in shared for key in copy.keys)
+    about = grouped(
+        (key, Flag(copy.code, copy.says, copy.note, "; ".join(copy.keys)))
+        for copy in shared
+        for key in copy.keys
+    )
     theirs = grouped((who[line.file].key, line) for line in lines)
     chosen = {
         key: _that_counts([line for line in some if line.points is not None] or some)
@@ -333,13 +337,6 @@ def _one_file(done: Sequence[ReportLine], who: Mapping[str, Person]) -> Iterator
         if n > 1:
             says = flag_of("same_file", n=n, typed=typed, made=_date(made)).says
             yield Copy(tuple(files), "same_file", says)
-
-
-def _copy_flag(copy: Copy, who: Mapping[str, Person]) -> Flag:
-    """The flag of bundles that share something, with the names of some who handed them in."""
-    some = [*{who[key].key: who[key].name or key for key in copy.keys}.values()]
-    names = "; ".join(some[:6]) + (f"; {len(some) - 6} more" * (len(some) > 6))
-    return Flag(copy.code, f"{copy.says.rstrip('.')} ({names}).", copy.note)
 
 
 # --- the student's page ---------------------------------------------------------------------------
@@ -548,6 +545,7 @@ def class_page(
     given = [(line.total, line.of or 100) for line in everybody]
     percents = [100 * total / of for total, of in given if total is not None]
     named = sorted(everybody, key=_by_name)
+    often = Counter(line.name for line in named)
     return _page(
         what="class",
         lines=lines,
@@ -563,6 +561,7 @@ def class_page(
         notes=_by_flag(done, True),
         changes=changes,
         named=named,
+        namesakes={name for name, n in often.items() if n > 1},
         ranked=sorted(named, key=lambda line: (line.total is not None, line.total or 0.0)),
     )
 
@@ -616,7 +615,7 @@ def _left_out(lines: Sequence[ReportLine]) -> list[tuple[str, list[ReportLine]]]
 def _by_flag(lines: Sequence[ReportLine], note: bool) -> list[Any]:
     """Those who share a flag share a row."""
     flags = ((flag, line) for line in lines for flag in line.flags if flag.note == note)
-    who = grouped(((flag.code.replace("_", " "), flag.says), line) for flag, line in flags)
+    who = grouped(((f.code.replace("_", " "), f.says, f.among), line) for f, line in flags)
     return list(who.items())
 
 
