@@ -103,6 +103,19 @@ def _squares(text: str) -> tuple[int, int]:
         raise argparse.ArgumentTypeError(f"got {text!r}, want for example 9x6") from None
 
 
+def _moment(text: str) -> datetime:
+    """A moment; of a day alone its end.
+
+    >>> _moment("2026-03-02").isoformat()
+    '2026-03-02T23:59:59'
+    """
+    try:
+        return datetime.fromisoformat(text if len(text) > len("2026-03-02") else f"{text}T23:59:59")
+    except ValueError:
+        wanted = "for example 2026-03-02T23:59"
+        raise argparse.ArgumentTypeError(f"got {text!r}, want {wanted}") from None
+
+
 def _record(options: argparse.Namespace) -> None:
     with ck.open_camera(options.camera) as camera:
         print(_typed(str(camera)))
@@ -223,7 +236,7 @@ def _doctor(options: argparse.Namespace) -> int:
 
 
 TYPES = {"int": int, "float": float, "lower": str.lower, "squares": _squares}
-TYPES |= {"moment": datetime.fromisoformat}
+TYPES |= {"moment": _moment}
 RUNS = (_calibrate, _hand_eye, _record, _board, _submit, _grade, _export, _doctor)
 RUN = {run.__name__[1:].replace("_", "-"): run for run in RUNS}  # by the command's name
 

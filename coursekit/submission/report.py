@@ -105,14 +105,14 @@ class ReportLine:
 
     @property
     def total(self) -> float | None:
-        """The points with the instructor's own: for the paragraph, for late days, in all."""
+        """The points with the instructor's own: for the paragraph, for late days, in all; >= 0."""
         if self.own.get("overrule"):
             return number_of(self.own["overrule"])
         if self.points is None:
             return None
         own = self.own.get("paragraph")
         more = number_of(own) - self.computed_paragraph if own else 0.0
-        return round(self.points + more + number_of(self.own.get("late", "")), 2)
+        return round(max(self.points + more + number_of(self.own.get("late", "")), 0.0), 2)
 
     @property
     def computed_paragraph(self) -> float:
@@ -545,7 +545,6 @@ def class_page(
     given = [(line.total, line.of or 100) for line in everybody]
     percents = [100 * total / of for total, of in given if total is not None]
     named = sorted(everybody, key=_by_name)
-    often = Counter(line.name for line in named)
     return _page(
         what="class",
         lines=lines,
@@ -561,9 +560,14 @@ def class_page(
         notes=_by_flag(done, True),
         changes=changes,
         named=named,
-        namesakes={name for name, n in often.items() if n > 1},
+        namesakes=_namesakes(named),
         ranked=sorted(named, key=lambda line: (line.total is not None, line.total or 0.0)),
     )
+
+
+def _namesakes(lines: Sequence[ReportLine]) -> set[str]:
+    """The names that several people have."""
+    return {name for name, n in Counter(line.name for line in lines).items() if n > 1}
 
 
 def _by_name(line: ReportLine) -> tuple[list[str], str]:
@@ -630,7 +634,8 @@ def paragraphs_page(lines: Sequence[ReportLine], named: bool = True) -> str:
     said = [line for line in some if line.paragraph.strip()]
     silent = [line for line in some if not line.paragraph.strip()]
     worth = grading_rules()["points"]["paragraph"]
-    return _page(what="paragraphs", said=said, silent=silent, named=named, worth=worth)
+    facts = {"named": named, "namesakes": _namesakes(some), "worth": worth}
+    return _page(what="paragraphs", said=said, silent=silent, **facts)
 
 
 def _said(item: Item) -> str:
