@@ -507,7 +507,7 @@ def test_what_the_instructor_decides_reaches_everybody(lms, in_process, tmp_path
 
 
 def test_own_points_survive_a_regrade_which_says_what_changed(in_process, tmp_path, monkeypatch):
-    folder, out = quick(tmp_path / "in", ["a", "b"]), tmp_path / "out"
+    folder, out = quick(tmp_path / "in", ["a", "b", "c"]), tmp_path / "out"
     before = graded(folder, out)
     own = out / "own_points.csv"
     codes = {row["student"]: row["code"] for row in table(out, "own_points.csv")}
@@ -535,16 +535,16 @@ def test_own_points_survive_a_regrade_which_says_what_changed(in_process, tmp_pa
         summary
     )  # two markers, of whom the first one counts
     assert "grades.csv had been edited: your copy of it is grades_edited_" in str(summary)
-    assert summary.kept == before.counts["graded"] == 2
+    assert summary.kept == before.counts["graded"] == 3
     assert own.read_bytes() == kept
     assert all(path.exists() for path in foreign)
     (edited,) = out.glob("grades_edited_*.csv")
     assert edited.read_text(encoding="utf-8") == "edited"
     with pytest.raises(ValueError, match="is the report of other bundles"):
-        graded(quick(tmp_path / "another", ["c"]), out, overwrite=True)
+        graded(quick(tmp_path / "another", ["d"]), out, overwrite=True)
     monkeypatch.setitem(grading_rules()["points"], "paragraph", 4)
     monkeypatch.setattr(batch, "grader_version", lambda: "another")
-    (change,) = [c for c in graded(folder, out, overwrite=True).changes if c[0] == "b"]
+    (change,) = [c for c in graded(folder, out, overwrite=True).changes if c[0] == "c"]
     assert "the rubric or the grader changed; paragraph " in change[3]
 
 
