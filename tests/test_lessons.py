@@ -399,11 +399,18 @@ def test_the_widget_commits() -> None:
     button.click()
     assert "right" in said[-1]
     assert CHECKPOINTS["pinhole.half_size"]._before().startswith("<details><summary>You have")
-    field, *_ = panel(PITCH, said.append).children
+    field, button, _ = panel(PITCH, said.append).children
     for number, verdict in (("500", "not this"), ("2000", "right")):
         field._handle_custom_msg({"event": "submit"}, [])  # the key Enter, told before the number
         field.value = number
         assert verdict in said[-1]
+    field.value = "500"
+    button.click()
+    button.click()  # of a busy kernel's learner, who has typed 2000: the press is told first
+    assert "not this" in said[-1]
+    field.value = "2000"
+    assert "right" in said[-1]
+    assert len(questions.read_attempts()["pinhole.pitch"]) == 4  # nothing was judged twice
     kinds = [a["kind"] for a in questions.read_attempts()["pinhole.half_size"]]
     assert kinds == ["wrong", "right"]
 
