@@ -344,6 +344,7 @@ def test_right_digits_in_another_unit_are_no_attempt() -> None:
     verdict = CHECKPOINTS["pinhole.same_size"].answer(187.5)
     assert verdict.kind == "not attempted"
     assert "wanted in m" in verdict.headline
+    assert PITCH.judge("2000 m").kind == "not attempted"  # of pixels
 
 
 def test_the_first_mistake_to_look_at_shows_in_the_case() -> None:

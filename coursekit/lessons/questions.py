@@ -236,7 +236,9 @@ def _readings(given: Any, unit: str) -> list[float]:
     written = [digits.replace(",", ".")] if re.fullmatch(r"[-+]?\d+,\d+", digits) else [digits]
     if re.fullmatch(r"[-+]?\d{1,3},000", digits):
         written.append(digits.replace(",", ""))
-    factor = 1.0 if given_unit == unit else LENGTHS.get(given_unit, 0.0) / LENGTHS.get(unit, 1.0)
+    factor = (
+        1.0 if given_unit == unit else LENGTHS.get(given_unit, 0.0) / LENGTHS.get(unit, math.inf)
+    )
     try:
         numbers = [float(text) * factor for text in written]
     except ValueError:
