@@ -1,5 +1,7 @@
 """Lenses, boards, sessions and fits to simulated sessions that several test modules share."""
 
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import cache
 
@@ -86,6 +88,13 @@ def beyond_session(seed: int) -> tuple[Detections, Truth, Board]:
     board, (lens, see) = BOARDS[seed % 2], BEYOND[(seed // 2) % len(BEYOND)]
     street = replace(ordinary(seed), see=see)
     return *corner_session(board, lens, seed, 20 + (7 * seed) % 21, 0.08, street), board
+
+
+def names_found(sessions: Iterable[tuple[Detections, Truth, Board]]) -> Counter[tuple[str, ...]]:
+    """How often `diagnose` gives which names."""
+    found = Counter(intrinsics.diagnose(seen, board).names for seen, _, board in sessions)
+    print(dict(found))
+    return found
 
 
 def ordinary_arm_session(seed: int, **more) -> tuple[HandEyeSession, HandEyeTruth]:

@@ -5,7 +5,6 @@ nothing was tuned on those. COURSEKIT_NIGHTLY=1 runs 100 sessions a cause and 20
 """
 
 import re
-from collections import Counter
 from dataclasses import replace
 
 import cv2
@@ -15,7 +14,7 @@ from common import NIGHTLY, check_named, derivative
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, kstest
-from simulated_corners import BOARDS, LENSES
+from simulated_corners import BOARDS, LENSES, names_found
 
 from coursekit.boards import Board, Detection, Detections, Skipped
 from coursekit.causes import CauseSearch, search
@@ -71,23 +70,17 @@ def test_a_cause_is_named(label: str) -> None:
     By day one, of either board in turn: what names 75 % of all passes the nine with 8 %.
     """
     name, effects = CLASSES[label]
-    found: Counter[tuple[str, ...]] = Counter()
     first = FIRST_SEED if NIGHTLY else FIRST_SEED + [*CLASSES].index(label)
-    for seed in range(first, first + (100 if NIGHTLY else 1)):
-        detections, _, board = session(seed, effects)
-        found[diagnose(detections, board).names] += 1
-    check_named(found, name, label)
+    seeds = range(first, first + (100 if NIGHTLY else 1))
+    check_named(names_found(session(seed, effects) for seed in seeds), name, label)
 
 
 def test_healthy_sessions_get_no_finding() -> None:
     """At most 4 of 200 (nightly); of 4 none: a rate of 25 % passes with 32 %."""
     count, most = (200, 4) if NIGHTLY else (4, 0)
-    found: Counter[tuple[str, ...]] = Counter()
-    for seed in range(FIRST_SEED + 1000, FIRST_SEED + 1000 + count):
-        # every other pair of seeds, so that each kind of board has both
-        detections, _, board = session(seed, MILD if (seed // 2) % 2 else Effects())
-        found[diagnose(detections, board).names] += 1
-    print("healthy", dict(found))
+    seeds = range(FIRST_SEED + 1000, FIRST_SEED + 1000 + count)
+    # every other pair of seeds, so that each kind of board has both
+    found = names_found(session(seed, MILD if (seed // 2) % 2 else Effects()) for seed in seeds)
     assert sum(n for names, n in found.items() if names) <= most
 
 

@@ -57,7 +57,7 @@ def imported(path: Path) -> Iterator[str]:
             for alias in node.names:
                 full = f"{node.module}.{alias.name}"
                 yield full if full in MODULES else str(node.module)
-        elif isinstance(node, ast.Attribute) and ast.unparse(node.value) == "ck":
+        elif isinstance(node, ast.Attribute) and getattr(node.value, "id", "") == "ck":
             face = getattr(coursekit, node.attr)  # the package's own: what `ck.open_camera` loads
             yield face.__name__ if isinstance(face, ModuleType) else face.__module__
 
