@@ -259,7 +259,7 @@ def test_what_most_got_wrong_comes_first_and_what_is_left_out_is_no_mistake():
     text = check_page(report.class_page([wrong["std"], *[wrong["bias"]] * 2, left_out])).text
     assert "What went wrong, and with how many of 4 students" in text
     assert re.findall(r"\d+ \(\d+ %\)", text) == ["2 (50 %)", "1 (25 %)"]  # bias, then std
-    table, _, rest = text.partition("Left out, and in no row above:")
+    table, _, rest = text.partition("Answers that are missing, in no row above:")
     assert "Silent" not in table.partition("What went wrong")[2]
     assert "Silent" in rest.partition("Everybody")[0]
 
@@ -395,7 +395,7 @@ def test_late_is_said_to_the_minute_not_rounded_up(after, said):
 def test_whoever_hands_in_an_essay_reads_which_file_and_what_is_wanted():
     line = report.not_graded("Bo_17_assignsubmission_file_/e.docx", "no_bundle", files="e.docx")
     text = report.student_page(line, "")
-    assert "Your file e.docx could not be read, so hand it in again." in text
+    assert "Your file e.docx could not be graded, so hand in another." in text
     assert "Wanted is the .zip" in text
 
 
@@ -421,7 +421,7 @@ def test_all_paragraphs_are_on_a_page_with_name_and_link(lines):
 
 def test_a_second_marker_finds_the_row_to_write_into(lines):
     rows = read(report.own_table(lines))
-    codes = re.findall("<h2>([0-9a-f]{6})</h2>", report.paragraphs_page(lines, named=False))
+    codes = re.findall("<h2>(p[0-9a-f]{6})</h2>", report.paragraphs_page(lines, named=False))
     assert len(codes) == len(set(codes)) == 6
     those = {row["student"].removeprefix("'") for row in rows if row["code"] in codes}
     assert those == {line.name for line in lines[:-1]}
