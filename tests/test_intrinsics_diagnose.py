@@ -10,7 +10,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from common import NIGHTLY, check_named, derivative
+from common import EXPECTED, NIGHTLY, check_named, derivative
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, kstest
@@ -34,15 +34,8 @@ from tools import make_data
 FIRST_SEED = 100_000
 LENS, CHARUCO, CHECKERBOARD = LENSES[0], *BOARDS
 CLASSES = {
-    "bow 1 mm": ("bowed_board", Effects(bow_m=1e-3)),
-    "bow 0.5 mm": ("bowed_board", Effects(bow_m=5e-4)),
-    "focus 2 %": ("focus_drift", Effects(focus_drift=0.02)),
-    "shutter 20 ms, 0.1 m/s": ("rolling_shutter", Effects(readout_s=0.02, speed_m_s=0.1)),
-    "tilts under 3 deg": ("fronto_parallel", Effects(max_tilt_deg=3.0)),
-    "nothing in the outer 15 %": ("no_edge_corners", Effects(inner_only=0.15)),
-    "blur of 3 px": ("motion_blur", Effects(blur_px=3.0)),
-    "a view off by 3 px": ("spoiled_view", Effects(spoiled_px=3.0)),
-    "three corners off by 3 px": ("bad_corners", Effects(bad_corners=3)),
+    label: (name, Effects(**fields))
+    for label, (name, fields) in EXPECTED["intrinsic_classes"].items()
 }
 # What careful people have: a plate flat to 0.03 mm, a lens that breathes 0.03 %, a board that is
 # put down, and corners that are noisier in some views than in others.
