@@ -83,7 +83,7 @@ def test_python(monkeypatch, attribute, value, verdict, says):
     found = doctor._python()
     assert found.verdict == verdict
     assert re.search(says, found.says)
-    assert ("Python 3.13" in found.remedy or "a hub" in found.remedy) == (verdict != "ok")
+    assert ("Python 3.14" in found.remedy or "a hub" in found.remedy) == (verdict != "ok")
 
 
 @pytest.mark.parametrize(("brings", "version", "verdict"), EXPECTED["brings_opencv"])
