@@ -59,6 +59,7 @@ def test_all_yours(folders: tuple[Path, Path]) -> None:
     write(YOURS)
     handed = hand_over(folders[1])
     assert all("yours (live: D435 on the bench, 20" in found.says for found in handed)
+    assert "several cameras" not in repr(handed)
     budget = handed.budget()
     assert "Your budget" in repr(budget)
     at = at_object_mm(handed)
@@ -74,6 +75,15 @@ def test_all_yours(folders: tuple[Path, Path]) -> None:
     whose = {row.term.name: row.term.source for row in budget.rows}
     assert whose["pixel"] == whose["forward kinematics"] == "the lesson"
     assert whose["depth noise"].startswith("yours")
+
+
+def test_numbers_of_two_cameras_are_said_to_be(folders: tuple[Path, Path]) -> None:
+    """As of somebody who gave a name only after notebook 01."""
+    write(YOURS)
+    for lesson, seed in (("01_pinhole", 7), ("02_depth_noise", 22), ("04_hand_eye", "")):
+        camera = SimpleNamespace(**vars(YOURS), serial=seed and f"seed-{seed}")
+        results.save(lesson, camera, results.load(lesson).quantities)
+    assert "several cameras (01: seed-7, 02: seed-22), and" in repr(hand_over())
 
 
 def test_intrinsics_use_the_correlations(folders: tuple[Path, Path]) -> None:

@@ -24,6 +24,7 @@ from coursekit.intrinsics.derivatives import PARAMETERS, scaled_root
 from coursekit.results import Covariance, ErrorKind, Quantity, Result, Source
 from coursekit.specifications import DATA, device
 from coursekit.stereo.law import depth_slope
+from coursekit.words import say
 
 LESSON = "the lesson"
 LESSON_CAMERA = Intrinsics(848, 480, 447.0, 447.0, 424.0, 240.0)
@@ -180,7 +181,13 @@ class HandOver:
         return ", ".join(dict.fromkeys(found.result().camera for found in self))
 
     def __repr__(self) -> str:
-        return "\n".join(found.says for found in self)
+        said = [found.says for found in self]
+        own = {found.lesson[:2]: found.yours.serial for found in self if found.yours}
+        serials = {lesson: serial for lesson, serial in own.items() if serial}  # an arm has none
+        if len(set(serials.values())) > 1:
+            which = ", ".join(f"{lesson}: {serial}" for lesson, serial in serials.items())
+            said.append(say("budget.cameras", which=which))
+        return "\n".join(said)
 
     # the budget
 
