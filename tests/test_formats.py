@@ -792,6 +792,8 @@ def test_the_verdict_goes_along(kept, result, to) -> None:
         done = ck.export(what, to)
         assert "- Usable with care: a point 300 mm in front" in repr(done)
         assert ("Usable with care" in done.text) is (to != "easy_handeye2")
+    few = ck.export(result.session.pick([0, 5, 9]).solve(), to)
+    assert "- Cannot be told how good it is" in repr(few)
     wrong = replace(result.session, T_base_gripper=invert_transform(ARM)).solve()
     assert "Not to be trusted: " in ck.export(wrong, to, parent="tool0").notes[0]
 
