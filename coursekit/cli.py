@@ -103,6 +103,16 @@ def _squares(text: str) -> tuple[int, int]:
         raise argparse.ArgumentTypeError(f"got {text!r}, want for example 9x6") from None
 
 
+def _moment(text: str) -> datetime:
+    """A moment as ISO 8601 has it; a day alone is its last second."""
+    try:
+        when = datetime.fromisoformat(text)
+    except ValueError:
+        wanted = "a day or a moment, such as 2026-03-02 or 2026-03-02T23:59"
+        raise argparse.ArgumentTypeError(f"got {text!r}, want {wanted}") from None
+    return when.replace(hour=23, minute=59, second=59) if len(text) <= len("2026-03-02") else when
+
+
 def _record(options: argparse.Namespace) -> None:
     with ck.open_camera(options.camera) as camera:
         print(_typed(str(camera)))
@@ -222,8 +232,7 @@ def _doctor(options: argparse.Namespace) -> int:
     return doctor.run(options.camera, options.json)
 
 
-TYPES = {"int": int, "float": float, "lower": str.lower, "squares": _squares}
-TYPES |= {"moment": datetime.fromisoformat}
+TYPES = {"int": int, "float": float, "lower": str.lower, "squares": _squares, "moment": _moment}
 RUNS = (_calibrate, _hand_eye, _record, _board, _submit, _grade, _export, _doctor)
 RUN = {run.__name__[1:].replace("_", "-"): run for run in RUNS}  # by the command's name
 

@@ -276,7 +276,8 @@ def mistaken(seed: int = 0) -> dict[str, tuple[str, Submission]]:
         "not_widened": ("sigma_d_interval", claiming(sigma_d_interval_px=ends)),
         "of_variance": ("exponent", claiming(**twice)),
         "off_scale": ("plot", predicting(good, 2.5)),
-        "incomplete": ("data", weak(seed)),
+        "incomplete": ("verdict", with_part(good, "conclusion", distance_m=None)),
+        "too_few": ("data", weak(seed)),
     }
 
 

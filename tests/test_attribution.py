@@ -454,7 +454,7 @@ def test_the_budget_is_the_first_row_and_trials_follow(tmp_path):
 )
 def test_text_comes_back_and_no_cell_is_a_formula(tmp_path, text):
     ledger = Ledger(tmp_path / "ledger.csv")
-    row = replace(BUDGET, task=text, note=text, mean_x_mm=-1.25)  # a number stays a number
+    row = replace(BUDGET, task=text, note=text, mean_x_mm=-1.25, trials=1234567)  # numbers stay
     ledger.append(row)
     assert ledger.read() == (row,)
     assert ",-1.25," in ledger.path.read_text("utf-8")
@@ -530,6 +530,7 @@ def entry(**changes):
     return replace(BUDGET, **changes)
 
 
+FAR = np.tile(np.eye(4) + 300 * np.eye(4, k=3), (5, 1, 1))
 test_what_cannot_be_is_refused = refusals(
     *each("misses: got shape", attributed, "misses", np.zeros((5, 2))),
     *each("misses: .* 2 trials or more", attributed, "misses", np.zeros((1, 3))),
@@ -537,6 +538,7 @@ test_what_cannot_be_is_refused = refusals(
     *each("millimetres", attributed, "misses", np.ones((5, 3))),
     *each("one .* for each of 5", attributed, "poses", np.tile(np.eye(4), (4, 1, 1))),
     *named(attributed, matters_m=[3.0], poses=[np.zeros((5, 4, 4))]),
+    *each("are these millimetres", attributed, "poses", FAR),
     *named(simulated, kind=["weather"], n=[0, 2.5]),
     *named(entry, task=[""], note=["two\nlines", "nul\0", "x" * 501]),
     *named(entry, noise_mm=[np.nan], trials=[2.5], success=["high"]),

@@ -89,6 +89,11 @@ def test_wrong_usage_exits_with_2(arguments, capsys):
     assert capsys.readouterr().err.startswith("usage: coursekit")
 
 
+def test_a_day_alone_is_its_end():
+    said = [str(cli.TYPES["moment"](text)) for text in ("2026-03-02", "2026-03-02T10:00")]
+    assert said == ["2026-03-02 23:59:59", "2026-03-02 10:00:00"]
+
+
 @pytest.mark.parametrize(("error", "code"), [(CameraError("gone"), 1), (KeyboardInterrupt(), 130)])
 def test_a_camera_that_fails_at_once(error, code, tmp_path, monkeypatch, capsys):
     real_library()

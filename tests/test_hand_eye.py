@@ -69,6 +69,9 @@ def test_half_turns_do_no_harm():
     seen = turned(camera_board(T, X, Y, "eye_in_hand"), 1e-5 * rng.normal(size=(6, 6)))
     result = he.HandEyeSession("eye_in_hand", T, seen).solve("closed_form")
     np.testing.assert_allclose(result.X, X, atol=1e-4)
+    T[:4, :3, :3] = Rotation.from_rotvec(np.radians(175) * np.eye(4, 3)).as_matrix()
+    alone = he.HandEyeSession("eye_in_hand", T[:4], camera_board(T[:4], X, Y, "eye_in_hand"))
+    np.testing.assert_allclose(alone.solve("closed_form").X, X, atol=1e-4)
 
 
 # --- what is no session ---
@@ -103,6 +106,7 @@ def test_bad_input_names_the_argument_and_the_index():
         ({"method": "park", "free_scale": True}, r"method: got 'park', want 'refine' with free_sc"),
         ({"method": "park", "guess": known.X}, r"method: got 'park', want 'refine' with guess"),
         ({"free_offsets": True}, r"q: got None, want joint angles"),
+        ({"fk": "uprigth"}, r"fk: got 'uprigth', want 'usual', 'upright'"),
     ):
         with pytest.raises(ValueError, match=message):
             known.solve(**options)

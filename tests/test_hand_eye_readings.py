@@ -160,6 +160,10 @@ def test_intrinsics_of_another_image_size(factor: float) -> None:
     times = float(finding.evidence.split("times ")[1].split()[0])
     assert times == pytest.approx(1 / factor, rel=0.03)
     smaller = replace(lens, width=320, height=240)
+    off = np.array([-240.0, 150.0]) if factor == 2.0 else np.array([-700.0, -500.0])
+    crop = replace(lens, cx=lens.cx + off[0], cy=lens.cy + off[1])  # is right for its images
+    seen = [replace(view, pixels=view.pixels + off) for view in given.seen]
+    assert not diagnose(replace(given, intrinsics=crop, seen=seen)).names
     with pytest.raises(ValueError, match="320"):
         diagnose(replace(given, intrinsics=smaller))
 

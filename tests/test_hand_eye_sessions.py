@@ -127,6 +127,7 @@ def test_pick_and_repr() -> None:
     assert part.names == ("view_07", "view_02")
     np.testing.assert_array_equal(part.q, session.q[[7, 2]])
     np.testing.assert_array_equal(part.seen[0].pixels, session.seen[7].pixels)
+    assert session.pick(session.times > session.times[7]).names == ("view_08", "view_09")
     assert "10 arm poses and images, joint angles, times" in repr(session)
 
 

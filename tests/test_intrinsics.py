@@ -113,6 +113,7 @@ def test_a_guess_changes_the_start_and_not_the_end(result):
     fit = intrinsics.calibrate(VIEWS, CHARUCO, guess=guess)
     for name in fit.names:
         assert abs(fit.value(name) - result.value(name)) < 0.01 * result.sigma(name)
+    assert calibrated(model="none", guess=LENS).intrinsics.coeffs == (0.0,) * 5  # held at 0
     same = intrinsics.calibrate(VIEWS, CHARUCO, guess=guess, same_focal=True)
     assert same.value("fx") == same.value("fy") == same.value("f")
     assert same.sigma("fx") == same.sigma("f") > 0
@@ -162,6 +163,8 @@ def test_jacobian_is_the_numerical_derivative_of_opencvs_projection(result):
         np.testing.assert_allclose(shared[rows], numeric[:, :9], rtol=1e-6, atol=1e-6)
         np.testing.assert_allclose(poses[view], numeric[:, 9:], rtol=1e-5, atol=1e-3)
     assert rows.stop == len(shared) == 2 * result.corners
+    bare, at = replace(lens, model="none"), CHARUCO.points + np.array([0, 0, 0.5])
+    assert (derivatives.project_with_derivatives(at, bare)[0] == project(at, bare.K)).all()
 
 
 def test_covariances_are_from_the_inverse_of_the_whole_normal_matrix(result):
@@ -226,6 +229,8 @@ test_bad_input_is_named = refusals(
     fourth("has 5 corners, want", ids=IDS[:5], pixels=PIXELS[:5]),
     fourth("not finite", pixels=PIXELS * np.nan),
     fourth("has corner .* the board has 0 to 39: another board", ids=IDS + 40),
+    fourth("has corner -1, the board has 0", ids=np.append(-1, IDS[1:])),
+    fourth("all its corners on one line", pixels=np.ones_like(PIXELS)),
     fourth("the same corner twice", ids=np.zeros(len(IDS), int)),
     fourth("all its corners on one line", ids=LINE, pixels=np.ones((len(LINE), 2))),
     *each("detections: got 2 views, want at least 3", calibrated, "detections", VIEWS[:2]),

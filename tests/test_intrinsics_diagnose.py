@@ -415,3 +415,8 @@ def test_depths_that_do_not_fit_the_views_are_refused() -> None:
         diagnose(detections, CHARUCO, depth_m=truth.depth_m[:3])
     with pytest.raises(ValueError, match=r"depth_m\[0\]: got shape \(2,\), want"):
         diagnose(detections, CHARUCO, depth_m=[z[:2] for z in truth.depth_m])
+    with pytest.raises(ValueError, match=r"depth_m: .* millimetres"):
+        diagnose(detections, CHARUCO, depth_m=[1e3 * z for z in truth.depth_m])
+    hole = replace(detections[0], pixels=detections[0].pixels * np.nan)
+    with pytest.raises(ValueError, match=r"detections\[0\].pixels: .* finite"):
+        diagnose([hole, *detections[1:]], CHARUCO)

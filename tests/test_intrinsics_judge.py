@@ -192,8 +192,11 @@ def test_comparison_with_the_truth_and_with_another_camera(good) -> None:
 
 
 OTHER = Intrinsics(848, 480, 600, 600, 424, 240)
+EMPTY = Detection([], np.zeros((0, 2)), (320, 240))
 test_bad_input_is_named = refusals(
     ("detections: got 0, want at least one view", lambda: intrinsics.coverage([])),
+    ("detections: got 0, want .* with corners", lambda: intrinsics.coverage([EMPTY])),
+    ("320", lambda: intrinsics.coverage([*fit(CHARUCO, 1).detections, EMPTY])),
     (
         "got 5 views, halves need at least 6",
         lambda: intrinsics.halves(fit(CHARUCO, 1).detections[:5], CHARUCO),

@@ -394,8 +394,11 @@ def test_what_cannot_be_is_said_before_anything_is_made(change, message, tmp_pat
     quick(tmp_path / "in", ["a"])
     quick(tmp_path / "empty", ())
     (quick(tmp_path / "papers", ()) / "a.pdf").write_bytes(b"")
+    zipfile.ZipFile("a.zip", "w").close()
+    Path("roster.csv").write_text("Vorname;Nachname\nAda;Honest\n", encoding="utf-8")
+    choices = batch.Choices(change.pop("roster", None))
     with pytest.raises(ValueError, match=message):
-        graded(**{"folder": "in", "out": "out"} | change)
+        graded(**{"folder": "in", "out": "out", "choices": choices} | change)
     assert not (tmp_path / "out").exists()
 
 
@@ -418,7 +421,7 @@ def test_everybody_of_a_class_has_a_row_and_nobodys_grade_is_anothers(
     choices = batch.Choices("class.csv", datetime(2026, 3, 4))
     summary = batch.grade_folder("all.zip", progress=False, choices=choices)
     assert summary.missing == tuple(names[:2])
-    assert ["“Studio exercise 1”" in note for note in summary.notes] == [True] * (lms == "Canvas")
+    assert sum("“Studio exercise 1”" in note for note in summary.notes) == (lms == "Canvas")
     out = Path("all_report")
     rows = table(out)
     status: dict[str, list[str]] = {}
@@ -475,7 +478,7 @@ def test_what_the_instructor_decides_reaches_everybody(lms, in_process, tmp_path
     said, rows, pages = run()
     assert "Missing: 1 student: Absent, Ann\n" in said
     assert "--assignment" not in said
-    assert "could not be read, so hand it in again. The file is no zip" in pages["Bo Lee"]
+    assert "could not be graded, so hand in another. The file is no zip" in pages["Bo Lee"]
     assert "<h1>Studio exercise 1: Eve Martin</h1>" in pages["Eve Martin"]
     assert "The name in the file is Hana Sato." in pages["Eve Martin"]
     assert "Handed in 3 March 2026, 13:00: 23 h 0 min late." in pages["Łukasz Żółć"]
@@ -502,14 +505,17 @@ def test_what_the_instructor_decides_reaches_everybody(lms, in_process, tmp_path
     assert "50 of 100 (yours; " in (out / "index.html").read_text(encoding="utf-8")
     if lms == "Moodle":
         (bo,) = [row for row in table(out, "moodle.csv") if row["Full name"] == "Lee, Bo"]
-        assert (bo["Grade"], bo["Feedback comments"]) == ("0", "too late")
+        said = "too late | Your instructor set the total."
+        assert (bo["Grade"], bo["Feedback comments"]) == ("0", said)
 
 
 def test_own_points_survive_a_regrade_which_says_what_changed(in_process, tmp_path, monkeypatch):
-    folder, out = quick(tmp_path / "in", ["a", "b"]), tmp_path / "out"
+    folder, out = quick(tmp_path / "in", ["a", "b", "c"]), tmp_path / "out"
     before = graded(folder, out)
     own = out / "own_points.csv"
-    text = "who;student;paragraph;late;overrule;comment\na;a;1,5;-1;;well said\n"
+    codes = {row["student"]: row["code"] for row in table(out, "own_points.csv")}
+    second = f";;{codes['a']};0;;;\n;;{codes['b']};0,5;;;terse\n"  # of a second marker
+    text = f"who;student;code;paragraph;late;overrule;comment\na;a;;1,5;-1;;\n{second}"
     own.write_text(text, encoding="utf-8-sig")
     kept = own.read_bytes()
     (out / "grades.csv").write_text("edited", encoding="utf-8")
@@ -522,25 +528,34 @@ def test_own_points_survive_a_regrade_which_says_what_changed(in_process, tmp_pa
     first = next(row for row in table(out) if row["student"] == "a")
     machine = float(first["points"]) - float(first["paragraph"])
     assert float(first["total"]) == pytest.approx(machine + 1.5 - 1)
-    assert summary.changes == (
-        ("a", f"{float(first['points']):g}", first["total"], "your own points changed"),
+    assert summary.changes[0] == (
+        *("a", f"{float(first['points']):g}", first["total"], "your own points changed"),
     )
-    assert summary.kept == before.counts["graded"] == 2
+    other = next(row for row in table(out) if row["student"] == "b")
+    assert float(other["total"]) == float(other["points"]) - float(other["paragraph"]) + 0.5
+    assert other["comment"] == "terse"
+    assert f"another row: {codes['a']}." in str(
+        summary
+    )  # two markers, of whom the first one counts
+    assert "grades.csv had been edited: your copy of it is grades_edited_" in str(summary)
+    assert summary.kept == before.counts["graded"] == 3
     assert own.read_bytes() == kept
     assert all(path.exists() for path in foreign)
     (edited,) = out.glob("grades_edited_*.csv")
     assert edited.read_text(encoding="utf-8") == "edited"
+    with pytest.raises(ValueError, match="is the report of other bundles"):
+        graded(quick(tmp_path / "another", ["d"]), out, overwrite=True)
     monkeypatch.setitem(grading_rules()["points"], "paragraph", 4)
     monkeypatch.setattr(batch, "grader_version", lambda: "another")
-    (change,) = [c for c in graded(folder, out, overwrite=True).changes if c[0] == "b"]
+    (change,) = [c for c in graded(folder, out, overwrite=True).changes if c[0] == "c"]
     assert "the rubric or the grader changed; paragraph " in change[3]
 
 
 @pytest.mark.parametrize(("row", "said"), EXPECTED["bad_own_points"])
 def test_own_points_that_cannot_be_are_refused_before_any_work(row, said, tmp_path):
     out = quick(tmp_path / "out", ())
-    (out / "own_points.csv").write_text(f"who,paragraph,late,overrule\na,{row}\n", "utf-8")
-    with pytest.raises(ValueError, match=rf"^own_points\.csv: a: {said}"):
+    (out / "own_points.csv").write_text(row, "utf-8")
+    with pytest.raises(ValueError, match=rf"^own_points\.csv: {said}"):
         graded(quick(tmp_path / "in", ["a"]), out)
 
 
@@ -571,6 +586,8 @@ def test_own_points_and_namesakes_outlive_another_roster(in_process, tmp_path, m
         summary, grades = run(column)
         assert grades == {"17": computed["17"], "18": "77", "19": jon}
     assert "another row: x (19); Nobody (20)." in str(summary)
+    again = batch.grade_folder("all.zip", overwrite=True, progress=False)
+    assert "Without --roster, which the last report had" in str(again)
     own = own.replace("19,x", '19,"Jon Late"')
     Path("all_report/own_points.csv").write_text(own, encoding="utf-8")
     summary, grades = run("Identifier")
@@ -594,6 +611,12 @@ def test_without_an_lms_a_name_typed_twice_takes_nobodys_points(in_process, tmp_
     rows = {row["file"]: row for row in table(out)}
     assert [rows[f"{at}/s.zip"]["counts"] for at in ("zoe", "mallory")] == ["yes", "no"]
     assert all("same_name" in row["flags"] for row in rows.values())
+
+
+def test_a_bundle_by_itself_is_graded_and_graded_again(in_process, tmp_path):
+    bundle, out = quick(tmp_path / "in", ["a"]) / "a.zip", tmp_path / "out"
+    assert [graded(bundle, out, overwrite=True).kept for _ in "12"] == [0, 1]
+    assert [row["file"] for row in table(out)] == ["a.zip"]
 
 
 def test_two_graders_do_not_write_one_report(in_process, tmp_path):

@@ -259,7 +259,7 @@ def test_what_most_got_wrong_comes_first_and_what_is_left_out_is_no_mistake():
     text = check_page(report.class_page([wrong["std"], *[wrong["bias"]] * 2, left_out])).text
     assert "What went wrong, and with how many of 4 students" in text
     assert re.findall(r"\d+ \(\d+ %\)", text) == ["2 (50 %)", "1 (25 %)"]  # bias, then std
-    table, _, rest = text.partition("Left out, and in no row above:")
+    table, _, rest = text.partition("Answers that are missing, in no row above:")
     assert "Silent" not in table.partition("What went wrong")[2]
     assert "Silent" in rest.partition("Everybody")[0]
 
@@ -378,6 +378,7 @@ def test_the_students_page_says_what_the_instructor_set():
     said = "Points that your instructor set: 1 for the paragraph, in place of 2; -10 for late days."
     assert f"{said} Computed were {line.points:g} of 100 points" in text
     assert "cost some" in text
+    assert replace(line, own={"late": "-100"}).total == 0
     text = report.student_page(replace(line, own={"overrule": "75"}), "")
     assert "<strong>75 of 100 points." in text
     assert "Your instructor set the total. Computed were" in text
@@ -395,7 +396,7 @@ def test_late_is_said_to_the_minute_not_rounded_up(after, said):
 def test_whoever_hands_in_an_essay_reads_which_file_and_what_is_wanted():
     line = report.not_graded("Bo_17_assignsubmission_file_/e.docx", "no_bundle", files="e.docx")
     text = report.student_page(line, "")
-    assert "Your file e.docx could not be read, so hand it in again." in text
+    assert "Your file e.docx could not be graded, so hand in another." in text
     assert "Wanted is the .zip" in text
 
 
@@ -411,6 +412,8 @@ def test_all_paragraphs_are_on_a_page_with_name_and_link(lines):
     assert 'No paragraph: <a href="students/Silent.html">Silent</a>' in text
     assert "words of old" not in page.text
     assert text.count("shares its words") == 0
+    twins = [replace(line, name="Ann", who=f"number {i}") for i, line in enumerate(lines[:2])]
+    assert "</a> (number 0)</h2>" in report.paragraphs_page(twins)
     shared = report.across([said_by("Ann", PARAGRAPH), said_by("Bob", PARAGRAPH)])
     assert report.paragraphs_page(shared).count("shares its words") == 2
     assert report.paragraphs_page(shared, named=False).count("shares its words") == 0  # no bias
@@ -421,7 +424,7 @@ def test_all_paragraphs_are_on_a_page_with_name_and_link(lines):
 
 def test_a_second_marker_finds_the_row_to_write_into(lines):
     rows = read(report.own_table(lines))
-    codes = re.findall("<h2>([0-9a-f]{6})</h2>", report.paragraphs_page(lines, named=False))
+    codes = re.findall("<h2>(p[0-9a-f]{6})</h2>", report.paragraphs_page(lines, named=False))
     assert len(codes) == len(set(codes)) == 6
     those = {row["student"].removeprefix("'") for row in rows if row["code"] in codes}
     assert those == {line.name for line in lines[:-1]}

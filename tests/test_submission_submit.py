@@ -322,7 +322,7 @@ def test_the_studio_cells_of_the_notebook_hand_in_what_they_say(own_results, cap
     wrong = {(item.topic, item.mistake) for item in found.items if item.verdict != "right"}
     few = 0 if NIGHTLY else 9 - 9 * 12 / 100  # of the points for raw depths
     assert found.points >= 95 - few
-    assert wrong <= {("data", "incomplete"), ("bias_se", "independent"), ("std_se", "one_pixel")}
+    assert wrong <= {("data", "too_few"), ("bias_se", "independent"), ("std_se", "one_pixel")}
     empty = replace(packed.claims, rows=()), replace(packed.plot, predicted_mm=None)
     untouched = replace(packed, claims=empty[0], plot=empty[1], conclusion=Conclusion())
     assert grade(untouched).points <= 30

@@ -138,11 +138,11 @@ class Ledger:
 
 
 def _cell(value: str | float | None) -> str:
-    """What is written: six digits of a number, text that cannot be taken for a formula."""
+    """What is written: six digits of a measure, text that cannot be taken for a formula."""
     if value is None:
         return ""
     if not isinstance(value, str):
-        return f"{value:.6g}"
+        return f"{value:.6g}" if isinstance(value, float) else f"{value}"
     risky = value.lstrip().startswith(FORMULA_SIGNS) or value.startswith("'")
     return "'" + value if risky else value
 

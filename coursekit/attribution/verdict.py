@@ -34,7 +34,7 @@ TEST_LEVEL = 0.01  # of each test
 ENOUGH_POWER = 0.9  # with which "there is none" may be said
 FEWEST_TRIALS, MOST_TRIALS = 5, 500  # fewer decide nothing; nobody grasps more often to find out
 MATTERS_M = 0.003
-TOO_LONG_M = 0.5  # a miss that long was given in millimetres
+TOO_LONG_M, OUT_OF_REACH_M = 0.5, 10.0  # misses and places so far were given in millimetres
 FEW_DIGITS = 1e-4  # of a rotation: poses are often written with five
 COVERAGE = 0.95
 # A mean is blamed on the calibration only if a part of the same size that follows the pose would
@@ -371,6 +371,8 @@ def attribute(
     if poses is not None:
         poses = checks.transforms("poses", poses, FEW_DIGITS)
         want(poses.shape == (n, 4, 4), "poses", poses, f"one (4, 4) for each of {n} trials")
+        far = float(np.abs(poses[:, :3, 3]).max())
+        want(far < OUT_OF_REACH_M, "poses", f"{far:.0f} m", "metres (are these millimetres?)")
     seen = MissEvidence.of(rows, poses)
     center, scatter = rows.mean(axis=0), rows.std(axis=0, ddof=1)
     half = float(t.ppf((1 + COVERAGE) / 2, n - 1)) * scatter / np.sqrt(n)

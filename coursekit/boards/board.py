@@ -442,13 +442,14 @@ def _faults(
     if not np.isfinite(view.pixels).all():
         yield "has corners that are not finite"
     if ids.min() < 0 or ids.max() > last:
-        yield f"has corner {ids.max()}, the board has 0 to {last}: another board?"
+        odd = ids[(ids < 0) | (ids > last)][-1]
+        yield f"has corner {odd}, the board has 0 to {last}: another board?"
     if len(np.unique(ids)) < len(ids):
         yield "has the same corner twice"
-    flat = board.points[ids, :2]
-    spread = np.linalg.svd(flat - flat.mean(axis=0), compute_uv=False)
-    if spread[1] < 1e-6 * spread[0]:
-        yield "has all its corners on one line, which fixes no pose"
+    for flat in (board.points[ids, :2], view.pixels):
+        spread = np.linalg.svd(flat - flat.mean(axis=0), compute_uv=False)
+        if spread[1] <= 1e-6 * spread[0]:
+            yield "has all its corners on one line, which fixes no pose"
 
 
 # --- what a camera sees of a board ---

@@ -130,8 +130,10 @@ class RosBag(Camera):
         if self.color:
             self.T_color_depth = facts.between(topics["color"], topics["depth"])
         self.baseline_m = facts.baseline_m(topics.get("right"))
-        first = next(self._messages(reader, {topics["depth"]}), (None, None, None))[2]
-        kind = getattr(first, "encoding", "16UC1")
+        first = next(self._messages(reader, {topics["depth"]}), None)
+        if first is None:
+            raise recording.without_depth(self._path, sorted(reader.topics))
+        kind = getattr(first[2], "encoding", "16UC1")
         if kind not in DEPTH_KINDS:  # a picture of depth, for people to look at
             raise recording.without_depth(self._path, [f"{topics['depth']}, {kind},"])
         metres = kind == "32FC1"

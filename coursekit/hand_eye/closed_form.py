@@ -40,7 +40,8 @@ HAND_EYE = ("tsai", "park", "horaud", "andreff", "daniilidis")  # OpenCV's, of A
 ROBOT_WORLD = ("shah", "li")  # OpenCV's, of X and Y together
 CLOSED_FORMS = ("closed_form", *HAND_EYE, *ROBOT_WORLD)
 FEWEST_POSES = 3
-HALF_TURN_DEG = 170.0  # beyond it noise can turn an axis round
+HALF_TURN_DEG = 170.0  # beyond it noise can turn an axis round,
+NARROW_RAD = 0.01  # but is used where the others turn no more than that about a second axis
 LEAST_TURN_RAD = np.radians(0.1)  # less than any arm's own wobble
 NO_INVERSE = 1e-13  # of the normal matrix' largest eigenvalue: rounding errors are as large
 NO_CAMERA_M = 1e5  # farther away is no camera, not even in millimetres that pass for metres
@@ -96,8 +97,10 @@ def rotation_by_axes(A: Floats, B: Floats) -> Floats:
     """`rotation_half` of many sessions, A and B (..., p, 4, 4), whether it is determined or not."""
     a, b = half_angle_vectors(A[..., :3, :3]), half_angle_vectors(B[..., :3, :3])
     longest = np.maximum(np.linalg.norm(a, axis=-1), np.linalg.norm(b, axis=-1))
-    use = longest < 2.0 * math.sin(math.radians(HALF_TURN_DEG) / 2)
-    return nearest_rotation(np.swapaxes(a * use[..., None], -1, -2) @ b)
+    use = (longest < 2.0 * math.sin(math.radians(HALF_TURN_DEG) / 2))[..., None]
+    spread = np.linalg.svd(a * use, compute_uv=False) / math.sqrt(a.shape[-2])
+    use |= (spread[..., 1:2] < NARROW_RAD)[..., None]  # without half turns nothing is left
+    return nearest_rotation(np.swapaxes(a * use, -1, -2) @ b)
 
 
 def translation_half(A: Floats, B: Floats, R_X: Floats) -> Floats:

@@ -39,7 +39,8 @@ VIDEO_STEP_M, VIDEO_STEP_RAD = 0.1, np.radians(20.0)  # at most, for velocities 
 # 5 % in one of 60 simulated sessions, 2 % on real webcams.
 FOCAL_SPREAD, FOREIGN_SIGMAS = 0.02, 3.0
 DRIFTING = ("the camera on its mount", "the board on its stand")
-FAR_FROM_MIDDLE = 0.12  # of the image: no camera's principal point is so far off
+FAR_FROM_MIDDLE = 0.12  # of the image: no camera's principal point is so far off, but a crop's;
+BY_CHANCE = 1.5  # times smaller are residuals at most through a lens that is not this camera's
 
 
 def diagnose(session: HandEyeSession) -> Findings:
@@ -95,12 +96,14 @@ class _Case:
         if lens is None or self.session.detections is None:
             return
         middle = np.array([lens.cx + 0.5, lens.cy + 0.5]) / lens.size
-        if np.abs(middle - 0.5).max() < FAR_FROM_MIDDLE:
+        if np.abs(middle - 0.5).max() < FAR_FROM_MIDDLE or middle.min() <= 0:
             return
         given, factor = self.pairs.fit, float(0.5 / middle.mean())
         fx, fy, (cx, cy) = factor * lens.fx, factor * lens.fy, factor * middle * lens.size - 0.5
         scaled = replace(lens, fx=fx, fy=fy, cx=float(cx), cy=float(cy))
         mended = PosePairs.of(replace(self.session, intrinsics=scaled))
+        if given.better_than(mended.fit) > BY_CHANCE:
+            return
         if mended.fit.better_than(given) > 1.0:
             self.pairs = mended
         change = _change(given, mended.fit)

@@ -512,13 +512,14 @@ def _implausible(
     if board > (ROOM_M if in_hand else BOARD_IN_GRIPPER_M):
         yield f"the board would be {board:.2f} m from the {'base' if in_hand else 'gripper'}"
     middle = np.zeros(3) if session.board is None else session.board.points.mean(axis=0)
-    limit, lens = np.full(2, np.tan(np.radians(WIDE_DEG))), session.intrinsics
+    centre, limit, lens = np.zeros(2), np.full(2, np.tan(np.radians(WIDE_DEG))), session.intrinsics
     if lens is not None:
-        limit = BEYOND_IMAGE * np.array([lens.width / lens.fx, lens.height / lens.fy]) / 2
+        half, focal = np.array(lens.size) / 2, np.array([lens.fx, lens.fy])
+        centre, limit = (half - 0.5 - [lens.cx, lens.cy]) / focal, BEYOND_IMAGE * half / focal
     place = T_camera_board @ [*middle, 1.0]
     front = place[:, 2] > 0
     with np.errstate(divide="ignore", invalid="ignore"):
-        inside = front & (np.abs(place[:, :2] / place[:, 2:3]) < limit).all(axis=1)
+        inside = front & (np.abs(place[:, :2] / place[:, 2:3] - centre) < limit).all(axis=1)
     if inside.mean() < SHARE_IN_VIEW:
         what = "behind the camera" if front.mean() < SHARE_IN_VIEW else "outside its field of view"
         yield f"the board would be {what} in {np.sum(~inside)} of {len(inside)} images"

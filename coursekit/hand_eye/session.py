@@ -168,8 +168,8 @@ class HandEyeSession:
         return len(self.T_base_gripper)
 
     def pick(self, which: Sequence[int] | Integers) -> HandEyeSession:
-        """The pairs with these numbers, in this order."""
-        which = np.asarray(which, int)
+        """The pairs with these numbers, in this order, or those of a mask (n,)."""
+        which = np.arange(len(self))[list(which)]
         known = [n for n in ("T_base_gripper", *OPTIONAL) if getattr(self, n) is not None]
         rows: dict[str, Any] = {name: getattr(self, name)[which] for name in known}
         seen = self.seen.pick(which) if isinstance(self.seen, Detections) else self.seen[which]
@@ -466,6 +466,8 @@ def solve(
     """
     choice("method", method, METHODS)
     stated = fk if isinstance(fk, FkErrors) else None
+    known = fk is stated or (isinstance(fk, str) and fk in ("usual", "upright"))
+    want(known, "fk", fk, "'usual', 'upright', None or FkErrors")
     asked = {"free_scale": free_scale, "free_offsets": free_offsets, "fk": stated, "guess": guess}
     for name, value in asked.items():
         refined = value is None or value is False or method == "refine"

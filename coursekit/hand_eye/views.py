@@ -211,7 +211,8 @@ def _starts(seen: Detection, board: Board, intrinsics: Intrinsics, name: str) ->
     if intrinsics.dist is not None:
         rays, found = undistort(rays, intrinsics.dist)
         if not found.all():
-            raise ValueError(f"{name}: has pixels where the distortion has no inverse")
+            why = "are the intrinsics those of this camera, at this image size?"
+            raise ValueError(f"{name}: has pixels where the distortion has no inverse; {why}")
     points = board.points[seen.ids]
     centre = points.mean(axis=0)  # without it IPPE loses digits on boards far from their origin
     count, rotations, translations, _ = cv2.solvePnPGeneric(

@@ -65,7 +65,7 @@ def project_with_derivatives(
     xy = points[:, :2] / z[:, None]
     x, y = xy[:, 0], xy[:, 1]
     r2 = x * x + y * y
-    coeffs = np.array(intrinsics.coeffs)
+    coeffs = np.zeros(5) if intrinsics.dist is None else intrinsics.dist
     distorted = distort(xy, coeffs)
     focal = np.array([intrinsics.fx, intrinsics.fy])
     pixels = distorted * focal + [intrinsics.cx, intrinsics.cy]

@@ -58,6 +58,7 @@ MOST_COLUMNS = 30  # that are tried
 # A print is off by whole per cents (a page "fitted to paper"); depth cameras read 1-2 % wrong at
 # 0.5 to 1 m.
 DEPTH_TOLERANCE, SCALE_SIGMAS = 0.025, 4.0
+TOO_FAR_M = 100.0  # beyond any depth camera; a board nearer than 0.1 m is out of focus
 NAMES_SHOWN = 4
 
 _TEXTS = DiagnosisTexts.of("intrinsics")
@@ -87,6 +88,10 @@ def diagnose(
         wanted = f"{len(detections)} views, each with its Z"
         want(len(depth_m) == len(detections), "depth_m", len(depth_m), wanted)
         depths = [array(f"depth_m[{i}]", z, (len(detections[i]),)) for i, z in enumerate(depth_m)]
+        far = max((z[np.isfinite(z)].max(initial=0.0) for z in depths), default=0.0)
+        want(far < TOO_FAR_M, "depth_m", f"Z of {far:.0f} m", "metres (are these millimetres?)")
+    for i, view in enumerate(detections):
+        array(f"detections[{i}].pixels", view.pixels, (None, 2), finite=True)
     found, used = _images(detections, board)
     unseen = [] if depths else [_TEXTS.not_tested["squares"]]
     if all(detections[i].blur is None for i in used):

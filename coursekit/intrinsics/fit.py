@@ -35,7 +35,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coursekit.arrays import ArrayLike, Floats, NDArray
-from coursekit.boards import Board, Detection
+from coursekit.boards import Board, Detection, Detections
 from coursekit.boards.board import check_detections
 from coursekit.checks import array, choice, is_number, want
 from coursekit.geometry import Intrinsics, deproject, make_transform, project
@@ -467,7 +467,8 @@ def _solve(
         flags |= 0 if name in names else getattr(cv2, f"CALIB_FIX_{name.upper()}")
     K0, dist0 = np.eye(3), np.zeros(5)
     if guess is not None:
-        K0, dist0, flags = guess.K, np.array(guess.coeffs), flags | cv2.CALIB_USE_INTRINSIC_GUESS
+        K0, flags = guess.K, flags | cv2.CALIB_USE_INTRINSIC_GUESS
+        dist0 = np.where([k in names for k in derivatives.PARAMETERS[4:]], guess.coeffs, 0.0)
         if same_focal:  # the ratio that OpenCV holds is that of the guess
             K0[0, 0] = K0[1, 1] = (K0[0, 0] + K0[1, 1]) / 2
     elif any(p[:, 2].any() for p in points):  # OpenCV finds a start for flat boards only
@@ -583,15 +584,16 @@ class Coverage:
 def coverage(detections: Sequence[Detection], cells: tuple[int, int] = (6, 8)) -> Coverage:
     """Where in the image the corners of all views lie.
 
-    cells: (rows, columns) in which to count them. Raises ValueError for no detections.
+    cells: (rows, columns) in which to count them. Raises ValueError for no corners, and for images
+    of different sizes.
 
     >>> corners = np.array([[15.5, 11.5], [623.5, 11.5], [15.5, 467.5], [623.5, 467.5]])
     >>> coverage([Detection(np.arange(4), corners, (640, 480))], (2, 2))
     corners in 100 % of 2x2 image cells, out to 95 % of the half diagonal
     empty margins: 2 % left, 2 % top, 2 % right, 2 % bottom
     """
-    want(len(detections), "detections", 0, "at least one view")
-    width, height = size = np.array(detections[0].size)
+    want(any(map(len, detections)), "detections", 0, "at least one view with corners")
+    width, height = size = np.array(Detections(detections).size)
     pixels = np.concatenate([d.pixels for d in detections])
     # pixel 0 is the centre of the first pixel: the image reaches from -0.5 to size - 0.5
     spans = (-0.5, height - 0.5), (-0.5, width - 0.5)

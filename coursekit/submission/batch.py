@@ -44,7 +44,7 @@ from pebble import ProcessExpired, ProcessPool
 from tqdm.auto import tqdm
 
 from coursekit import results
-from coursekit.checks import positive, want
+from coursekit.checks import positive, want, whole
 from coursekit.submission import report
 from coursekit.submission.flags import (
     Roster,
@@ -195,16 +195,16 @@ def grade_folder(
     if workers is None:
         free = getattr(os, "sched_getaffinity", None)  # what this process may use
         workers = len(free(0)) if free else os.cpu_count() or 1
-    positive("workers", workers)
-    limits = Limits(workers, positive("timeout_s", timeout_s))
+    limits = Limits(whole("workers", workers), positive("timeout_s", timeout_s))
     roster = Roster(class_table(Path(choices.roster)) if choices.roster else ())
+    want(roster.people or not choices.roster, "roster", choices.roster, say("submission.roster"))
     _own_points(out / OWN_POINTS)
     _check_out(out, overwrite)
     zipped = folder.is_file()
     with tempfile.TemporaryDirectory() as scratch:
+        bundles = Path(scratch, folder.name) if zipped else folder
         if zipped:
-            _unpack(folder, Path(scratch))
-        bundles = Path(scratch) if zipped else folder
+            _unpack(folder, bundles)
         return _grade(bundles, out, limits, progress, roster, choices, dated=zipped)
 
 
@@ -330,11 +330,13 @@ def find_bundles(
             others.append(name)
     if not found:
         there = f", only {counted(len(others), 'other file')}" if others else " or below it"
-        raise ValueError(say("submission.no_bundle", folder=folder, there=there))
+        raise ValueError(say("submission.no_bundle", folder=folder.name or folder, there=there))
     handed = {_whose(bundle.name) for bundle in found}
     alone = grouped((_whose(name), name) for name in others if _whose(name) not in handed | {""})
     for names in alone.values():
-        lines.append(report.not_graded(names[0], "no_bundle", files=", ".join(names[:5])))
+        files = ", ".join(name.rpartition("/")[2] for name in names[:5])
+        lines.append(report.not_graded(names[0], "no_bundle", files=files))
+    others = [name for name in others if _whose(name) not in alone]
     return found, tuple(others), lines
 
 
@@ -357,6 +359,7 @@ def _unpack(archive: Path, into: Path) -> None:
     """The files of an LMS's zip, with its dates; no path leads out, and no more than a bundle's
     size is unpacked of any. Raises ValueError for what is no zip.
     """
+    into.mkdir()
     try:
         with zipfile.ZipFile(archive) as packed:
             for member in packed.infolist():
@@ -430,8 +433,9 @@ def work_through(
     of them breaks a pool again is then known.
     Raises ChildProcessError when no process can be started.
     """
+    bundles = list(bundles)
     left, again, tried = iter(bundles), list[Bundle](), set[str]()
-    while True:
+    while bundles:  # no process is started for none
         running: dict[Future[Graded], Bundle] = {}
         with _pool(limits) as pool, contextlib.suppress(BrokenProcessPool):
             while True:
@@ -657,24 +661,25 @@ def _finish(
         if lines[i].points is not None:
             lines[i] = replace(lines[i], page=page)
     state = {line.who: [line.name or line.student, *_state(line)] for line in lines if line.counts}
-    changes = list(_changes(_json(out / ROWS / CLASS), state))
+    before = _json(out / ROWS / CLASS)
+    _same_class(before, lines, out)
+    changes = list(_changes(before, state))
     table = report.grades_csv(lines, how.separator)
     imports, notes = report.exports(lines, how.separator, how.assignment)
     warning = _unused(own, lines)
-    notes = (*notes, *filter(None, [warning]))
+    chosen = {"--roster": bool(how.roster), "--late-after": bool(how.late_after)}
+    notes = (*notes, *filter(None, [warning, *_not_said(before, chosen), _late(lines, how)]))
     texts = {
         PARAGRAPHS: report.paragraphs_page(lines),
         SECOND: report.paragraphs_page(lines, named=False),
         PAGE: report.class_page(lines, changes, warning),
         CSV: table,
         **imports,
-        f"{ROWS}/{CLASS}": json.dumps({"csv": _digest(table), "state": state}),
     }
-    before = _json(out / ROWS / CLASS).get("csv")
-    with contextlib.suppress(OSError):
-        edited = (out / CSV).read_bytes()
-        if before and _digest(edited.decode("utf-8-sig", "replace")) != before:
-            results.write_bytes(out / f"grades_edited_{_digest(str(edited))[:6]}.csv", edited)
+    tables = {name: _digest(text) for name, text in texts.items() if name.endswith(".csv")}
+    kept = {"tables": tables, "state": state, "chosen": chosen}
+    texts[f"{ROWS}/{CLASS}"] = json.dumps(kept)
+    notes = (*notes, *_set_aside(out, before))
     if not (out / OWN_POINTS).exists():
         texts[OWN_POINTS] = report.own_table(lines, how.separator)
     for name, text in texts.items():
@@ -691,6 +696,39 @@ def _finish(
         if re.fullmatch(r"[0-9a-f]{64}", path.stem) and path.stem not in keys:
             path.unlink()
     return lines, changes, notes
+
+
+def _same_class(before: dict[str, Any], lines: Sequence[report.ReportLine], out: Path) -> None:
+    """ValueError where the report is of other bundles, all of them."""
+    files = {was[3] for was in before.get("state", {}).values()} - {""}
+    if files and not files & {line.file for line in lines}:
+        raise ValueError(say("submission.another_class", out=out, file=min(files)))
+
+
+def _not_said(before: dict[str, Any], chosen: dict[str, bool]) -> Iterator[str]:
+    """What the last report was told and this one was not."""
+    had = before.get("chosen", {})
+    without = [option for option, now in chosen.items() if had.get(option) and not now]
+    if without:
+        yield say("submission.not_said", options=" and ".join(without))
+
+
+def _late(lines: Sequence[report.ReportLine], how: Choices) -> str:
+    """Who is late, in a sentence; "" for nobody."""
+    names = [line.name for line in lines if line.counts and line.late]
+    after = f" after {how.late_after:%Y-%m-%d %H:%M}" if how.late_after else ""
+    return f"Late{after}: {counted(len(names), 'student')}: {_some(names)}" if names else ""
+
+
+def _set_aside(out: Path, before: dict[str, Any]) -> Iterator[str]:
+    """Copies of the tables that were edited since the last report, and a sentence on each."""
+    for name, digest in before.get("tables", {}).items():
+        with contextlib.suppress(OSError):
+            edited = (out / name).read_bytes()
+            if _digest(edited.decode("utf-8-sig", "replace")) != digest:
+                aside = f"{Path(name).stem}_edited_{_digest(str(edited))[:6]}.csv"
+                results.write_bytes(out / aside, edited)
+                yield say("submission.set_aside", name=name, aside=aside)
 
 
 def _write_pages(out: Path, bundles: list[Bundle], lines: Sequence[report.ReportLine]) -> None:
@@ -718,8 +756,10 @@ def _own_points(path: Path) -> list[dict[str, str]]:
     worth = grading_rules()["points"]["paragraph"]
     possible = {"paragraph": (0, worth), "late": (-100, 0), "overrule": (0, 100)}
     for row in rows:
-        row["who"] = row.get("who", "").removeprefix("'")
-        row["student"] = row.get("student") or row["who"]
+        there = "who" in row and {*possible} & row.keys()
+        want(there, path.name, [*row], "the columns who and paragraph, late or overrule")
+        row["who"] = row["who"].removeprefix("'")
+        row["student"] = row.get("student") or row["who"] or row.get("code", "")
         for column, (low, high) in possible.items():
             got = row.get(column, "")
             with contextlib.suppress(ValueError):
@@ -736,7 +776,7 @@ def _unused(own: list[dict[str, str]], lines: Sequence[report.ReportLine]) -> st
     unused = (
         row for row in own if id(row) not in used and any(map(row.get, report.OWN_COLUMNS[3:]))
     )
-    names = "; ".join(f"{row['student']} ({row['who']})" for row in unused)
+    names = "; ".join(row["student"] + f" ({row['who']})" * bool(row["who"]) for row in unused)
     return say("submission.own_unused", file=OWN_POINTS, names=names) if names else ""
 
 

@@ -18,6 +18,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -105,14 +106,14 @@ class ReportLine:
 
     @property
     def total(self) -> float | None:
-        """The points with the instructor's own: for the paragraph, for late days, in all."""
+        """The points with the instructor's own: for the paragraph, for late days, in all; >= 0."""
         if self.own.get("overrule"):
             return number_of(self.own["overrule"])
         if self.points is None:
             return None
         own = self.own.get("paragraph")
         more = number_of(own) - self.computed_paragraph if own else 0.0
-        return round(self.points + more + number_of(self.own.get("late", "")), 2)
+        return round(max(self.points + more + number_of(self.own.get("late", "")), 0.0), 2)
 
     @property
     def computed_paragraph(self) -> float:
@@ -120,9 +121,18 @@ class ReportLine:
         return sum(item.points for item in self.items if item.topic == "paragraph")
 
     @property
+    def judged(self) -> tuple[Item, ...]:
+        """The items, with the instructor's points for the paragraph in place of the program's."""
+        own = self.own.get("paragraph")
+        if not own:
+            return self.items
+        read = partial(replace, points=number_of(own), says=SAYS["read"])
+        return tuple(read(item) if item.topic == "paragraph" else item for item in self.items)
+
+    @property
     def code(self) -> str:
-        """What stands for the name on the pages of a second marker."""
-        return hashlib.sha256(f"{self.who}\0{self.file}".encode()).hexdigest()[:6]
+        """What stands for the name on the pages of a second marker; to no spreadsheet a number."""
+        return "p" + hashlib.sha256(f"{self.who}\0{self.file}".encode()).hexdigest()[:6]
 
     @property
     def percent(self) -> float | None:
@@ -160,7 +170,7 @@ def graded(file: str, grade: Grade, submission: Submission) -> ReportLine:
         points=grade.points,
         of=grade.of,
         items=tuple(
-            replace(item, says=item.says * (item.topic == "verdict"), tolerance=None)
+            replace(item, says=item.says * (item.topic in ("verdict", "paragraph")), tolerance=None)
             for item in grade.items
         ),
         flags=grade.flags,
@@ -195,7 +205,7 @@ def across(
     lines: Sequence[ReportLine],
     roster: Roster | None = None,
     late_after: datetime | None = None,
-    own: Sequence[Mapping[str, str]] = (),
+    own: Sequence[dict[str, str]] = (),
 ) -> list[ReportLine]:
     """The lines with what only the class shows: who each is of and which of theirs counts, shared
     data and words, and a line for each of the roster who handed in nothing.
@@ -212,7 +222,8 @@ def across(
     handed = Counter(person(one.name) for one in there.values())
     for one in there.values():
         roster.add(one)
-    rows = _own_rows(own, roster)
+    codes = {replace(line, who=who[line.file].key).code: who[line.file] for line in lines}
+    rows = _own_rows(own, roster, codes)
     done = [line for line in lines if line.points is not None]
     prints = {
         line.file: replace(line.fingerprint, student=who[line.file].key)
@@ -257,14 +268,20 @@ def _of(line: ReportLine, one: Person, rows: Mapping[str, Mapping[str, str]]) ->
     return replace(line, who=one.key, name=one.name, row=one.row, own=rows.get(one.key, {}))
 
 
-def _own_rows(own: Sequence[Mapping[str, str]], roster: Roster) -> dict[str, Mapping[str, str]]:
-    """The instructor's rows by person: by `who`; of an older roster's by name and number, where
-    these are one person's who has no row."""
-    found: dict[str, Mapping[str, str]] = {}
+def _own_rows(
+    own: Sequence[dict[str, str]], roster: Roster, codes: Mapping[str, Person]
+) -> dict[str, dict[str, str]]:
+    """The instructor's rows by person: by `who`; a second marker's by `code`; of an older roster's
+    by name and number, where these are one person's. Of two rows the first one counts, and takes
+    from the other what it leaves empty."""
+    found: dict[str, dict[str, str]] = {}
     for row in sorted(own, key=lambda row: row["who"] not in roster.people):
-        one = roster.people.get(row["who"]) or roster.named(row["student"], row["who"])
-        if one is not None:
-            found.setdefault(one.key, row)
+        one = roster.people.get(row["who"]) or codes.get(row.get("code", ""))
+        one = one or roster.named(row["student"], row["who"])
+        kept = row if one is None else found.setdefault(one.key, row)
+        for column in OWN_COLUMNS[3:]:
+            if kept is not row and not kept.get(column):
+                kept[column] = row.pop(column, "")
     return found
 
 
@@ -330,9 +347,16 @@ def _date(moment: str) -> str:
 
 
 def _one_file(done: Sequence[ReportLine], who: Mapping[str, Person]) -> Iterator[Copy]:
-    """Files that several people handed in: whoever packs writes a name and the second."""
-    packed = grouped(((line.student, line.made), line.file) for line in done)
-    for (typed, made), files in packed.items():
+    """Files that several people handed in: one name, one second of packing, the same depths."""
+    packed = grouped(
+        (
+            (line.student, line.made, tuple(stack.digest for stack in line.fingerprint.stacks)),
+            line.file,
+        )
+        for line in done
+        if line.fingerprint is not None
+    )
+    for (typed, made, _), files in packed.items():
         n = len({who[file].key for file in files})
         if n > 1:
             says = flag_of("same_file", n=n, typed=typed, made=_date(made)).says
@@ -347,13 +371,15 @@ def student_page(line: ReportLine, body: str) -> str:
 
     line: after `across`. body: of `page_body`, or "" where the bundle was not graded.
     """
-    lost = sum(item.points < item.of for item in line.items)
-    return _page(what="student", bundle=line, lost=lost, body=Markup(body))
+    lost = sum(item.points < item.of for item in line.judged)
+    paragraph = next((item for item in line.judged if item.topic == "paragraph"), None)
+    return _page(what="student", bundle=line, lost=lost, body=Markup(body), paragraph=paragraph)
 
 
 def _decided(line: ReportLine) -> str:
     """Which points the instructor gave, for the student; "" for none."""
     facts = {"points": _points(line.points), "of": _points(line.of)}
+    facts["reasons"] = ", for the reasons that follow" if line.points != line.of else ""
     computed = "" if line.points is None else SAYS["computed"].format(**facts)
     if line.own.get("overrule"):
         return SAYS["total_set"] + computed
@@ -382,8 +408,8 @@ def page_body(grade: Grade, submission: Submission) -> str:
         made=_date(submission.made),
         figure=_noise_figure(submission, grade.recomputed),
         comparison=list(_comparison(grade, submission)),
-        lost=[item for item in grade.items if item.points < item.of],
-        right=[item for item in grade.items if item.points >= item.of],
+        lost=[i for i in grade.items if i.points < i.of and i.topic != "paragraph"],
+        right=[i for i in grade.items if i.points >= i.of and i.topic != "paragraph"],
     )
 
 
@@ -545,7 +571,6 @@ def class_page(
     given = [(line.total, line.of or 100) for line in everybody]
     percents = [100 * total / of for total, of in given if total is not None]
     named = sorted(everybody, key=_by_name)
-    often = Counter(line.name for line in named)
     return _page(
         what="class",
         lines=lines,
@@ -561,9 +586,15 @@ def class_page(
         notes=_by_flag(done, True),
         changes=changes,
         named=named,
-        namesakes={name for name, n in often.items() if n > 1},
+        namesakes=_namesakes(named),
+        unread=sum(bool(n.paragraph.strip()) and not n.own.get("paragraph") for n in counts),
         ranked=sorted(named, key=lambda line: (line.total is not None, line.total or 0.0)),
     )
+
+
+def _namesakes(lines: Sequence[ReportLine]) -> set[str]:
+    """The names that several have."""
+    return {name for name, n in Counter(line.name for line in lines).items() if n > 1}
 
 
 def _by_name(line: ReportLine) -> tuple[list[str], str]:
@@ -630,7 +661,8 @@ def paragraphs_page(lines: Sequence[ReportLine], named: bool = True) -> str:
     said = [line for line in some if line.paragraph.strip()]
     silent = [line for line in some if not line.paragraph.strip()]
     worth = grading_rules()["points"]["paragraph"]
-    return _page(what="paragraphs", said=said, silent=silent, named=named, worth=worth)
+    shown = {"said": said, "silent": silent, "named": named, "namesakes": _namesakes(some)}
+    return _page(what="paragraphs", worth=worth, **shown)
 
 
 def _said(item: Item) -> str:
@@ -693,7 +725,7 @@ def exports(
     a table without either is not made. assignment: see `canvas_column`.
     """
     tables: dict[str, str] = {}
-    moodle, canvas = [], []
+    moodle, canvas, notes = [], [], set[str]()
     for line in lines:
         at, row = place_of(line.file), {k.strip().casefold(): v for k, v in line.row.items()}
         name, grade_of, feedback = line.name or line.student, _points(line.total), _feedback(line)
@@ -701,8 +733,13 @@ def exports(
             continue
         identifier = f"Participant {at.id}" if at.lms == "Moodle" else row.get("identifier", "")
         if identifier:
+            most = row.get("maximum grade") or "100"
+            if number_of(most) != 100:
+                notes.add(SAYS["other_maximum"].format(most))
             email = row.get("email address", row.get("email", ""))
-            moodle.append((identifier, name, email, grade_of, "100", "", feedback))
+            # else Moodle skips whom it has graded before; "-" is its word for never
+            when = row.get("last modified (grade)", "").strip("- ")
+            moodle.append((identifier, name, email, grade_of, "100", when, feedback))
         gradebook = {"student", "id", "section"} <= set(row)
         number = row["id"] if gradebook else at.id if at.lms == "Canvas" else ""
         if number:
@@ -711,24 +748,27 @@ def exports(
     if any(row[3] or row[6] != NOTHING for row in moodle):
         tables["moodle.csv"] = _csv([MOODLE_COLUMNS, *moodle], separator)
     if not any(row[-1] for row in canvas):
-        return tables, ()
+        return tables, tuple(notes)
     column, known = canvas_column(lines, assignment)
     possible = ("    Points Possible", "", "", "", "", "100")
     tables["canvas.csv"] = _csv([(*CANVAS_COLUMNS[:-1], column), possible, *canvas], separator)
-    return tables, () if known else (SAYS["no_column"].format(column),)
+    if not known:
+        notes.add(SAYS["no_column"].format(column))
+    return tables, tuple(sorted(notes))
 
 
 def own_table(lines: Sequence[ReportLine], separator: str = ",") -> str:
     """A table for the instructor's own points, with a row for everybody."""
-    counts = {line.who: line for line in lines if line.who and line.counts}
-    rows = ((who, n.name or n.student, n.code, "", "", "", "") for who, n in counts.items())
+    some = sorted((line for line in lines if line.who and line.counts), key=_by_name)
+    rows = ((n.who, n.name or n.student, n.code, "", "", "", "") for n in some)
     return _csv([OWN_COLUMNS, *rows], separator)
 
 
 def _feedback(line: ReportLine) -> str:
     """What a student reads beside the points: the instructor's words, and what cost some."""
-    lost = [_lost(item) for item in line.items if item.points < item.of]
-    return " ".join(filter(None, (line.own.get("comment", ""), "; ".join(lost), _told(line))))
+    lost = "; ".join(_lost(item) for item in line.items if item.points < item.of)
+    said = (line.own.get("comment", ""), _decided(line), lost, _told(line))
+    return " | ".join(filter(None, said))
 
 
 def _csv(rows: Iterable[Iterable[str]], separator: str) -> str:

@@ -267,7 +267,7 @@ def _data(asked: _Question, z: float, m: AtDistance | None) -> Item:
     if not (few or small):
         return asked.item("right", _say("enough", **facts))
     says = _say("few_and_small" if few and small else "few" if few else "small", **facts)
-    return asked.item("partial", says, "incomplete", min(n / needed, 1.0) * (0.5 if small else 1.0))
+    return asked.item("partial", says, "too_few", min(n / needed, 1.0) * (0.5 if small else 1.0))
 
 
 def _bias(asked: _Question, submission: Submission, m: AtDistance, claim: float) -> Item:
