@@ -256,7 +256,9 @@ def read(path: Path) -> Result:
 
 # --- to other programs ---
 
-COMMENTS = {"urdf": "<!-- {} -->\n"} | dict.fromkeys(("ros", "tf2", "moveit"), "# {}\n")
+COMMENTS = {"urdf": "<!-- {} -->\n"} | dict.fromkeys(
+    ("ros", "kalibr", "colmap", "tf2", "moveit", "easy_handeye2"), "# {}\n"
+)
 
 
 @dataclass(frozen=True)
@@ -375,6 +377,7 @@ def _place_text(
     """The text, and which frame it is of."""
     optical = placed.child
     notes = [f"of {optical}: if a driver publishes its place in a link, name the link instead"]
+    want(link or T_link_optical is None, "link", link, "the frame that T_link_optical is in")
     if link is not None:
         if T_link_optical is None:
             raise ValueError(say("others.no_link", optical=optical, link=link))

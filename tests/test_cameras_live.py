@@ -95,9 +95,16 @@ def test_a_camera_that_does_not_start_is_never_replaced(plug_in, which, error, a
     assert f"the RealSense {SERIAL} does not start" in str(caught.value)
 
 
-def test_unplugged_while_the_exposure_settles(plug_in):
-    rs = plug_in(frames=12, then=RuntimeError("Device disconnected"))
-    with pytest.raises(CameraError, match=r"stopped giving frames \(Device disconnected\)"):
+@pytest.mark.parametrize(
+    ("then", "raised", "message"),
+    [
+        (RuntimeError("gone"), CameraError, r"stopped giving frames \(gone\)"),
+        (KeyboardInterrupt(), KeyboardInterrupt, "^$"),
+    ],
+)
+def test_unplugged_or_interrupted_while_the_exposure_settles(plug_in, then, raised, message):
+    rs = plug_in(frames=12, then=then)
+    with pytest.raises(raised, match=message):
         open_camera()
     assert rs.stops == 1
 

@@ -77,7 +77,7 @@ def test_this_computer_with_the_simulated_camera(capsys):
     ("owner", "attribute", "value", "verdict", "says"),
     [
         (sys, "version_info", (3, 10, 4), "problem", "3.10.4 .* too old, want 3.11 or newer"),
-        (sys, "version_info", (3, 14, 0), "note", "newer than what the course was tested with"),
+        (sys, "version_info", (3, 14, 0), "ok", "3.14.0 on"),
         (sys, "version_info", (3, 15, 0), "problem", "too new, some packages do not exist"),
         (sys, "version_info", (3, 12, 1), "ok", "3.12.1 on"),
         (sys, "maxsize", 2**31 - 1, "problem", "a 32-bit Python"),
@@ -93,7 +93,7 @@ def test_python(monkeypatch, owner, attribute, value, verdict, says):
     found = doctor._python()
     assert found.verdict == verdict
     assert re.search(says, found.says)
-    assert ("Python 3.13" in found.remedy or "a hub" in found.remedy) == (verdict != "ok")
+    assert ("Python 3.14" in found.remedy or "a hub" in found.remedy) == (verdict != "ok")
 
 
 @pytest.mark.parametrize(("brings", "version", "verdict"), EXPECTED["brings_opencv"])

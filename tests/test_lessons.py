@@ -344,6 +344,7 @@ def test_right_digits_in_another_unit_are_no_attempt() -> None:
     verdict = CHECKPOINTS["pinhole.same_size"].answer(187.5)
     assert verdict.kind == "not attempted"
     assert "wanted in m" in verdict.headline
+    assert PITCH.judge("2000 m").kind == "not attempted"  # of pixels
 
 
 def test_the_first_mistake_to_look_at_shows_in_the_case() -> None:
@@ -398,11 +399,18 @@ def test_the_widget_commits() -> None:
     button.click()
     assert "right" in said[-1]
     assert CHECKPOINTS["pinhole.half_size"]._before().startswith("<details><summary>You have")
-    field, *_ = panel(PITCH, said.append).children
+    field, button, _ = panel(PITCH, said.append).children
     for number, verdict in (("500", "not this"), ("2000", "right")):
         field._handle_custom_msg({"event": "submit"}, [])  # the key Enter, told before the number
         field.value = number
         assert verdict in said[-1]
+    field.value = "500"
+    button.click()
+    button.click()  # of a busy kernel's learner, who has typed 2000: the press is told first
+    assert "not this" in said[-1]
+    field.value = "2000"
+    assert "right" in said[-1]
+    assert len(questions.read_attempts()["pinhole.pitch"]) == 4  # nothing was judged twice
     kinds = [a["kind"] for a in questions.read_attempts()["pinhole.half_size"]]
     assert kinds == ["wrong", "right"]
 

@@ -9,6 +9,7 @@ import pytest
 from common import CHARUCO, by_opencv
 from matplotlib.colors import to_rgb
 from matplotlib.patches import Ellipse
+from PIL import Image
 from test_lesson_intrinsics import X, Y, predict
 
 from coursekit import boards, budget, geometry, plots, specifications
@@ -238,6 +239,14 @@ def intrinsics_figures() -> dict[str, plots.LessonFigure]:
         "power": intrinsics.power(stored_power()),
         "difference": intrinsics.difference(compare(two["Q"], D435.color)),
     }
+
+
+def test_a_photograph_that_says_it_is_turned_is_shown_as_its_corners_were_found(tmp_path) -> None:
+    said = Image.Exif()
+    said[0x0112] = 6  # a quarter turn
+    Image.open(SESSION / "view_00.jpg").save(tmp_path / "a.jpg", exif=said, quality=95)
+    shown = intrinsics.views(tmp_path, boards.detect_all(tmp_path, CHARUCO, False)).axes[0]
+    assert shown.images[0].get_array().shape == (480, 640)
 
 
 def test_outlines_are_opencvs() -> None:

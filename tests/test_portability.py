@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 from common import EXPECTED
 
-from coursekit.doctor import NEWEST_TESTED, OLDEST, pins
+from coursekit.doctor import NEWEST, OLDEST, pins
 
 ROOT = Path(__file__).resolve().parents[1]
 BINDER = ROOT / ".binder"
@@ -258,7 +258,7 @@ def test_binary_kinds_are_named(kind: str) -> None:
 
 
 REQUIREMENTS = ("requirements.txt", "requirements-camera.txt", "requirements-test.txt")
-PYTHONS = [f"3.{minor}" for minor in range(OLDEST[1], NEWEST_TESTED[1] + 1)]
+PYTHONS = [f"3.{minor}" for minor in range(OLDEST[1], NEWEST[1] + 1)]
 
 
 def chosen(file: str, python: str, system: str, machine: str) -> dict[str, list[str]]:

@@ -701,6 +701,8 @@ def test_a_camera_s_frames_bring_their_unit_and_intrinsics():
     again = stereo.block_face(np.stack([counts] * 3), UNIT.depth, 1e-4)
     assert (face.width_m, face.stats.pixel_std_m) == (again.width_m, again.stats.pixel_std_m)
     assert stereo.window_stats(frames, face.window).depth_m == face.stats.depth_m
+    lost = stereo.block_face([*frames, replace(frames[0], depth=0 * counts)])  # a frame without
+    assert (lost.width_std_m, lost.width_std_error_m) == (face.width_std_m, face.width_std_error_m)
     with pytest.raises(ValueError, match=r"^depth: got 0 frames"):
         stereo.window_stats(Frames(), (0, 0, 5, 5))
 

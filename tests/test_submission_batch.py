@@ -394,8 +394,11 @@ def test_what_cannot_be_is_said_before_anything_is_made(change, message, tmp_pat
     quick(tmp_path / "in", ["a"])
     quick(tmp_path / "empty", ())
     (quick(tmp_path / "papers", ()) / "a.pdf").write_bytes(b"")
+    zipfile.ZipFile("a.zip", "w").close()
+    Path("roster.csv").write_text("Vorname;Nachname\nAda;Honest\n", encoding="utf-8")
+    choices = batch.Choices(change.pop("roster", None))
     with pytest.raises(ValueError, match=message):
-        graded(**{"folder": "in", "out": "out"} | change)
+        graded(**{"folder": "in", "out": "out", "choices": choices} | change)
     assert not (tmp_path / "out").exists()
 
 
@@ -551,8 +554,8 @@ def test_own_points_survive_a_regrade_which_says_what_changed(in_process, tmp_pa
 @pytest.mark.parametrize(("row", "said"), EXPECTED["bad_own_points"])
 def test_own_points_that_cannot_be_are_refused_before_any_work(row, said, tmp_path):
     out = quick(tmp_path / "out", ())
-    (out / "own_points.csv").write_text(f"who,paragraph,late,overrule\na,{row}\n", "utf-8")
-    with pytest.raises(ValueError, match=rf"^own_points\.csv: a: {said}"):
+    (out / "own_points.csv").write_text(row, "utf-8")
+    with pytest.raises(ValueError, match=rf"^own_points\.csv: {said}"):
         graded(quick(tmp_path / "in", ["a"]), out)
 
 
@@ -608,6 +611,12 @@ def test_without_an_lms_a_name_typed_twice_takes_nobodys_points(in_process, tmp_
     rows = {row["file"]: row for row in table(out)}
     assert [rows[f"{at}/s.zip"]["counts"] for at in ("zoe", "mallory")] == ["yes", "no"]
     assert all("same_name" in row["flags"] for row in rows.values())
+
+
+def test_a_bundle_by_itself_is_graded_and_graded_again(in_process, tmp_path):
+    bundle, out = quick(tmp_path / "in", ["a"]) / "a.zip", tmp_path / "out"
+    assert [graded(bundle, out, overwrite=True).kept for _ in "12"] == [0, 1]
+    assert [row["file"] for row in table(out)] == ["a.zip"]
 
 
 def test_two_graders_do_not_write_one_report(in_process, tmp_path):

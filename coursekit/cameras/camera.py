@@ -88,7 +88,7 @@ class Camera(Description, ABC):
         """Change what is not None, and return a sentence of what was done.
 
         ambient: the simulated room's infrared light, where 1 is as bright as a projected dot's peak
-        on a surface at 1 m. exposure: ms, or "auto". depth_scale_m: metres per depth count; a
+        on a surface at 2 m. exposure: ms, or "auto". depth_scale_m: metres per depth count; a
         RealSense changes nothing else, and this only where the device offers it. A recording cannot
         be changed. Raises ValueError for a figure out of range, and CameraError.
         """

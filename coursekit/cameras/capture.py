@@ -315,7 +315,8 @@ class Album:
             held = {"folder": self.folder, "count": len(images), "whose": whose}
             raise ValueError(say("cameras.other_views", card=self._session, **held))
         for path in images:
-            image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+            data = np.fromfile(path, np.uint8)  # imread takes no accents on Windows
+            image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
             try:
                 if image is None:
                     raise BoardNotFound("the file holds no image")

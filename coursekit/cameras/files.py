@@ -129,8 +129,10 @@ class RosBag(Camera):
         if self.color:
             self.T_color_depth = facts.between(topics["color"], topics["depth"])
         self.baseline_m = facts.baseline_m(topics.get("right"))
-        first = next(self._messages(reader, {topics["depth"]}), (None, None, None))[2]
-        metres = getattr(first, "encoding", "") == "32FC1"
+        first = next(self._messages(reader, {topics["depth"]}), None)
+        if first is None:
+            raise recording.without_depth(self._path, sorted(reader.topics))
+        metres = getattr(first[2], "encoding", "") == "32FC1"
         self.depth_scale_m = FINE_M if metres else facts.depth_scale_m()
 
     # --- frames --------------------------------------------------------------------------------

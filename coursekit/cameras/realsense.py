@@ -50,16 +50,15 @@ class RealSense(Camera):
         self._what = f"the RealSense {serial}"
         if serial in _live_cameras:  # the setup cell was run again
             _live_cameras[serial].close()
-        self._start()
         try:
+            self._start()
             self._query()
             _live_cameras[self.serial] = self
             self._skip(WARM_UP_FRAMES)
-        except CameraError:
+        except BaseException as error:  # Ctrl-C, too: nobody holds this camera
             self.close()
-            raise
-        except (RuntimeError, ValueError) as error:
-            self.close()
+            if isinstance(error, CameraError) or not isinstance(error, (RuntimeError, ValueError)):
+                raise
             raise CameraError(f"{self._what} does not describe itself fully: {error}") from error
 
     # --- opening and closing -------------------------------------------------------------------
@@ -69,11 +68,12 @@ class RealSense(Camera):
         with self._running.turn:
             need(not self._running.left, "cameras.closed_meanwhile", what=self._what)
             try:
-                pipeline = self._rs.pipeline()
-                self._profile = pipeline.start(self._config())
+                # held before it starts: a Ctrl-C meanwhile comes as soon as it has
+                self._running.pipeline = self._rs.pipeline()
+                self._profile = self._running.pipeline.start(self._config())
             except RuntimeError as error:
+                self._running.pipeline = None
                 raise CameraError(start_problem(self._what, error)) from error
-            self._running.pipeline = pipeline
 
     def _config(self) -> Any:
         rs, config = self._rs, self._rs.config()

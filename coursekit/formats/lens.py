@@ -49,6 +49,8 @@ def read_lens(
         chain = {key: value for key, value in found.items() if re.fullmatch(r"cam\d+", key)}
         found = _kalibr(_only(chain, which, name), name) if chain else _named(found, name, text)
     if size is not None:
+        pair = isinstance(size, Sequence) and not isinstance(size, str) and len(size) == 2
+        want(pair, "size", size, "(width, height), px")
         found = {"width": size[0], "height": size[1]} | found
     want({"width", "height"} <= found.keys(), name, "no image size", "it: say size=(width, height)")
     for side in ("width", "height"):

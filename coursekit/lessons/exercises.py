@@ -308,7 +308,7 @@ class Exercise:
         where = self._parts_off(values, expected)
         if relation and not mistakes:
             mistakes = (_device(relation, "your result", "", replace),)
-        mistakes = mistakes or self._by_part(values, expected)
+        mistakes = mistakes or self._turned_too(values, expected) or self._by_part(values, expected)
         if len({m.name.partition(",")[0] for m in mistakes}) > 1:
             seen = self._seen_in(first, mistakes, expected[first])
             return self._several(_in_words(seen, known), count, evidence)
@@ -317,6 +317,19 @@ class Exercise:
             return self._one(_in_words(mistakes[0], known), count + where, evidence)
         where += self._factors_off(values, expected)
         return self._say("wrong", f"not right yet. {count}{where}", evidence, FOUND["by_hand"])
+
+    def _turned_too(self, values: list[Floats], expected: list[Floats]) -> tuple[Mistake, ...]:
+        """Two mistakes at once: what can be said of square results once they are transposed."""
+        turned = [v.T for v in values]
+        square = all(v.shape == e.shape for v, e in zip(turned, expected, strict=True))
+        relation = self._relation(turned, expected) if square else None
+        if relation is None:
+            return ()
+        first, then = (
+            _device(kind, "your result", "", replace) for kind in ("transposed", relation)
+        )
+        says = FOUND["both"].format(first=first.says, then=then.says)
+        return (replace(then, name=f"transposed and {relation}", says=says),)
 
     def _part(self, i: int) -> Any:
         """The index of a part of a result: of a column, or of a number."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -215,18 +216,29 @@ def _mean_turn(R: Floats) -> Floats:
     return np.asarray(Rotation.from_matrix(R).mean().as_matrix())
 
 
-def _kabsch(product: Callable[[Floats, Floats, Floats], Floats]) -> Step:
-    """Kabsch's method with another product of U, V^T and the matrix that makes it a rotation."""
+def _kabsch(multiply: Callable[[Floats, Floats], Floats], exchanged: bool, unit: bool) -> Step:
+    """Kabsch's method with another product of U and V^T, of b^T a or a^T b, of unit axes or not."""
 
     def turn(a: Floats, b: Floats) -> Floats:
-        U, S, Vt = np.linalg.svd(a.T @ b)
+        first, second = (b, a) if exchanged else (a, b)
+        if unit:
+            first, second = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (first, second))
+        U, S, Vt = np.linalg.svd(first.T @ second)
         if S[2] < 1e-9:  # the third direction has the sign that rounding gives it
             return np.full((3, 3), np.nan)
-        return product(U, Vt, np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]))
+        return multiply(U, Vt)  # without noise U V^T is no mirror image, so that is all
 
     return turn
 
 
+_PRODUCTS: list[Callable[[Floats, Floats], Floats]] = [
+    lambda U, Vt: U @ Vt.T,
+    lambda U, Vt: U.T @ Vt,
+    lambda U, Vt: U.T @ Vt.T,
+    lambda U, Vt: Vt @ U,
+    lambda U, Vt: Vt @ U.T,
+    lambda U, Vt: Vt.T @ U,
+]
 ROTATION_HALF.add_mistakes(
     ("result", "inverse_of_x", lambda R: R.T),
     ("turn", "not_a_rotation", lambda a, b: np.linalg.lstsq(b, a, rcond=None)[0].T),
@@ -239,11 +251,6 @@ ROTATION_HALF.add_mistakes(
     ("axes", "euler_angles", lambda *R: [Rotation.from_matrix(r).as_euler("xyz") for r in R]),
     ("result", "not_scaled", lambda R: R / np.sqrt(3)),
     ("result", "not_scaled_and_negative", lambda R: -R / np.sqrt(3)),
-    ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: U @ D @ Vt.T)),
-    ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: Vt @ D @ U.T)),
-    ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: U @ Vt.T)),
-    ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: U.T @ D @ Vt)),
-    ("turn", "transposed_factor", _kabsch(lambda U, Vt, D: Vt @ U.T)),
     ("axes", "axis_without_sign", _no_signs),
     ("axes", "one_sign", *map(_flipped, 1 - 2 * np.eye(3))),
     ("", "same_frame", lambda _: lambda A, B: A[0] @ B[0].T),
@@ -253,3 +260,5 @@ ROTATION_HALF.add_mistakes(
     ("", "same_frame", lambda _: lambda A, B: _same_frame(*np.swapaxes([A, B], 2, 3))),
     ("", "same_frame", lambda _: lambda A, B: _mean_turn(np.swapaxes(A, 1, 2) @ B)),
 )
+_FACTORS = (_kabsch(*how) for how in product(_PRODUCTS, (False, True), (False, True)))
+ROTATION_HALF.add_mistakes(("turn", "transposed_factor", *_FACTORS), alone=True)

@@ -236,7 +236,9 @@ def _readings(given: Any, unit: str) -> list[float]:
     written = [digits.replace(",", ".")] if re.fullmatch(r"[-+]?\d+,\d+", digits) else [digits]
     if re.fullmatch(r"[-+]?\d{1,3},000", digits):
         written.append(digits.replace(",", ""))
-    factor = 1.0 if given_unit == unit else LENGTHS.get(given_unit, 0.0) / LENGTHS.get(unit, 1.0)
+    factor = (
+        1.0 if given_unit == unit else LENGTHS.get(given_unit, 0.0) / LENGTHS.get(unit, math.inf)
+    )
     try:
         numbers = [float(text) * factor for text in written]
     except ValueError:
@@ -260,6 +262,13 @@ def panel(checkpoint: Checkpoint, say: Callable[[str], None]) -> Any:
             said = checkpoint.answer(field.value)._repr_html_()
         say(f'<div role="alert">{said}</div>')  # which is read out
 
+    def pressed(_: Any) -> None:
+        nonlocal waiting
+        again = bool(judged) and field.value == judged
+        if not again:
+            commit()
+        waiting = again and isinstance(checkpoint, Number)  # a busy kernel is told the press first
+
     def entered(_: Any, told: dict[str, Any], __: Any) -> None:
         nonlocal waiting
         if told.get("event") == "submit":
@@ -271,7 +280,7 @@ def panel(checkpoint: Checkpoint, say: Callable[[str], None]) -> Any:
         if waiting:
             commit()
 
-    button.on_click(commit)
+    button.on_click(pressed)
     field.on_msg(entered)
     field.observe(changed, "value")
     return words.stacked(field, button)

@@ -14,6 +14,7 @@ from matplotlib.patheffects import withStroke
 
 from coursekit.arrays import Floats
 from coursekit.boards import Detection
+from coursekit.boards.detector import AS_STORED
 from coursekit.checks import refuse
 from coursekit.geometry import project, transform_points
 from coursekit.intrinsics import Comparison, IntrinsicsResult
@@ -89,7 +90,9 @@ def views(folder: str | Path, detections: Sequence[Detection]) -> LessonFigure:
     refuse(not len(detections), "detections: there are none to show; print them to see why")
     fig, axes = panels(len(detections), 3, 9.0, 2.35, 0.3, sharex=True, sharey=True)
     for ax, found in zip(axes, detections, strict=True):
-        image = cv2.imread(str(Path(folder) / found.name), cv2.IMREAD_GRAYSCALE)
+        # as its corners were found; and imread takes no accents on Windows
+        data = np.fromfile(Path(folder) / found.name, np.uint8)
+        image = cv2.imdecode(data, AS_STORED)
         ax.imshow(image, cmap="gray", vmin=0, vmax=255)
         ax.plot(found.pixels[:, 0], found.pixels[:, 1], ".", ms=3, color=COLORS["measured"])
         ax.set_title(f"{found.name}: {len(found.ids)} corners", fontsize=10)

@@ -36,7 +36,8 @@ class BlockFace:
     the face's normal and the optical axis. edges_px: u of the left and right edge on the middle
     row. width_m: between the edges, as measured, in the face's plane; width_error_m: its standard
     error from the edges' jitter from row to row, the pixel grid and the depth.
-    widths_m (N,): the width in each frame, with its edges found anew; width_std_m: std of that.
+    widths_m (N,): the width in each frame, with its edges found anew, NaN for a frame without the
+    face; width_std_m: std of that.
     width_held_std_m: std of the width when the edges are held and only the plane's depth changes.
     fattening_px: what each edge is pushed outwards if the depth is right, against the known width,
     and standard error. window: on the face. stats: of `window_stats` there.
@@ -69,7 +70,8 @@ class BlockFace:
     @property
     def width_std_error_m(self) -> float:
         """Standard error of `width_std_m`, frames taken as `averaging_curve` finds them."""
-        return windows.std_error(*windows.series_std(self.widths_m - self.widths_m.mean()))
+        known = self.widths_m[np.isfinite(self.widths_m)]
+        return windows.std_error(*windows.series_std(known - known.mean()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,6 +319,8 @@ def _edge_lines(edges: Floats) -> tuple[Floats, float]:
 
 def _edge_line(edges: Floats) -> tuple[float, float, float]:
     """u at the middle row, du/dv and standard error (px) of one edge (N, rows)."""
+    if not np.isfinite(edges).any():  # a frame without depth
+        return (math.nan,) * 3
     off_median = np.abs(edges - np.nanmedian(edges))
     good = np.where(off_median <= 2 * HALF_WINDOW_PX, edges, np.nan)  # no matching pushes farther
     mean = windows.valid_mean(good, axis=0)

@@ -526,13 +526,12 @@ def _copy(
     innocent, note = "", False
     if len({person(one.student) for one in some}) == 1:
         innocent, note = ": they are of one student", True
-    elif (
-        exact
-        and {one.source for one in some} == {"simulated"}
-        and len({one.camera for one in some}) == 1
-    ):
-        note = some[0].camera.endswith(f"seed-{grading_rules()['flags']['common_seed']:g}")
-        innocent = SEEN["common_seed" if note else "one_seed"].format(camera=some[0].camera)
+    elif len({(one.source, one.camera) for one in some}) == 1:
+        camera = some[0].camera
+        innocent = f": all are {camera}"
+        if exact and some[0].source == "simulated":
+            note = camera.endswith(f"seed-{grading_rules()['flags']['common_seed']:g}")
+            innocent = SEEN["common_seed" if note else "one_seed"].format(camera=camera)
     return Copy(tuple(keys), code, f"{says}{innocent}.", note)
 
 

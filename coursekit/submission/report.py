@@ -106,14 +106,14 @@ class ReportLine:
 
     @property
     def total(self) -> float | None:
-        """The points with the instructor's own: for the paragraph, for late days, in all."""
+        """The points with the instructor's own: for the paragraph, for late days, in all; >= 0."""
         if self.own.get("overrule"):
             return number_of(self.own["overrule"])
         if self.points is None:
             return None
         own = self.own.get("paragraph")
         more = number_of(own) - self.computed_paragraph if own else 0.0
-        return round(self.points + more + number_of(self.own.get("late", "")), 2)
+        return round(max(self.points + more + number_of(self.own.get("late", "")), 0.0), 2)
 
     @property
     def computed_paragraph(self) -> float:
@@ -379,6 +379,7 @@ def student_page(line: ReportLine, body: str) -> str:
 def _decided(line: ReportLine) -> str:
     """Which points the instructor gave, for the student; "" for none."""
     facts = {"points": _points(line.points), "of": _points(line.of)}
+    facts["reasons"] = ", for the reasons that follow" if line.points != line.of else ""
     computed = "" if line.points is None else SAYS["computed"].format(**facts)
     if line.own.get("overrule"):
         return SAYS["total_set"] + computed
@@ -736,7 +737,8 @@ def exports(
             if number_of(most) != 100:
                 notes.add(SAYS["other_maximum"].format(most))
             email = row.get("email address", row.get("email", ""))
-            when = row.get("last modified (grade)", "")  # else Moodle skips whom it has graded
+            # else Moodle skips whom it has graded before; "-" is its word for never
+            when = row.get("last modified (grade)", "").strip("- ")
             moodle.append((identifier, name, email, grade_of, "100", when, feedback))
         gradebook = {"student", "id", "section"} <= set(row)
         number = row["id"] if gradebook else at.id if at.lms == "Canvas" else ""
