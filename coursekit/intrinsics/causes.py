@@ -60,7 +60,7 @@ TYPICAL = {
     BOW: 5e-4, HEIGHTS: 3e-4, STRETCH: 5e-4, PRINT: 1e-4, FLEX: 5e-4, DRIFT: 0.5, FOCUS: 0.01,
     SHUTTER: 1e-3, LENS: 0.5, SPOILED_VIEW: 1.0, BAD_CORNERS: 1.0,
 }  # fmt: skip
-IN_METRES = (*SHAPE, FLEX, SHUTTER)
+GROWS_WITH_BOARD = (*SHAPE, FLEX, SHUTTER)
 COURSE_BOARD_M = math.hypot(0.0875, 0.05)  # from its middle to its outermost corners
 SHAPE_VIEWS, SHAPE_SIGHTS = 6, 5  # so many, and of each corner on average, tell a shape from noise
 SMOOTH_DEGREE = 3  # of the field over the board that is no corner's noise
@@ -363,7 +363,7 @@ class Calibration:
         columns = self._by_view(columns) if cause in OWN else columns.reshape(2 * n, -1)
         if cause == LENS:  # terms of different units: each as the px that it moves corners by
             columns = columns / np.sqrt(np.mean(columns**2, axis=0) + 1e-300)
-        typical = TYPICAL[cause] * (self.larger if cause in IN_METRES else 1.0)
+        typical = TYPICAL[cause] * (self.larger if cause in GROWS_WITH_BOARD else 1.0)
         return engine.Hypothesis(cause, columns, typical=typical)
 
     def _by_view(self, columns: Floats) -> Floats:
