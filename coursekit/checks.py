@@ -11,8 +11,8 @@ ValueError: mount: got 'ceiling', want one of eye_in_hand, eye_to_hand
 
 from __future__ import annotations
 
+import contextlib
 import math
-import sys
 from collections.abc import Iterable
 from typing import Any, TypeVar
 
@@ -56,8 +56,9 @@ def settle(thing: object, **fields: object) -> None:
 def is_number(value: object) -> bool:
     """Whether `value` is one finite real number; True and False are none."""
     plain = isinstance(value, (int, float, np.integer, np.floating))
-    largest = sys.float_info.max  # an int may be too large for a float
-    return plain and not isinstance(value, bool) and abs(value) <= largest  # type: ignore[arg-type]
+    with contextlib.suppress(OverflowError):  # of an int that no float holds
+        return plain and not isinstance(value, bool) and math.isfinite(value)  # type: ignore[arg-type]
+    return False
 
 
 def number(

@@ -326,7 +326,8 @@ def export(
 
 def placement(result: Any) -> Placement:
     """The camera's place as `hand_eye.solve` found it, with the usual names of the two frames."""
-    known = None if result.refined is None else result.covariance[:6, :6]
+    told = result.refined is not None and bool(np.isfinite(result.covariance).all())
+    known = result.covariance[:6, :6] if told else None
     parent, verdict = PARENTS[result.mount], _verdict(result)
     return Placement(parent, OPTICAL, result.mount, result.X, known, verdict)
 

@@ -52,10 +52,7 @@ class Page(HTMLParser):
         self.text += data + " "
 
 
-ALLOWED = {"html", "head", "meta", "title", "style", "body", "h1", "h2", "p", "a", "ul", "li"}
-ALLOWED |= {"span", "strong", "div", "table", "thead", "tbody", "tr", "th", "td", "blockquote"}
-ALLOWED |= {"details", "summary", "main"}
-ALLOWED |= {"svg", "desc", "line", "text", "path", "circle", "rect"}
+ALLOWED = set(EXPECTED["allowed_elements"])
 
 
 def check_page(text: str) -> Page:
