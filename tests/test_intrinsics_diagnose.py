@@ -365,6 +365,13 @@ def test_blur_along_one_direction_is_motion_and_round_blur_is_not() -> None:
 # --- a wrong square size ---
 
 
+@pytest.mark.parametrize("times", [0.03, 30.0])
+def test_a_bow_is_named_whatever_the_square_size(times: float) -> None:
+    detections, _ = corner_session(CHARUCO, LENS, FIRST_SEED + 10, effects=Effects(bow_m=1e-3))
+    sizes = {name: times * getattr(CHARUCO, name) for name in ("square_m", "marker_m")}
+    assert diagnose(detections, replace(CHARUCO, **sizes)).names == ("bowed_board",)
+
+
 def test_images_alone_do_not_show_a_wrong_square_size_and_the_report_says_what_would() -> None:
     effects = Effects(square_scale=0.96)
     detections, truth = corner_session(CHARUCO, LENS, FIRST_SEED + 10, effects=effects)
