@@ -375,16 +375,9 @@ def test_what_is_not_said_is_not_guessed(tmp_path, columns, said, message) -> No
         assert reading in str(refused.value)
 
 
-@pytest.mark.parametrize(
-    ("columns", "values", "said", "message"),
-    [
-        ("x,y,z", 1e3 * PLACES, {}, "positions reach 6.. m; if they are mm"),
-        ("x,y,z", PLACES, {"length": "mm"}, "stay within 0.6. mm; if they are m"),
-        ("x_mm,y_mm,z_mm", PLACES, {}, "stay within"),
-    ],
-)
-def test_lengths_that_no_arm_has(tmp_path, columns, values, said, message) -> None:
-    text = table(f"{columns},qx,qy,qz,qw", (values, QUATERNIONS))
+@pytest.mark.parametrize(("columns", "factor", "said", "message"), EXPECTED["lengths"])
+def test_lengths_that_no_arm_has(tmp_path, columns, factor, said, message) -> None:
+    text = table(f"{columns},qx,qy,qz,qw", (factor * PLACES, QUATERNIONS))
     with pytest.raises(ValueError, match=message):
         poses.read_table(wrote(tmp_path, "poses.csv", text), **said)
 
