@@ -202,14 +202,7 @@ def test_what_repeats_passes_and_nothing_is_written(light, monkeypatch, capsys):
 
 
 def test_cells_that_do_not_repeat_or_are_out_of_date_are_named(tmp_path, monkeypatch, capsys):
-    sources = {
-        "fine": "print('1')",
-        "drawn": "import random\nprint(f'{random.random():.9f}')",
-        "table": "from IPython.display import HTML, display\ndisplay(HTML('<b>2</b>'))",
-        "figure": PICTURE.format("b'one'"),
-        "other": PICTURE.format("bytes(random.sample(range(256), 9))"),
-    }
-    path = toy(sources, tmp_path / "01_toy.ipynb")
+    path = toy(dict(EXPECTED["changing_notebook"]), tmp_path / "01_toy.ipynb")
     build_notebooks.build(path)
     stored = {"text/plain": ["A"], "text/html": ["<b>3</b>"]}
     edit(path, lambda n: cell_of(n, "table")["outputs"][0].update(data=stored))
@@ -225,12 +218,6 @@ def test_cells_that_do_not_repeat_or_are_out_of_date_are_named(tmp_path, monkeyp
         f"01_toy: cell drawn (stdout): {second}",
         f"01_toy: cell other (image/png): {second}",
     ]
-
-
-PICTURE = (
-    "import base64\nshown = base64.b64encode({}).decode()\n"
-    "display({{'image/png': shown, 'text/plain': '<Figure>'}}, raw=True)"
-)
 
 
 def picture(notebook):

@@ -354,14 +354,14 @@ def arm_of(path, **said):
     return np.stack([row.T for row in rows])
 
 
-@pytest.mark.parametrize(("mark", "decimal"), [(",", "."), (";", ","), ("\t", ","), (" ", ".")])
 @pytest.mark.parametrize("kind", NOTATIONS)
-def test_notations_give_one_camera(tmp_path, kind, mark, decimal) -> None:
+def test_notations_give_one_camera(tmp_path, kind) -> None:
     columns, values, said = NOTATIONS[kind]
-    if mark == " ":
-        columns = columns.replace(" [mm]", "_mm")
-    arm = arm_of(wrote(tmp_path, "poses.csv", table(columns, values, mark, decimal)), **said)
-    assert np.abs(arm - ARM).max() < 1e-12
+    for mark, decimal in ((",", "."), (";", ","), ("\t", ","), (" ", ".")):
+        if mark == " ":
+            columns = columns.replace(" [mm]", "_mm")
+        arm = arm_of(wrote(tmp_path, "poses.csv", table(columns, values, mark, decimal)), **said)
+        assert np.abs(arm - ARM).max() < 1e-12
     found = HandEyeSession("eye_in_hand", arm, SEEN).solve("park").X
     assert np.abs(found - HandEyeSession("eye_in_hand", ARM, SEEN).solve("park").X).max() < 1e-9
 
@@ -375,16 +375,9 @@ def test_what_is_not_said_is_not_guessed(tmp_path, columns, said, message) -> No
         assert reading in str(refused.value)
 
 
-@pytest.mark.parametrize(
-    ("columns", "values", "said", "message"),
-    [
-        ("x,y,z", 1e3 * PLACES, {}, "positions reach 6.. m; if they are mm"),
-        ("x,y,z", PLACES, {"length": "mm"}, "stay within 0.6. mm; if they are m"),
-        ("x_mm,y_mm,z_mm", PLACES, {}, "stay within"),
-    ],
-)
-def test_lengths_that_no_arm_has(tmp_path, columns, values, said, message) -> None:
-    text = table(f"{columns},qx,qy,qz,qw", (values, QUATERNIONS))
+@pytest.mark.parametrize(("columns", "factor", "said", "message"), EXPECTED["lengths"])
+def test_lengths_that_no_arm_has(tmp_path, columns, factor, said, message) -> None:
+    text = table(f"{columns},qx,qy,qz,qw", (factor * PLACES, QUATERNIONS))
     with pytest.raises(ValueError, match=message):
         poses.read_table(wrote(tmp_path, "poses.csv", text), **said)
 
@@ -788,18 +781,17 @@ def test_results_of_before_are_read_and_say_what_they_lack(kept) -> None:
             ck.export(lesson, "json")
 
 
-@pytest.mark.parametrize("to", ["urdf", "tf2", "moveit", "easy_handeye2", "json"])
-def test_the_verdict_goes_along(kept, result, to) -> None:
+def test_the_verdict_goes_along(kept, result) -> None:
     """Of a result, and of what a notebook kept: in what is printed, and where a comment may be."""
     assert result.verdict().startswith("Usable with care")
-    for what in (result, "04_hand_eye"):
-        done = ck.export(what, to)
-        assert "- Usable with care: a point 300 mm in front" in repr(done)
-        assert "Usable with care" in done.text
-    few = ck.export(result.session.pick([0, 5, 9]).solve(), to)
-    assert "- Cannot be told how good it is" in repr(few)
     wrong = replace(result.session, T_base_gripper=invert_transform(ARM)).solve()
-    assert "Not to be trusted: " in ck.export(wrong, to, parent="tool0").notes[0]
+    few = result.session.pick([0, 5, 9]).solve()
+    for to in READERS:
+        for done in (ck.export(what, to) for what in (result, "04_hand_eye")):
+            assert "- Usable with care: a point 300 mm in front" in repr(done)
+            assert "Usable with care" in done.text
+        assert "- Cannot be told how good it is" in repr(ck.export(few, to))
+        assert "Not to be trusted: " in ck.export(wrong, to, parent="tool0").notes[0]
 
 
 def test_whose_poses_they_are_is_said_where_nobody_does(result) -> None:
@@ -832,6 +824,6 @@ def test_the_command_writes_and_prints(kept, tmp_path, capsys) -> None:
     assert main(["export", "04_hand_eye", "--to", "ros"]) == 1
 
 
-def test_case_05_as_it_came(few) -> None:
+def test_case_05_as_it_came() -> None:
     folder = case("05_poses_csv_names_a_subfolder")
     assert len(HandEyeSession.from_folder(folder, progress=False)) == 4

@@ -248,12 +248,6 @@ def test_every_checkout_has_the_same_bytes() -> None:
         assert "\r" not in text, f"{name} has carriage returns"
 
 
-@pytest.mark.parametrize("kind", ["npz", "npy", "png", "jpg", "zip", "pdf", "bag", "db3"])
-def test_binary_kinds_are_named(kind: str) -> None:
-    said = git("check-attr", "text", "--", f"data/a.{kind}")
-    assert said.strip().endswith("text: unset")
-
-
 # --- the same pins for every Python and system ---
 
 
@@ -379,9 +373,7 @@ class TestStart:
         said = self.variables(tmp_path, COURSEKIT_CAMERA="auto", COURSEKIT_RESULTS="elsewhere")
         assert (said["COURSEKIT_CAMERA"], said["COURSEKIT_RESULTS"]) == ("auto", "elsewhere")
 
-    @pytest.mark.parametrize(
-        ("limit", "threads"), [("4", "4"), ("1.5", "1"), ("0.5", "1"), (".5", "1"), ("", "2")]
-    )
+    @pytest.mark.parametrize(("limit", "threads"), EXPECTED["threads_of_a_hub"])
     def test_threads(self, tmp_path: Path, limit: str, threads: str) -> None:
         said = self.variables(tmp_path, CPU_LIMIT=limit)
         assert {said[f"{name}_NUM_THREADS"] for name in ("NUMBA", "OMP", "OPENBLAS")} == {threads}

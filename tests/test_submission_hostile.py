@@ -86,10 +86,7 @@ def test_there_are_as_many_kinds_as_ever_and_every_reason_has_one():
     assert len(codes) > 10
 
 
-ZIPPED_AGAIN = ["a Mac's zip of a bundle", "a folder", "streamed"]
-
-
-@pytest.mark.parametrize("kind", ZIPPED_AGAIN)
+@pytest.mark.parametrize("kind", ["a Mac's zip of a bundle", "a folder", "streamed"])
 def test_a_bundle_zipped_again_is_read(kind):
     assert bundle_bytes(read_bundle(KINDS[kind][1])) == HONEST
 

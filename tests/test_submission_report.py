@@ -52,10 +52,7 @@ class Page(HTMLParser):
         self.text += data + " "
 
 
-ALLOWED = {"html", "head", "meta", "title", "style", "body", "h1", "h2", "p", "a", "ul", "li"}
-ALLOWED |= {"span", "strong", "div", "table", "thead", "tbody", "tr", "th", "td", "blockquote"}
-ALLOWED |= {"details", "summary", "main"}
-ALLOWED |= {"svg", "desc", "line", "text", "path", "circle", "rect"}
+ALLOWED = set(EXPECTED["allowed_elements"])
 
 
 def check_page(text: str) -> Page:
@@ -435,6 +432,12 @@ def test_a_second_marker_finds_the_row_to_write_into(lines):
 
 def read(text: str) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(text)))
+
+
+@pytest.mark.parametrize(("most", "other"), [("", 0), ("100,00", 0), ("50", 1), ("1.000,00", 1)])
+def test_a_worksheet_of_other_points_is_told(lines, most, other):
+    row = {"Identifier": "Participant 17", "Maximum grade": most}
+    assert len(report.exports([replace(lines[0], row=row)])[1]) == other
 
 
 def test_the_table_has_a_row_a_bundle_and_points_that_add_up(lines):
