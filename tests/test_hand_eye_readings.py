@@ -23,6 +23,7 @@ from coursekit.hand_eye import HandEyeSession
 from coursekit.hand_eye.diagnosis import diagnose
 
 FIRST_SEED = 200_000
+LEFT_HANDED = np.diag([1.0, -1, 1, 1])
 TO_BODY = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
 
 
@@ -110,6 +111,15 @@ KINDS: dict[str, tuple[str, str, Mistake]] = {
         "inconsistent_convention", "x forward, y left, z up",
         lambda s, i: replace(s, seen=TO_BODY @ s.seen)),
     "a slow drift": ("slow_drift", "camera or board moved slowly", drifting),
+    "ZYZ read as rotation vector": (
+        "inconsistent_convention", r"angles 'ZYZ' read by Rotation.from_rotvec\(v\)",
+        lambda s, i: read(s, "ZYZ", "vector")),
+    "a left-handed base": (
+        "inconsistent_convention", "left-handed: arm and camera agree but for a mirror",
+        lambda s, i: replace(s, T_base_gripper=LEFT_HANDED @ s.T_base_gripper @ LEFT_HANDED)),
+    "Euler angles in the reverse order": (
+        "inconsistent_convention", "the data fit Rotation.from_euler",
+        lambda s, i: read(s, "ZYX", "xyz")),
 }  # fmt: skip
 
 

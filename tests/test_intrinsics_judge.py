@@ -104,7 +104,9 @@ def folding(coefficients, seed: int) -> Detections:
 
 
 @pytest.mark.parametrize("case", FOLDS if NIGHTLY else [*FOLDS][:2])
-def test_where_a_lens_folds_it_has_no_figures_and_all_that_is_said_is_a_number(case) -> None:
+def test_where_a_lens_folds_it_has_no_figures_and_all_that_is_said_is_a_number(
+    case, monkeypatch
+) -> None:
     views = folding(*FOLDS[case])
     result = intrinsics.calibrate(views, CHECKERBOARD)
     sigma = result.uncertainty_map(result.board_range_m)
@@ -122,6 +124,8 @@ def test_where_a_lens_folds_it_has_no_figures_and_all_that_is_said_is_a_number(c
     assert result.simpler.folded_share == 0
     assert f"model='{result.simpler.model}'): held-out views RMS" in verdict
     assert not verdict.startswith("Good")
+    monkeypatch.setattr(type(result), "held_out_px", lambda fit: np.nan)  # a half that folds
+    assert "nan" not in result.verdict()
 
 
 # --- two halves ---

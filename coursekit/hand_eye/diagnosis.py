@@ -187,7 +187,8 @@ class _Case:
             return
         arm = invert_transform(self.pairs.T_base_gripper)
         flipped = replace(self.pairs, T_base_gripper=arm).fit
-        if misread.clearly_better(flipped, given, misread.PAIRING_SHIFT_LEFT):
+        inverted = misread.clearly_better(flipped, given, misread.PAIRING_SHIFT_LEFT)
+        if inverted and (flipped.shift_m < POOR_M or not self._rotations()):
             self.pairs = flipped.pairs
             options = misread.candidates(flipped, self.session, "inverted")
             if self._off_joints(self.session.T_base_gripper, self.q) < AS_COMPUTED_M:
@@ -198,8 +199,9 @@ class _Case:
                 self.pairs = replace(self.pairs, T_base_gripper=arm, mount=mount)
             words = {"candidates": _listed(options), "choice": _choice(options)}
             self.add("inconsistent_convention", **words, **_change(given, flipped))
-        elif given.turn_rad > POOR_RAD:
-            self._rotations(given)
+        elif not inverted and given.turn_rad > POOR_RAD:
+            if not self._rotations() and given.turn_rad > HOPELESS_RAD:
+                self._nothing_fits(given)
         elif given.shift_m < POOR_M:
             asked, *others = misread.candidates(given, self.session, "declared")
             others = [other for other in others if not other.against]
@@ -216,8 +218,8 @@ class _Case:
             what, cure = known.get(axis, known["other"])
             self.add("camera_axes", axis=axis, share=100 * share, what=what, cure=cure)
 
-    def _rotations(self, given: Fit) -> None:
-        """Rotations of one side that contradict the other although the positions agree."""
+    def _rotations(self) -> bool:
+        """Whether rotations of one side contradict the other although the positions agree."""
         sides = [("arm", self.pairs)]
         if self.session.detections is None:
             sides.append(("camera", self.pairs.exchanged()))
@@ -236,12 +238,14 @@ class _Case:
             else:
                 T = reading.fit.pairs.T_base_gripper
                 self.pairs = replace(self.pairs, T_camera_board=T)
-            return
-        if given.turn_rad > HOPELESS_RAD:
-            self.hopeless = True
-            computed = self._off_joints(self.session.T_base_gripper, self.q) < AS_COMPUTED_M
-            key = "computed_for_another_arm" if computed else "nothing_fits"
-            self.add(key, left=given.says(), arm=self.session.arm.name)
+            return True
+        return False
+
+    def _nothing_fits(self, given: Fit) -> None:
+        self.hopeless = True
+        computed = self._off_joints(self.session.T_base_gripper, self.q) < AS_COMPUTED_M
+        key = "computed_for_another_arm" if computed else "nothing_fits"
+        self.add(key, left=given.says(), arm=self.session.arm.name)
 
     def _off_joints(self, T_base_gripper: Floats, q: Floats | None) -> float:
         """How far arm poses (n, 4, 4) are from those of joint angles q (n, 6), in any entry."""
@@ -352,7 +356,9 @@ def _from_residuals(found: CauseSearch[MendedPairs], session: HandEyeSession) ->
         figures = _figures(step, found.model, session) | _change(step.before.fit, step.after.fit)
         if odd:
             figures |= {"names": ", ".join(names), "left": odd[-1].after.fit.says()}
-        findings.append(SENTENCES.finding(step.test.cause, step.test.p_value, **figures))
+        left_handed = step.test.cause == causes.SCALE and found.model.scale < 0
+        cause = "left_handed" if left_handed else step.test.cause
+        findings.append(SENTENCES.finding(cause, step.test.p_value, **figures))
     return findings
 
 

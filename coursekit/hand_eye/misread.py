@@ -35,7 +35,7 @@ PLACES_AGREE = 0.15  # of the positions' spread; in degrees taken as radians pos
 # Of a whole turn of the numbers as read that a decoding may miss in a typical pose; random ones do
 # by 130 deg. With few whole turns in reach much less is chance too.
 CHANCE_RAD, CLOSE_RAD = np.radians(80.0), np.radians(15.0)
-NOTATION_LEVEL, HYPOTHESES = 1e-4, 150
+NOTATION_LEVEL, HYPOTHESES = 1e-4, 181
 SOURCE_POSES = 3  # that candidates are taken from
 FEW_CANDIDATES = 2000  # that all poses are asked about
 ROUNDED = 1.001  # times pi: how far numbers reach
@@ -91,7 +91,10 @@ def other_rotations(pairs: PosePairs, expected: Floats) -> Reading | None:
     named = zip(SENTENCES.words["other_rotations"], slips, strict=True)
     found = [Reading("notation", w, with_rotations(pairs, S.as_matrix()).fit) for w, S in named]
     clear = [r for r in found if clearly_better(r.fit, pairs.fit, ROTATION_SHIFT_LEFT)]
-    return best(clear) or undo_notation(pairs, expected)
+    slip = best(clear)
+    if slip and slip.fit.shift_m < PAIRING_SHIFT_LEFT * pairs.fit.shift_m:
+        return slip
+    return undo_notation(pairs, expected) or slip
 
 
 def with_rotations(pairs: PosePairs, R: Floats) -> PosePairs:
@@ -408,7 +411,7 @@ def misreadings() -> Iterator[Misreading]:
     vector, twice = Notation(ROTATION_VECTOR), [*map(Notation, TWICE)]
     fixed, moving = [*map(Notation, FIXED)], [*map(Notation, MOVING)]
     for factor in (1.0, 1 / PER_RADIAN):
-        for euler in (*fixed, *moving):
+        for euler in (*fixed, *moving, *twice):
             yield Misreading(vector, euler, factor)
             yield Misreading(euler, vector, factor)
     for read in fixed:

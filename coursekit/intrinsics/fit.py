@@ -668,6 +668,7 @@ def _fewer_coefficients(result: IntrinsicsResult) -> str:
     held_out, fx = "", "f" if "f" in result.names else "fx"
     if len(result.detections) >= 2 * MIN_VIEWS:
         rms = {"theirs": fit.held_out_px(), "ours": result.held_out_px()}
-        held_out = say("intrinsics.held_out", **rms)
+        if math.isfinite(sum(rms.values())):  # not where a half's lens folds within its corners
+            held_out = say("intrinsics.held_out", **rms)
     sigmas = {"theirs": fit.sigma(fx), "ours": result.sigma(fx)}
     return say("intrinsics.fewer", model=fit.model, held_out=held_out, **sigmas)
