@@ -11,6 +11,7 @@ ValueError: mount: got 'ceiling', want one of eye_in_hand, eye_to_hand
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterable
 from typing import Any, TypeVar
@@ -55,7 +56,9 @@ def settle(thing: object, **fields: object) -> None:
 def is_number(value: object) -> bool:
     """Whether `value` is one finite real number; True and False are none."""
     plain = isinstance(value, (int, float, np.integer, np.floating))
-    return plain and not isinstance(value, bool) and math.isfinite(value)  # type: ignore[arg-type]
+    with contextlib.suppress(OverflowError):  # of an int that no float holds
+        return plain and not isinstance(value, bool) and math.isfinite(value)  # type: ignore[arg-type]
+    return False
 
 
 def number(

@@ -35,7 +35,7 @@ from typing import Any, Literal
 
 Condition = Literal["ok", "note", "problem"]
 
-OLDEST, NEWEST_TESTED, TOO_NEW = (3, 11), (3, 13), (3, 15)
+OLDEST, NEWEST = (3, 11), (3, 14)
 PINS = Path(__file__).resolve().parents[1] / "requirements.txt"
 LOADED = ("numpy", "scipy", "cv2", "numba", "matplotlib", "ipywidgets")
 UDEV_FOLDERS = tuple(map(Path, ("/etc/udev/rules.d", "/usr/lib/udev/rules.d", "/lib/udev/rules.d")))
@@ -138,12 +138,11 @@ def _python() -> CheckUp:
     faults = {
         "python_old": running < OLDEST,
         "python_32": sys.maxsize < 2**32,
-        "python_new": running[:2] >= TOO_NEW,
+        "python_new": running[:2] > NEWEST,
         "python_lacks": lacks,
-        "python_untested": running[:2] > NEWEST_TESTED,
     }
     what = next((fault for fault, there in faults.items() if there), "python")
-    oldest, newest, version = (".".join(map(str, v)) for v in (OLDEST, NEWEST_TESTED, running[:3]))
+    oldest, newest, version = (".".join(map(str, v)) for v in (OLDEST, NEWEST, running[:3]))
     python = f"{version} on {platform.system()} {platform.machine()}, in {sys.prefix}"
     another = f"install Python {newest} for 64 bits and begin again"
     return found(what, python=python, oldest=oldest, another=another, lacks=lacks, runs=runs)

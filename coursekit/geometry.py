@@ -24,7 +24,7 @@ from coursekit.words import say
 
 DISTORTION_MODELS = ("none", "brown_conrady", "inverse_brown_conrady", "modified_brown_conrady")
 # What others call Brown-Conrady; ROS's rational_polynomial is that where k4 to k6 are zero
-SAME_MODEL = {"plumb_bob": "brown_conrady", "rational_polynomial": "brown_conrady"}
+SAME_MODEL = dict.fromkeys(("plumb_bob", "radtan", "rational_polynomial"), "brown_conrady")
 _NEWTON_STEPS = 50
 _NEWTON_TOLERANCE = 1e-13  # normalised units; times fx this is 1e-10 px
 
@@ -35,7 +35,7 @@ class Intrinsics:
 
     `model` names what the device says about its coefficients; `project` and `deproject` take
     `dist` in OpenCV's sense, which is librealsense's `brown_conrady`. What the other two models
-    do differently is measured in notebook 01. `plumb_bob`, ROS's name, is taken for brown_conrady;
+    do differently is measured in notebook 01. `plumb_bob` and `radtan` of others are brown_conrady;
     4, 5, 8, 12 or 14 coefficients, also as one row or column, where all after k3 are zero.
     """
 

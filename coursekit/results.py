@@ -256,7 +256,9 @@ def read(path: Path) -> Result:
 
 # --- to other programs ---
 
-COMMENTS = {"urdf": "<!-- {} -->\n"} | dict.fromkeys(("ros", "tf2", "moveit"), "# {}\n")
+COMMENTS = {"urdf": "<!-- {} -->\n"} | dict.fromkeys(
+    ("ros", "kalibr", "colmap", "tf2", "moveit", "easy_handeye2"), "# {}\n"
+)
 
 
 @dataclass(frozen=True)
@@ -324,7 +326,8 @@ def export(
 
 def placement(result: Any) -> Placement:
     """The camera's place as `hand_eye.solve` found it, with the usual names of the two frames."""
-    known = None if result.refined is None else result.covariance[:6, :6]
+    told = result.refined is not None and bool(np.isfinite(result.covariance).all())
+    known = result.covariance[:6, :6] if told else None
     parent, verdict = PARENTS[result.mount], _verdict(result)
     return Placement(parent, OPTICAL, result.mount, result.X, known, verdict)
 
@@ -375,6 +378,7 @@ def _place_text(
     """The text, and which frame it is of."""
     optical = placed.child
     notes = [f"of {optical}: if a driver publishes its place in a link, name the link instead"]
+    want(link or T_link_optical is None, "link", link, "the frame that T_link_optical is in")
     if link is not None:
         if T_link_optical is None:
             raise ValueError(say("others.no_link", optical=optical, link=link))

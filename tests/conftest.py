@@ -25,9 +25,14 @@ def real_data():
 
 
 @pytest.fixture(scope="session")
-def tabletop(tmp_path_factory):
+def rs():
+    """The module pyrealsense2 itself; skips without it."""
+    return real_library()
+
+
+@pytest.fixture(scope="session")
+def tabletop(rs, tmp_path_factory):
     """12 frames of the simulated camera, as librealsense recorded them; skips without it."""
-    real_library()
     with SimulatedCamera() as camera:
         return camera.record(tmp_path_factory.mktemp("recording") / "tabletop.db3", 12)
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from common import EXPECTED
 
 from coursekit.cameras import Camera, Frame, librealsense, realsense
 from coursekit.cameras.librealsense import LibraryMissing, load_librealsense
@@ -127,13 +128,7 @@ class FakeRealSense:
         self.serials = [SERIAL]
         self.noise: float | None = None
         self.filled, self.frames_per_s = 1.0, 30
-        self.told = {
-            "name": "Intel RealSense D435",
-            "serial_number": SERIAL,
-            "usb_type_descriptor": "3.2",
-            "firmware_version": "5.16.0.1",
-            "recommended_firmware_version": "5.16.0.1",
-        }
+        self.told = EXPECTED["told_by_a_d435"] | {"serial_number": SERIAL}
         self.starts = self.stops = self.given = 0
         self.enabled: list[tuple[Any, ...]] = []
         self.query_error: str | None = None

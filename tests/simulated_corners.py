@@ -1,11 +1,13 @@
 """Lenses, boards, sessions and fits to simulated sessions that several test modules share."""
 
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import cache
 
 import cv2
 import numpy as np
-from common import CHARUCO, CHECKERBOARD, NIGHTLY
+from common import CHARUCO, CHECKERBOARD, EXPECTED, NIGHTLY
 
 from coursekit import intrinsics
 from coursekit.arm import ArmErrors
@@ -19,12 +21,7 @@ __all__ = ["CHARUCO", "CHECKERBOARD", "LENS", "NIGHTLY", "fit"]
 LENS = Intrinsics(
     640, 480, 612.0, 610.0, 322.0, 238.0, "brown_conrady", (0.08, -0.18, 0.0007, -0.0004, 0.05)
 )
-LENSES = [
-    Intrinsics(640, 480, 612, 610, 322, 238, "brown_conrady", (-0.12, 0.08, 1e-3, -8e-4, 0.02)),
-    Intrinsics(640, 480, 612, 610, 322, 238),
-    Intrinsics(848, 480, 425, 426, 424, 238, "brown_conrady", (-0.05, 0.06, 5e-4, 3e-4, -0.02)),
-    Intrinsics(1280, 720, 918, 917, 642, 362, "brown_conrady", (0.12, -0.25, 8e-4, 4e-4, 0.1)),
-]
+LENSES = [Intrinsics(*fields) for fields in EXPECTED["lenses"]]
 BOARDS = [CHARUCO, CHECKERBOARD]
 # Fisheyes of 120 to 160 degrees across the diagonal, and wide lenses that are a quotient of two
 # polynomials, which grows all the way: five coefficients leave two to eight times the noise.
@@ -86,6 +83,13 @@ def beyond_session(seed: int) -> tuple[Detections, Truth, Board]:
     board, (lens, see) = BOARDS[seed % 2], BEYOND[(seed // 2) % len(BEYOND)]
     street = replace(ordinary(seed), see=see)
     return *corner_session(board, lens, seed, 20 + (7 * seed) % 21, 0.08, street), board
+
+
+def names_found(sessions: Iterable[tuple[Detections, Truth, Board]]) -> Counter[tuple[str, ...]]:
+    """How often `diagnose` gives which names."""
+    found = Counter(intrinsics.diagnose(seen, board).names for seen, _, board in sessions)
+    print(dict(found))
+    return found
 
 
 def ordinary_arm_session(seed: int, **more) -> tuple[HandEyeSession, HandEyeTruth]:

@@ -156,9 +156,7 @@ def test_in_one_place_a_constant_is_not_told_from_an_error_of_the_arm():
     assert attribute(exact, poses).verdict == "cannot_tell_yet"
 
 
-@pytest.mark.parametrize(
-    ("apart_m", "low", "high"), [(2e-3, 0, 0), (0.03, 0, 0.1), (0.15, 0.95, 1)]
-)
+@pytest.mark.parametrize(("apart_m", "low", "high"), EXPECTED["blamed_by_distance"])
 def test_the_nearer_the_places_the_less_a_constant_is_blamed_on_the_calibration(apart_m, low, high):
     blamed = 0
     for i in range(100):
@@ -210,10 +208,7 @@ def repeated_shares(places: int, repeats: int, sets: int = SOME, **options) -> C
     return found
 
 
-@pytest.mark.parametrize(
-    ("places", "repeats", "share"),
-    [(8, 3, 0.95), (5, 3, 0.95), (8, 2, 0.95), (3, 5, 0.95), (3, 2, 0.70)],
-)
+@pytest.mark.parametrize(("places", "repeats", "share"), EXPECTED["found_by_repeats"])
 def test_errors_of_places_that_follow_no_regression_are_found_by_repeats(places, repeats, share):
     found = repeated_shares(places, repeats)
     assert found["pose_dependent"] >= least(share, SOME)
@@ -449,9 +444,7 @@ def test_the_budget_is_the_first_row_and_trials_follow(tmp_path):
     assert ledger.path.read_text("utf-8").startswith(EXPECTED["ledger_header"])
 
 
-@pytest.mark.parametrize(
-    "text", ["=1+1", "+1", "-1", "@SUM(A1)", " =1", "'=1", "'quoted'", "＝1", 'a "b", c', "Würfel"]
-)
+@pytest.mark.parametrize("text", EXPECTED["texts_of_a_ledger"])
 def test_text_comes_back_and_no_cell_is_a_formula(tmp_path, text):
     ledger = Ledger(tmp_path / "ledger.csv")
     row = replace(BUDGET, task=text, note=text, mean_x_mm=-1.25, trials=1234567)  # numbers stay

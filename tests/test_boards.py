@@ -176,10 +176,7 @@ def test_the_noise_estimate_is_the_scatter_of_the_corners(board, noise, photon, 
 
 
 @BOTH
-@pytest.mark.parametrize(
-    ("blur_px", "motion_px"),
-    [(0.5, (0, 0)), (1.2, (0, 0)), (0.6, (3, 0)), (0.6, (0, 3)), (0.6, (2.1, -2.1))],
-)
+@pytest.mark.parametrize(("blur_px", "motion_px"), EXPECTED["blurs"])
 def test_the_blur_has_its_size_and_direction(board, blur_px, motion_px):
     """A uniform motion of length L has the variance L^2 / 12, a pixel that of its width.
 

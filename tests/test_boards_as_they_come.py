@@ -106,6 +106,9 @@ def test_mirrored_and_negative_boards_are_named(squares, dictionary):
         said = not_found(np.flipud(image), other)
         assert "markers, all mirrored: switch the camera's mirror off" in said
     assert "all with white for black: give the negatives" in not_found(255 - image, board)
+    assert "all mirrored, with white for black: turn" in not_found(255 - image[:, ::-1], board)
+    said = not_found(np.hstack([image, image]), board)
+    assert "each of several twice: is the board there twice, or reflected?" in said
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.5], ids=["symmetric", "asymmetric"])

@@ -47,14 +47,6 @@ def test_converted_rows() -> None:
     assert 1e3 * budget.at(distance_m=0.9).rows[0].high_m == pytest.approx(2.013, abs=5e-4)
 
 
-@pytest.mark.parametrize(("u", "v", "moved_mm"), [(424, 240, 5.0), (0, 240, 6.9), (0, 0, 7.4)])
-def test_depth_bias_leaks_sideways(u: float, v: float, moved_mm: float) -> None:
-    budget = eb.lesson_budget(stated=False).at(u=u, v=v)
-    low, high = budget["depth bias"].at_object_m(budget.view)
-    assert 1e3 * high == pytest.approx(moved_mm, abs=0.05)
-    assert low == pytest.approx(0.4 * high)
-
-
 def test_the_wrist_is_worse_in_depth() -> None:
     far = eb.wrist_budget().at(distance_m=0.40)
     noise = far["depth noise"].at_object_m(far.view)[1]

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 from common import EXPECTED
-from fake_realsense import ending_after, real_library
+from fake_realsense import ending_after
 from scipy.spatial.transform import Rotation
 
 from coursekit.cameras import Camera, CameraError, Frame, open_camera, recording
@@ -22,11 +22,6 @@ from coursekit.cameras.recording import depth_frame_numbers, restore_order
 from coursekit.geometry import Intrinsics, make_transform
 
 SIX_DECIMALS = 6e-7  # the recorder writes extrinsics with %f: half a unit, and float32
-
-
-@pytest.fixture(scope="module")
-def rs():
-    return real_library()
 
 
 class RandomCamera(Camera):

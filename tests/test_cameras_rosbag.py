@@ -172,6 +172,14 @@ def test_a_recording_without_depth_is_named_for_what_it_is(tmp_path, name):
         open_camera(driver.write())
 
 
+def test_a_picture_of_depth_is_no_depth(tmp_path):
+    def viewed(driver, k, t):
+        yield "/camera/depth/image_viz", t, driver.image(t, "depth_optical", "bgr8", bgr(k))
+
+    with pytest.raises(CameraError, match=r"\(/camera/depth/image_viz, bgr8, \.\.\.\) without"):
+        open_camera(Driver(tmp_path / "a.bag").write(depth=viewed))
+
+
 @pytest.mark.parametrize(
     ("model", "message"),
     [("equidistant", "fisheye"), ("rational_polynomial", None)],

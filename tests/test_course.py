@@ -128,12 +128,7 @@ def test_only_what_changed_is_installed_again_in_place(project: Path) -> None:
     run(project)
     calls(project)
     (project / ".venv/kept").touch()
-    for changed, wanted in (
-        ("requirements.txt", ["requirements.txt"]),
-        ("requirements-camera.txt", ["requirements-camera.txt"]),
-        ("pyproject.toml", ["."]),
-        ("requirements-test.txt", []),  # only "test" needs it
-    ):
+    for changed, wanted in EXPECTED["installed_again"]:
         (project / changed).write_text("# changed\n", encoding="utf-8")
         code, output = run(project)
         assert (code, calls(project)) == (0, wanted), output

@@ -10,7 +10,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from common import NIGHTLY, check_named
+from common import EXPECTED, NIGHTLY, check_named
 from scipy.spatial.transform import Rotation
 
 from coursekit.arm import ArmErrors, pose_difference, widowx
@@ -25,25 +25,7 @@ from coursekit.simulation.arm_sessions import HandEyeTruth, hand_eye_session
 
 FIRST_SEED = 100_000
 CLASSES = {
-    "millimetres of the arm": ("millimetres", M(millimetres="arm")),
-    "millimetres of the board": ("millimetres", M(millimetres="board")),
-    "joints in degrees": ("degrees", M(degrees="joints")),
-    "rotation vectors in degrees": ("degrees", M(degrees="rotation_vectors")),
-    "translation grid": ("pure_translation", M(design="grid")),
-    "one axis": ("single_axis", M(design="single_axis")),
-    "turns of 3 deg": ("small_rotations", M(design="small_rotations")),
-    "shifted by one": ("off_by_one", M(shifted_by=1)),
-    "shifted by minus one": ("off_by_one", M(shifted_by=-1)),
-    "late by 50 ms": ("late_time_stamps", M(late_s=0.05)),
-    "slip of 10 mm": ("slipping_board", M(slip_m=0.01, slip_deg=1.5)),
-    "one pose off by 30 mm": ("outlier_pose", M(outliers=1)),
-    "two poses off by 30 mm": ("outlier_pose", M(outliers=2)),
-    "squares 5 % larger": ("wrong_square_size", M(square_scale=1.05)),
-    "squares 3 % smaller": ("wrong_square_size", M(square_scale=0.97)),
-    "inverted arm poses": ("inconsistent_convention", M(inverted_poses=True)),
-    "inverted detections": ("inconsistent_convention", M(inverted_detections=True)),
-    "wrong mount": ("inconsistent_convention", M(wrong_mount=True)),
-    "a zero off by 2 deg": ("arm_error", M(joint_offset_deg=2.0)),
+    label: (name, M(**fields)) for label, (name, fields) in EXPECTED["hand_eye_classes"].items()
 }
 
 

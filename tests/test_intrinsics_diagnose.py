@@ -5,17 +5,16 @@ nothing was tuned on those. COURSEKIT_NIGHTLY=1 runs 100 sessions a cause and 20
 """
 
 import re
-from collections import Counter
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
-from common import NIGHTLY, check_named, derivative
+from common import EXPECTED, NIGHTLY, check_named, derivative
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, kstest
-from simulated_corners import BOARDS, LENSES
+from simulated_corners import BOARDS, LENSES, names_found
 
 from coursekit.boards import Board, Detection, Detections, Skipped
 from coursekit.causes import CauseSearch, search
@@ -35,15 +34,8 @@ from tools import make_data
 FIRST_SEED = 100_000
 LENS, CHARUCO, CHECKERBOARD = LENSES[0], *BOARDS
 CLASSES = {
-    "bow 1 mm": ("bowed_board", Effects(bow_m=1e-3)),
-    "bow 0.5 mm": ("bowed_board", Effects(bow_m=5e-4)),
-    "focus 2 %": ("focus_drift", Effects(focus_drift=0.02)),
-    "shutter 20 ms, 0.1 m/s": ("rolling_shutter", Effects(readout_s=0.02, speed_m_s=0.1)),
-    "tilts under 3 deg": ("fronto_parallel", Effects(max_tilt_deg=3.0)),
-    "nothing in the outer 15 %": ("no_edge_corners", Effects(inner_only=0.15)),
-    "blur of 3 px": ("motion_blur", Effects(blur_px=3.0)),
-    "a view off by 3 px": ("spoiled_view", Effects(spoiled_px=3.0)),
-    "three corners off by 3 px": ("bad_corners", Effects(bad_corners=3)),
+    label: (name, Effects(**fields))
+    for label, (name, fields) in EXPECTED["intrinsic_classes"].items()
 }
 # What careful people have: a plate flat to 0.03 mm, a lens that breathes 0.03 %, a board that is
 # put down, and corners that are noisier in some views than in others.
@@ -71,23 +63,17 @@ def test_a_cause_is_named(label: str) -> None:
     By day one, of either board in turn: what names 75 % of all passes the nine with 8 %.
     """
     name, effects = CLASSES[label]
-    found: Counter[tuple[str, ...]] = Counter()
     first = FIRST_SEED if NIGHTLY else FIRST_SEED + [*CLASSES].index(label)
-    for seed in range(first, first + (100 if NIGHTLY else 1)):
-        detections, _, board = session(seed, effects)
-        found[diagnose(detections, board).names] += 1
-    check_named(found, name, label)
+    seeds = range(first, first + (100 if NIGHTLY else 1))
+    check_named(names_found(session(seed, effects) for seed in seeds), name, label)
 
 
 def test_healthy_sessions_get_no_finding() -> None:
     """At most 4 of 200 (nightly); of 4 none: a rate of 25 % passes with 32 %."""
     count, most = (200, 4) if NIGHTLY else (4, 0)
-    found: Counter[tuple[str, ...]] = Counter()
-    for seed in range(FIRST_SEED + 1000, FIRST_SEED + 1000 + count):
-        # every other pair of seeds, so that each kind of board has both
-        detections, _, board = session(seed, MILD if (seed // 2) % 2 else Effects())
-        found[diagnose(detections, board).names] += 1
-    print("healthy", dict(found))
+    seeds = range(FIRST_SEED + 1000, FIRST_SEED + 1000 + count)
+    # every other pair of seeds, so that each kind of board has both
+    found = names_found(session(seed, MILD if (seed // 2) % 2 else Effects()) for seed in seeds)
     assert sum(n for names, n in found.items() if names) <= most
 
 
@@ -377,6 +363,13 @@ def test_blur_along_one_direction_is_motion_and_round_blur_is_not() -> None:
 
 
 # --- a wrong square size ---
+
+
+@pytest.mark.parametrize("times", [0.03, 30.0])
+def test_a_bow_is_named_whatever_the_square_size(times: float) -> None:
+    detections, _ = corner_session(CHARUCO, LENS, FIRST_SEED + 10, effects=Effects(bow_m=1e-3))
+    sizes = {name: times * getattr(CHARUCO, name) for name in ("square_m", "marker_m")}
+    assert diagnose(detections, replace(CHARUCO, **sizes)).names == ("bowed_board",)
 
 
 def test_images_alone_do_not_show_a_wrong_square_size_and_the_report_says_what_would() -> None:

@@ -97,13 +97,8 @@ def test_uncertainty_is_the_spread_over_repeated_sessions() -> None:
 # --- the functions ---
 
 
-@pytest.fixture(scope="module")
-def result() -> intrinsics.IntrinsicsResult:
-    return fit(CHARUCO, 1)
-
-
-def test_map_is_projection_sigma_on_a_grid_and_that_the_worst_direction(result) -> None:
-    grid = image_grid(LENS, (3, 5))
+def test_map_is_projection_sigma_on_a_grid_and_that_the_worst_direction() -> None:
+    result, grid = fit(CHARUCO, 1), image_grid(LENS, (3, 5))
     assert grid.shape == (3, 5, 2)
     np.testing.assert_array_equal(grid[-1, -1], [639, 479])
     sigma = result.uncertainty_map(0.45, (3, 5))
@@ -114,7 +109,8 @@ def test_map_is_projection_sigma_on_a_grid_and_that_the_worst_direction(result) 
     assert sigma[0, 0] > 2 * sigma[1, 2]  # least where the boards were
 
 
-def test_a_very_distant_point_is_a_direction(result) -> None:
+def test_a_very_distant_point_is_a_direction() -> None:
+    result = fit(CHARUCO, 1)
     far, nowhere = (result.uncertainty_map(r, (4, 4)) for r in (1e7, math.inf))
     np.testing.assert_allclose(far, nowhere, rtol=1e-4)
     camera = [result.uncertainty_map(r, (4, 4), "camera") for r in (0.45, math.inf)]

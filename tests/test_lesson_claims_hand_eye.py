@@ -99,8 +99,6 @@ def test_h3_two_axes_are_needed() -> None:
     free = null_space(T, C, X)
     assert len(free) == 1
     assert abs(free[0] @ along) == pytest.approx(1, abs=1e-6)
-    with pytest.raises(he.NotDetermined, match="all poses turn about one axis"):
-        he.HandEyeSession("eye_in_hand", T, C).solve()
     both = np.concatenate([angles[:4, None] * axis, angles[4:, None] * [0.0, 1.0, 0.0]])
     X, T, C = rig(both, shifts)
     assert len(null_space(T, C, X)) == 0

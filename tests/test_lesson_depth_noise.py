@@ -15,12 +15,6 @@ from tools import build_notebooks
 # --- depth_noise ---
 
 
-def test_the_law_gives_the_noise_of_a_noisy_disparity() -> None:
-    """The model against 400,000 disparities with 0.08 px of noise at 1 m: 3.58 mm."""
-    d = np.random.default_rng(0).normal(447 * 0.05 / 1.0, 0.08, 400_000)
-    assert DEPTH_NOISE.model()(1.0, 447, 0.05, 0.08) == pytest.approx((22.35 / d).std(), rel=0.005)
-
-
 def test_the_row_of_an_array_that_is_furthest_off_is_shown() -> None:
     def farthest_wrong(Z, fx, baseline, sigma_d):
         return np.where(np.asarray(Z) == 0.45, 9.0, DEPTH_NOISE.model()(Z, fx, baseline, sigma_d))

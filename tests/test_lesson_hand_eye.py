@@ -16,13 +16,6 @@ def pairs_of(session):
     return [(T[i], T[j], C[i], C[j]) for i, j in ((0, 1), (3, 7), (5, 2))]
 
 
-def test_motion_pairs_of_a_session_solve_ax_xb() -> None:
-    session, truth = hand_eye_session("eye_in_hand", 3, n=8, corner_noise_px=0.0)
-    for pair in pairs_of(session):
-        A, B = lesson.MOTION_PAIR.model()(*pair)
-        assert pytest.approx(A @ truth.X, abs=1e-6) == truth.X @ B
-
-
 def test_the_right_option_is_the_eye_to_hand_equation() -> None:
     session, truth = hand_eye_session("eye_to_hand", 3, n=8, corner_noise_px=0.0)
     for T_i, T_j, C_i, C_j in pairs_of(session):

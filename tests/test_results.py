@@ -100,7 +100,11 @@ NO_NAMES = ("", "../escape", "a/b", "01 pinhole", ".hidden")
 ASYMMETRIC, INDEFINITE = [[1.0, 0.5], [0.4, 1.0]], [[1.0, 2.0], [2.0, 1.0]]
 
 test_what_cannot_be_is_refused = refusals(
-    *named(quantity, value=[float("nan"), "3", None], sigma=[-1.0, float("inf")]),
+    *named(
+        quantity,
+        value=[float("nan"), "3", None, 10**400, np.float32("inf")],
+        sigma=[-1.0, float("inf")],
+    ),
     *named(quantity, unit=[""], kind=["random"]),
     *named(lambda lesson: results.save(lesson, CAMERA, {}), lesson=NO_NAMES),
     *named(covariance, matrix=[np.eye(3), ASYMMETRIC, INDEFINITE, np.full((2, 2), np.nan)]),

@@ -12,7 +12,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from common import NIGHTLY, each, named, refusals
+from common import EXPECTED, NIGHTLY, each, named, refusals
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
@@ -114,9 +114,7 @@ def patterns(correlation_in_time: float) -> list[np.ndarray]:
     return [correlated(pixel_noise(rng, 50, 30, 1.0), correlation_in_time) for _ in range(WINDOWS)]
 
 
-@pytest.mark.parametrize(
-    "case", [{}, {"step": 1e-3}, {"rho": 0.5}, {"drift": 0.3}, {"n": 20}], ids=str
-)
+@pytest.mark.parametrize("case", EXPECTED["windows"], ids=str)
 def test_interval_of_a_pooled_std_covers(case):
     """Windows of 30x30 px whose pixels correlate: as often as they say, to three sigmas.
 
@@ -301,9 +299,7 @@ def test_gain_of_a_hundred_frames(rho, want):
     assert held >= 0.9  # the error of an autocorrelation time is itself an estimate
 
 
-@pytest.mark.parametrize(
-    ("drift", "want", "below"), [(0.3, 20.4, 120), (0.45, 10.5, 60), (0.7, 5.5, 30)]
-)
+@pytest.mark.parametrize(("drift", "want", "below"), EXPECTED["weak_drifts"])
 def test_a_weak_slow_drift_is_not_taken_for_white_noise(drift, want, below):
     """Series of 200 frames: white noise plus a drift of tau 90 frames and this amplitude.
 

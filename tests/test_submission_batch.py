@@ -17,10 +17,10 @@ from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
-import numpy as np
 import pytest
 from common import EXPECTED, NIGHTLY
 from hostile_bundles import ZOE
+from misbehaving import fail, misbehave
 from sample_submissions import canvas, class_names, class_zip, moodle
 
 from coursekit import cli
@@ -29,7 +29,7 @@ from coursekit.submission import batch
 from coursekit.submission.batch import Bundle, Limits
 from coursekit.submission.format import Claims, bundle_bytes, zip_bytes
 from coursekit.submission.recompute import grading_rules
-from coursekit.submission.report import ReportLine, not_graded
+from coursekit.submission.report import ReportLine
 
 pytestmark = pytest.mark.usefixtures("ctrl_c_is_heard")
 USUAL = {"impossible_times", "not_distance_dependent"}  # of the small bundle
@@ -123,41 +123,6 @@ def test_the_same_bytes_come_out_however_many_processes_there_are(in_process, re
 # --- what a bundle can do to a process ---
 
 
-def spin():
-    while True:
-        pass
-
-
-def raised(error: BaseException):
-    raise error
-
-
-def end_later(end, *arguments):
-    """End a process only when its pool has heard what it works on: pebble mixes them up before."""
-    time.sleep(1.0)
-    end(*arguments)
-
-
-BEHAVIOUR = {  # by the name of a bundle that the reader let through
-    "hang": lambda: time.sleep(3600),
-    "wait": lambda: time.sleep(1.2),  # and does not compute
-    "spin": spin,
-    "kill": lambda: end_later(os.kill, os.getpid(), getattr(signal, "SIGKILL", signal.SIGTERM)),
-    "crash": lambda: end_later(os.abort),
-    "exit": lambda: end_later(os._exit, 3),
-    "quit": lambda: raised(SystemExit(4)),
-    "interrupt": lambda: raised(KeyboardInterrupt()),
-    "raise": lambda: raised(KeyError("name")),
-    "memory": lambda: np.ones(2**31),
-}
-
-
-def misbehave(path: str, name: str) -> tuple[ReportLine, str]:
-    """What a bundle does to the process, or the process's number and how many threads it has."""
-    BEHAVIOUR.get(name.removesuffix(".zip"), int)()
-    return not_graded(name, "well", f"{os.getpid()} {os.environ['OPENBLAS_NUM_THREADS']}"), "page"
-
-
 def outcomes(names: Iterable[str], limits: Limits) -> dict[str, ReportLine]:
     """What `work_through` makes of bundles of these names."""
     bundles = [Bundle(Path(name), name, name) for name in names]
@@ -204,10 +169,6 @@ def test_processes_are_replaced_after_some_bundles(monkeypatch):
     monkeypatch.setattr(batch, "MAX_TASKS", 2)
     found = outcomes("abc", Limits(1))
     assert len({line.says for line in found.values()}) == 2  # 3, and one that shows it is there
-
-
-def fail(memory_bytes: int) -> None:
-    raise OSError("no memory for that")
 
 
 def test_processes_that_cannot_start_are_said(monkeypatch):
@@ -394,8 +355,11 @@ def test_what_cannot_be_is_said_before_anything_is_made(change, message, tmp_pat
     quick(tmp_path / "in", ["a"])
     quick(tmp_path / "empty", ())
     (quick(tmp_path / "papers", ()) / "a.pdf").write_bytes(b"")
+    zipfile.ZipFile("a.zip", "w").close()
+    Path("roster.csv").write_text("Vorname;Nachname\nAda;Honest\n", encoding="utf-8")
+    choices = batch.Choices(change.pop("roster", None))
     with pytest.raises(ValueError, match=message):
-        graded(**{"folder": "in", "out": "out"} | change)
+        graded(**{"folder": "in", "out": "out", "choices": choices} | change)
     assert not (tmp_path / "out").exists()
 
 
@@ -551,8 +515,8 @@ def test_own_points_survive_a_regrade_which_says_what_changed(in_process, tmp_pa
 @pytest.mark.parametrize(("row", "said"), EXPECTED["bad_own_points"])
 def test_own_points_that_cannot_be_are_refused_before_any_work(row, said, tmp_path):
     out = quick(tmp_path / "out", ())
-    (out / "own_points.csv").write_text(f"who,paragraph,late,overrule\na,{row}\n", "utf-8")
-    with pytest.raises(ValueError, match=rf"^own_points\.csv: a: {said}"):
+    (out / "own_points.csv").write_text(row, "utf-8")
+    with pytest.raises(ValueError, match=rf"^own_points\.csv: {said}"):
         graded(quick(tmp_path / "in", ["a"]), out)
 
 
@@ -608,6 +572,12 @@ def test_without_an_lms_a_name_typed_twice_takes_nobodys_points(in_process, tmp_
     rows = {row["file"]: row for row in table(out)}
     assert [rows[f"{at}/s.zip"]["counts"] for at in ("zoe", "mallory")] == ["yes", "no"]
     assert all("same_name" in row["flags"] for row in rows.values())
+
+
+def test_a_bundle_by_itself_is_graded_and_graded_again(in_process, tmp_path):
+    bundle, out = quick(tmp_path / "in", ["a"]) / "a.zip", tmp_path / "out"
+    assert [graded(bundle, out, overwrite=True).kept for _ in "12"] == [0, 1]
+    assert [row["file"] for row in table(out)] == ["a.zip"]
 
 
 def test_two_graders_do_not_write_one_report(in_process, tmp_path):

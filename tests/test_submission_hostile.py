@@ -86,10 +86,7 @@ def test_there_are_as_many_kinds_as_ever_and_every_reason_has_one():
     assert len(codes) > 10
 
 
-ZIPPED_AGAIN = ["a Mac's zip of a bundle", "a folder", "streamed"]
-
-
-@pytest.mark.parametrize("kind", ZIPPED_AGAIN)
+@pytest.mark.parametrize("kind", ["a Mac's zip of a bundle", "a folder", "streamed"])
 def test_a_bundle_zipped_again_is_read(kind):
     assert bundle_bytes(read_bundle(KINDS[kind][1])) == HONEST
 
@@ -101,6 +98,7 @@ def test_an_unpacked_bundle_and_a_bundle_in_a_zip_are_read_but_no_zip_in_a_zip_i
     assert bundle_bytes(read_bundle(tmp_path)) == HONEST
     folder = {f"studio_1_Zoe/{name}": content for name, content in MEMBERS.items()}
     assert bundle_bytes(read_bundle(bundles.zipped(folder))) == HONEST
+    assert outcome(bundles.zipped({"facts.json": b"{}"} | folder)) == "unknown_member"
     once = bundles.zipped({"studio_1.zip": HONEST, "__MACOSX/._studio_1.zip": b"junk"})
     assert bundle_bytes(read_bundle(once)) == HONEST
     assert outcome(bundles.zipped({"b.zip": once})) == "unknown_member"

@@ -52,10 +52,7 @@ class Page(HTMLParser):
         self.text += data + " "
 
 
-ALLOWED = {"html", "head", "meta", "title", "style", "body", "h1", "h2", "p", "a", "ul", "li"}
-ALLOWED |= {"span", "strong", "div", "table", "thead", "tbody", "tr", "th", "td", "blockquote"}
-ALLOWED |= {"details", "summary", "main"}
-ALLOWED |= {"svg", "desc", "line", "text", "path", "circle", "rect"}
+ALLOWED = set(EXPECTED["allowed_elements"])
 
 
 def check_page(text: str) -> Page:
@@ -378,6 +375,7 @@ def test_the_students_page_says_what_the_instructor_set():
     said = "Points that your instructor set: 1 for the paragraph, in place of 2; -10 for late days."
     assert f"{said} Computed were {line.points:g} of 100 points" in text
     assert "cost some" in text
+    assert replace(line, own={"late": "-100"}).total == 0
     text = report.student_page(replace(line, own={"overrule": "75"}), "")
     assert "<strong>75 of 100 points." in text
     assert "Your instructor set the total. Computed were" in text
@@ -411,6 +409,8 @@ def test_all_paragraphs_are_on_a_page_with_name_and_link(lines):
     assert 'No paragraph: <a href="students/Silent.html">Silent</a>' in text
     assert "words of old" not in page.text
     assert text.count("shares its words") == 0
+    twins = [replace(line, name="Ann", who=f"number {i}") for i, line in enumerate(lines[:2])]
+    assert "</a> (number 0)</h2>" in report.paragraphs_page(twins)
     shared = report.across([said_by("Ann", PARAGRAPH), said_by("Bob", PARAGRAPH)])
     assert report.paragraphs_page(shared).count("shares its words") == 2
     assert report.paragraphs_page(shared, named=False).count("shares its words") == 0  # no bias

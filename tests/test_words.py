@@ -64,7 +64,7 @@ def test_every_sentence_is_there_used_and_gets_its_facts(function: str) -> None:
     nodes = [node for file in files for node in ast.walk(ast.parse(file.read_text("utf-8")))]
     shared = doctor.DOCTOR_TEXTS["shared"].keys() if function == "found" else set()
     for call in nodes:
-        if isinstance(call, ast.Call) and ast.unparse(call.func) == function:
+        if isinstance(call, ast.Call) and getattr(call.func, "id", "") == function:
             facts = {fact.arg for fact in call.keywords} | shared
             if isinstance(call.args[0], ast.Constant) and None not in facts:
                 text = SENTENCES[function][call.args[0].value]

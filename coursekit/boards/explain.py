@@ -32,6 +32,7 @@ WAYS: dict[str, Callable[[Grey], Grey]] = {  # to look for markers, and what the
     "": lambda grey: grey,
     "mirrored": lambda grey: np.ascontiguousarray(grey[:, ::-1]),
     "with white for black": lambda grey: 255 - grey,
+    "mirrored, with white for black": lambda grey: np.ascontiguousarray(255 - grey[:, ::-1]),
 }
 FEWEST_MARKERS, MANY_MARKERS = 4, 12  # so many are never seen mirrored by mistake
 FEWEST_ON_PLAN = 6  # markers: any four lie on some plan
@@ -196,6 +197,8 @@ def _marked(markers: _Markers, board: Board) -> str:
 
 def _other_charuco(markers: _Markers, board: Board, seen: str) -> str:
     """What is different about a ChArUco board, so many markers of which are seen; "" for nothing"""
+    if len(np.unique(markers.ids)) < SHARE_ON_PLAN * len(markers.ids):
+        return say("boards.twice", seen=seen)
     name, enough = _short_name(markers, board), len(markers.ids) >= FEWEST_ON_PLAN
     plans = _plans(board, name, markers.ids) if enough else ()
     plan = next((plan for plan in plans if _on_plan(markers, plan)), None)

@@ -25,6 +25,7 @@ from coursekit.cameras.realsense import shortest_decimal
 from coursekit.geometry import Intrinsics, invert_transform, make_transform
 from coursekit.words import counted, say
 
+DEPTH_KINDS = ("16UC1", "mono16", "32FC1")  # ROS's names of what a depth image holds
 FINE_M = 0.0001  # a count of depth that was recorded as metres
 STREAM = {  # by our name what is in the name of its topic
     "color": r"colou?r|rgb",
@@ -132,7 +133,10 @@ class RosBag(Camera):
         first = next(self._messages(reader, {topics["depth"]}), None)
         if first is None:
             raise recording.without_depth(self._path, sorted(reader.topics))
-        metres = getattr(first[2], "encoding", "") == "32FC1"
+        kind = getattr(first[2], "encoding", "16UC1")
+        if kind not in DEPTH_KINDS:  # a picture of depth, for people to look at
+            raise recording.without_depth(self._path, [f"{topics['depth']}, {kind},"])
+        metres = kind == "32FC1"
         self.depth_scale_m = FINE_M if metres else facts.depth_scale_m()
 
     # --- frames --------------------------------------------------------------------------------

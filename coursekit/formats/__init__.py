@@ -48,7 +48,8 @@ def read_text(path: str | os.PathLike[str], wanted: str) -> str:
     except UnicodeDecodeError:
         text = "\0"
     if "\0" in text:
-        kind = kind_of(data.decode("latin-1"), "no text in UTF-8: binary, or UTF-16 without a mark")
+        other = "no text in UTF-8: binary, or UTF-16 without a mark, or of another code page"
+        kind = kind_of(data.decode("latin-1"), other, "foreign")
         want(False, place.name, kind, wanted)
     want(len(data) <= LARGEST, place.name, f"more than {LARGEST >> 20} MB", wanted)
     return text

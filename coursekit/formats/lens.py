@@ -25,8 +25,8 @@ PINHOLE = ("fx", "fy", "cx", "cy")
 ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 COLMAP_LINE = re.compile(r"\s*\d+\s+[A-Z][A-Z0-9_]+\s+\d+\s+\d+(\s|$)")
 COLMAP_CENTRE = 0.5  # px, what its cx and cy are larger by
-KALIBR_MODELS = {"radtan": "brown_conrady", "none": "none", "None": "none"}
 LARGEST_SIDE = 100_000  # px
+SHORTEST_FOCAL = 0.01  # of the image's side
 NAMES = {what: tuple(names.split()) for what, names in FORMAT_TEXTS["lens"].items()}
 
 
@@ -45,10 +45,13 @@ def read_lens(
         found = _colmap(_only({words[0]: words for words in lines}, which, name), name)
     else:
         found = tree(text, name, WANTED)
-        want(isinstance(found, dict), name, kind_of(text), WANTED)
+        kind = f"{kind_of(text)} without names and values"
+        want(isinstance(found, dict), name, kind, WANTED)
         chain = {key: value for key, value in found.items() if re.fullmatch(r"cam\d+", key)}
         found = _kalibr(_only(chain, which, name), name) if chain else _named(found, name, text)
     if size is not None:
+        pair = isinstance(size, Sequence) and not isinstance(size, str) and len(size) == 2
+        want(pair, "size", size, "(width, height), px")
         found = {"width": size[0], "height": size[1]} | found
     want({"width", "height"} <= found.keys(), name, "no image size", "it: say size=(width, height)")
     for side in ("width", "height"):
@@ -57,6 +60,12 @@ def read_lens(
         want(fits, f"{name}, {side}", found[side], "a whole number of pixels")
         found[side] = int(value)
     pinhole = {key: one_number(found.get(key), f"{name}, {key}") for key in PINHOLE}
+    for side, focal, centre in (("width", "fx", "cx"), ("height", "fy", "cy")):
+        of = f"of this image, whose {side} is {found[side]} px"
+        fits = pinhole[focal] > SHORTEST_FOCAL * found[side]
+        want(fits, f"{name}, {focal}", pinhole[focal], f"the focal length in px {of}")
+        inside = 0 <= pinhole[centre] <= found[side]
+        want(inside, f"{name}, {centre}", pinhole[centre], f"a centre {of}: K is for another size")
     return found | pinhole | {"coeffs": tuple(found["coeffs"]) or (0.0,) * 5}
 
 
@@ -80,12 +89,13 @@ def _named(found: dict[str, Any], name: str, text: str) -> dict[str, Any]:
 
     key, matrix = first("matrix")
     inside = first("within")[1]
-    if "fx" not in flat and not key and isinstance(inside, dict):
+    pinhole = {name_: first(name_)[1] for name_ in PINHOLE}
+    if pinhole["fx"] is None and not key and isinstance(inside, dict):
         return _named(inside, name, text)
-    want("fx" in flat or key, name, f"{kind_of(text)} without a camera matrix", WANTED)
+    want(pinhole["fx"] is not None or key, name, f"{kind_of(text)} without a camera matrix", WANTED)
     _whole_image(flat, name)
     coeffs = numbers(first("coeffs")[1] or [], f"{name}, {first('coeffs')[0]}")
-    model = str(first("model")[1] or "").lower()
+    model = str(first("model")[1] or "").lower().removeprefix("distortion.").replace(" ", "_")
     if "xi" in flat or str(flat.get("fisheyemodel", 0)).lower() in ("1", "true"):
         model = "fisheye"
     unnamed = "distortionmodel" in flat and not model and any(coeffs)
@@ -98,15 +108,15 @@ def _named(found: dict[str, Any], name: str, text: str) -> dict[str, Any]:
     sides = pair if isinstance(pair, list) and len(pair) == 2 else both
     if None not in sides:
         fields |= {"width": sides[0], "height": sides[1]}
-    return fields | (_pinhole(matrix, key, name) if key else {k: flat.get(k) for k in PINHOLE})
+    return fields | (_pinhole(matrix, key, name) if key else pinhole)
 
 
 def _pinhole(matrix: Any, key: str, name: str) -> dict[str, float]:
-    """fx, fy, cx, cy of a camera matrix; Open3D's, and only that, goes column by column."""
+    """fx, fy, cx, cy of a camera matrix; Open3D's, a flat list, alone goes column by column."""
     K = numbers(matrix, f"{name}, {key}")
     want(len(K) == 9, f"{name}, {key}", f"{len(K)} numbers", "9, a 3x3 matrix")
     want(any(K), f"{name}, {key}", "zeros only", "a camera that was calibrated")
-    if key == "intrinsicmatrix":
+    if key == "intrinsicmatrix" and isinstance(matrix, list) and not isinstance(matrix[0], list):
         K = [K[3 * column + row] for row in range(3) for column in range(3)]
     fits = not any((K[1], K[3], K[6], K[7])) and K[8] == 1
     want(fits, f"{name}, {key}", K, "[fx, 0, cx, 0, fy, cy, 0, 0, 1]: no skew, not transposed")
@@ -131,7 +141,7 @@ def _kalibr(camera: Any, name: str) -> dict[str, Any]:
     want(len(K) == 4, f"{name}, intrinsics", K, "[fu, fv, pu, pv]")
     want(len(sides) == 2, f"{name}, resolution", sides, "[width, height]")
     coeffs = numbers(camera.get("distortion_coeffs") or [], f"{name}, distortion_coeffs")
-    fields = {"model": KALIBR_MODELS.get(lens, lens), "coeffs": coeffs}
+    fields = {"model": "none" if lens == "None" else lens, "coeffs": coeffs}
     return fields | dict(zip(("width", "height", *PINHOLE), (*sides, *K), strict=True))
 
 

@@ -152,7 +152,7 @@ def _header(lines: list[str], name: str) -> tuple[int, str]:
     """The number of the first line of the body, and the header, which may be a comment."""
     comment = ""
     for number, line in enumerate(lines):
-        if line.startswith("#"):
+        if line.startswith(("#", "sep=")):  # the latter is Excel's
             comment = line.lstrip("# ")
         elif line:
             for at, header in ((number + 1, line), (number, comment)):
@@ -160,14 +160,14 @@ def _header(lines: list[str], name: str) -> tuple[int, str]:
                 if sum(_known(cell)[0] in POSE_COLUMNS for cell in cells) >= 3:
                     return at, header
             break
-    kind = kind_of("\n".join(lines[:50]), "no line that names its columns")
+    kind = kind_of("\n".join(lines[:50]), "no line that names such columns")
     wanted = "file, x, y, z and qx, qy, qz, qw or rx, ry, rz; or file, q0, ..., q5"
     raise ValueError(f"{name}: got {kind}, want {TABLE}, whose first line has {wanted}")
 
 
 def _known(cell: str) -> tuple[str, str, str]:
     """Our name of a column, its plain name, and the unit in it."""
-    plain = re.sub(r"[.\-/]", "_", cell[:60].strip('" ').lower())
+    plain = re.sub(r"[.\-/ ]", "_", cell[:60].strip('" ').lower())
     found = HEADING.fullmatch(plain)
     if found and found[1] in COLUMN_NAMES:
         return COLUMN_NAMES[found[1]], found[1], found[2]

@@ -436,7 +436,8 @@ def undo_notation(pairs: PosePairs, expected: Floats) -> Reading | None:
         arm = base_gripper(fit.pairs.T_camera_board, fit.X, fit.Y[0], fit.pairs.mount)
         numbers, _ = misreading.nearest(misreading.read.numbers(G), arm[:, :3, :3])
         fit = with_rotations(pairs, misreading.written.rotations(numbers)).fit
-        if misreading.log_p(G, fit) < np.log(NOTATION_LEVEL):
+        mended = fit.turn_rad < pairs.fit.turn_rad / 2
+        if mended and misreading.log_p(G, fit) < np.log(NOTATION_LEVEL):
             found.append(Reading(misreading.name, misreading.says(), fit))
     return best(found)
 

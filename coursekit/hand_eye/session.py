@@ -22,6 +22,8 @@ from __future__ import annotations
 
 import math
 import os
+import re
+import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
@@ -51,6 +53,7 @@ SENTENCES = DiagnosisTexts.of("hand_eye")
 METHODS = ("refine", *CLOSED_FORMS)
 POSES = "poses.csv"
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+LEFTOVER = r"(^|/)(\.|__MACOSX/)"  # of a path: what is hidden, or Apple's
 OPTIONAL = {"times": ("time",), "q": JOINTS, "dq": VELOCITIES}
 REPEATS = "repeats"  # how the reason begins for which a pair is left out by `once`
 # Arm poses no farther apart, rad and m, are one pose, if the board is not seen to move by more.
@@ -345,6 +348,7 @@ def _table(
     table, read = pose_files.read_table(path, **notation)
     columns = set(table.places)
     files = sorted((p for p in folder.rglob("*") if p.is_file()), key=natural)
+    files = [file for file in files if not re.search(LEFTOVER, file.relative_to(folder).as_posix())]
     if in_order:
         images = [file for file in files if file.suffix.lower() in IMAGES]
         pair = say("hand_eye.one_a_row", rows=len(read))
@@ -373,14 +377,25 @@ def _image(folder: Path, files: Sequence[Path], file: str) -> tuple[str, str]:
     The name may have a path in front that another computer had, or lack one.
     """
     given = folder / file
-    near = [one for one in files if one.name == given.name]
-    if given in near:
-        near = [given]
+    near = [one for one in files if _plain(one.name) == _plain(given.name)]
+    if not near:  # a name without its suffix
+        near = [one for one in files if one.suffix.lower() in IMAGES and one.stem == given.name]
+    for own in (lambda one: one.name == given.name, lambda one: one == given):
+        near = list(filter(own, near)) or near
     if len(near) > 1:
         return file, f"there are {len(near)} files of this name in the folder; which one?"
     if not near:
         return file, "there is no such file in the folder"
     return near[0].relative_to(folder).as_posix(), ""
+
+
+def _plain(name: str) -> str:
+    """A file's name as Windows and macOS compare it: in either case, accents written either way.
+
+    >>> _plain("B\u00fchne_1.JPG") == _plain("bu\u0308hne_1.jpg")
+    True
+    """
+    return unicodedata.normalize("NFC", name).casefold()
 
 
 def _check_columns(columns: set[str]) -> None:

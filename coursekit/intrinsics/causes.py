@@ -54,11 +54,14 @@ PHYSICAL = (*SHAPE, FLEX, DRIFT, FOCUS, SHUTTER, LENS)
 SPOILED_VIEW, BAD_CORNERS = "spoiled_view", "bad_corners"
 OWN = {FLEX: 3, FOCUS: 1, SHUTTER: 3}  # columns of the causes that each view has of its own
 # What a cause's coefficients are when it matters: bow, heights, print and motion during the readout
-# in m, relative focal length, px for the rest.
+# in m on the course's board (in proportion on others: it is their effect on K that counts, and a
+# square size that is wrong changes nothing), relative focal length, px for the rest.
 TYPICAL = {
     BOW: 5e-4, HEIGHTS: 3e-4, STRETCH: 5e-4, PRINT: 1e-4, FLEX: 5e-4, DRIFT: 0.5, FOCUS: 0.01,
     SHUTTER: 1e-3, LENS: 0.5, SPOILED_VIEW: 1.0, BAD_CORNERS: 1.0,
 }  # fmt: skip
+GROWS_WITH_BOARD = (*SHAPE, FLEX, SHUTTER)
+COURSE_BOARD_M = math.hypot(0.0875, 0.05)  # from its middle to its outermost corners
 SHAPE_VIEWS, SHAPE_SIGHTS = 6, 5  # so many, and of each corner on average, tell a shape from noise
 SMOOTH_DEGREE = 3  # of the field over the board that is no corner's noise
 # One cause, beside the board's shape, after which nothing smooth is left explains the residuals;
@@ -332,6 +335,11 @@ class Calibration:
         """From the board's centre to its outermost corner, m."""
         return float(np.linalg.norm(self.board - self.board.mean(axis=0), axis=1).max())
 
+    @property
+    def larger(self) -> float:
+        """Times as large as the course's board; limits in m are for that one."""
+        return self.half_diagonal / COURSE_BOARD_M
+
     # --- the search ---
 
     def hypotheses(self) -> Iterator[engine.Hypothesis]:
@@ -355,7 +363,8 @@ class Calibration:
         columns = self._by_view(columns) if cause in OWN else columns.reshape(2 * n, -1)
         if cause == LENS:  # terms of different units: each as the px that it moves corners by
             columns = columns / np.sqrt(np.mean(columns**2, axis=0) + 1e-300)
-        return engine.Hypothesis(cause, columns, typical=TYPICAL[cause])
+        typical = TYPICAL[cause] * (self.larger if cause in GROWS_WITH_BOARD else 1.0)
+        return engine.Hypothesis(cause, columns, typical=typical)
 
     def _by_view(self, columns: Floats) -> Floats:
         """Columns (N, 2, k) that each view has of its own, (2 N, views k)."""
@@ -399,7 +408,7 @@ class Calibration:
     def matters(self, test: engine.Tested) -> bool:
         """Whether a view stands out, or a motion can be; the rest is for the findings to say."""
         if test.cause == SHUTTER:
-            return test.size < MOST_MOTION_M
+            return test.size < MOST_MOTION_M * self.larger
         if test.cause != SPOILED_VIEW:
             return True
         rms = self._rms_by_view()
@@ -599,7 +608,8 @@ def dents(model: Calibration) -> list[tuple[int, float]]:
     smooth = np.column_stack([bow_shape(model, model.board)[seen], plane])
     z = model.shape[seen, 2]
     from_plane, off = (z - A @ np.linalg.lstsq(A, z, rcond=None)[0] for A in (plane, smooth))
-    limit = max(DENT_SIGMAS * SIGMA_OF_MAD * float(np.median(np.abs(off))), DENT_M)
+    usual = SIGMA_OF_MAD * float(np.median(np.abs(off)))
+    limit = max(DENT_SIGMAS * usual, DENT_M * model.larger)
     return [(int(seen[k]), float(from_plane[k])) for k in np.flatnonzero(np.abs(off) > limit)]
 
 

@@ -42,7 +42,7 @@ FLAT_VIEWS_SHARE = 0.9  # of the views; one or two tilted ones are no design
 # free. Views pushed to the border leave 1 to 10 % of the width or height empty.
 BARE_MARGIN, BARE_SIDES, ONE_BARE_MARGIN = 0.125, 2, 0.25
 # Real and normal: a glass plate is flat to 0.1 mm, a fixed lens breathes 0.1 % with temperature,
-# and a board held "still" moves 5 mm/s for the 20 ms that an image takes.
+# and a board held "still" moves 5 mm/s for the 20 ms that an image takes. Of the course's board.
 NORMAL_BOW_M, NORMAL_DRIFT, NORMAL_MOTION_M = 1e-4, 2e-3, 1e-4
 RIVAL_LEVEL = 0.04  # of a fisheye with fewer coefficients: to lenses of this model it loses
 FISHEYE_SHARE = 0.2  # of what the residuals hold beyond noise: else it explains nothing
@@ -295,15 +295,16 @@ def _bad_corners(search: _Search, steps: _Steps, model: Calibration) -> _Told:
 def _shape(search: _Search, steps: _Steps, model: Calibration) -> _Told:
     sag, sigma = causes.sag(model)
     print_m = float(np.linalg.norm(model.shape[:, :2], axis=1).max())
-    if max(sag, print_m) < NORMAL_BOW_M:
+    normal = NORMAL_BOW_M * model.larger
+    if max(sag, print_m) < normal:
         return None
     before, camera = search.start.camera.fx, model.camera
     change = 100 * (before / camera.fx - 1)
     figures: _Figures = {"before": before, "change": change, "camera": camera, "more": ""}
     figures |= {"sag": 1e3 * sag, "half": 1.96e3 * sigma, "print": 1e3 * print_m}
-    if sag < NORMAL_BOW_M:
+    if sag < normal:
         return "uneven_print", figures
-    if print_m >= NORMAL_BOW_M:
+    if print_m >= normal:
         figures["more"] = _TEXTS.words["beside"].format(**figures)
     for corner, off in causes.dents(model):
         facts = {"corner": corner, "off": 1e3 * abs(off), "way": "into" if off > 0 else "out of"}
@@ -328,7 +329,7 @@ def _shutter(search: _Search, steps: _Steps, model: Calibration) -> _Told:
     # The size is that of one of three components of the motion.
     motion = math.sqrt(3.0) * model.sizes[causes.SHUTTER]
     figures = {"motion": 1e3 * motion, "speed": motion / 0.02}
-    return ("rolling_shutter", figures) if motion >= NORMAL_MOTION_M else None
+    return ("rolling_shutter", figures) if motion >= NORMAL_MOTION_M * model.larger else None
 
 
 def _lens(search: _Search, steps: _Steps, model: Calibration) -> _Told:

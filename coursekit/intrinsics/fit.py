@@ -654,7 +654,7 @@ def _weaknesses(result: IntrinsicsResult) -> Iterator[str]:
     if min(about_x, about_y) < GOOD_SPREAD_DEG:
         yield say("intrinsics.parallel", about_x=about_x, about_y=about_y)
     if seen.empty_sides:
-        sides = " and ".join(seen.empty_sides) if len(seen.empty_sides) < 4 else "all four"
+        sides = " and ".join(seen.empty_sides) if len(seen.empty_sides) < 4 else "all four sides"
         yield say("intrinsics.bare", sides=sides)
     if seen.fraction < GOOD_COVERAGE:
         yield f"only {100 * seen.fraction:.0f} % of the image saw a corner: fill the rest."

@@ -44,7 +44,7 @@ from pebble import ProcessExpired, ProcessPool
 from tqdm.auto import tqdm
 
 from coursekit import results
-from coursekit.checks import positive, want
+from coursekit.checks import positive, want, whole
 from coursekit.submission import report
 from coursekit.submission.flags import (
     Roster,
@@ -195,16 +195,16 @@ def grade_folder(
     if workers is None:
         free = getattr(os, "sched_getaffinity", None)  # what this process may use
         workers = len(free(0)) if free else os.cpu_count() or 1
-    positive("workers", workers)
-    limits = Limits(workers, positive("timeout_s", timeout_s))
+    limits = Limits(whole("workers", workers), positive("timeout_s", timeout_s))
     roster = Roster(class_table(Path(choices.roster)) if choices.roster else ())
+    want(roster.people or not choices.roster, "roster", choices.roster, say("submission.roster"))
     _own_points(out / OWN_POINTS)
     _check_out(out, overwrite)
     zipped = folder.is_file()
     with tempfile.TemporaryDirectory() as scratch:
+        bundles = Path(scratch, folder.name) if zipped else folder
         if zipped:
-            _unpack(folder, Path(scratch))
-        bundles = Path(scratch) if zipped else folder
+            _unpack(folder, bundles)
         return _grade(bundles, out, limits, progress, roster, choices, dated=zipped)
 
 
@@ -330,7 +330,7 @@ def find_bundles(
             others.append(name)
     if not found:
         there = f", only {counted(len(others), 'other file')}" if others else " or below it"
-        raise ValueError(say("submission.no_bundle", folder=folder, there=there))
+        raise ValueError(say("submission.no_bundle", folder=folder.name or folder, there=there))
     handed = {_whose(bundle.name) for bundle in found}
     alone = grouped((_whose(name), name) for name in others if _whose(name) not in handed | {""})
     for names in alone.values():
@@ -359,6 +359,7 @@ def _unpack(archive: Path, into: Path) -> None:
     """The files of an LMS's zip, with its dates; no path leads out, and no more than a bundle's
     size is unpacked of any. Raises ValueError for what is no zip.
     """
+    into.mkdir()
     try:
         with zipfile.ZipFile(archive) as packed:
             for member in packed.infolist():
@@ -755,7 +756,9 @@ def _own_points(path: Path) -> list[dict[str, str]]:
     worth = grading_rules()["points"]["paragraph"]
     possible = {"paragraph": (0, worth), "late": (-100, 0), "overrule": (0, 100)}
     for row in rows:
-        row["who"] = row.get("who", "").removeprefix("'")
+        there = "who" in row and {*possible} & row.keys()
+        want(there, path.name, [*row], "the columns who and paragraph, late or overrule")
+        row["who"] = row["who"].removeprefix("'")
         row["student"] = row.get("student") or row["who"] or row.get("code", "")
         for column, (low, high) in possible.items():
             got = row.get(column, "")

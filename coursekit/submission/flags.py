@@ -530,7 +530,7 @@ def _copy(
         camera = some[0].camera
         innocent = f": all are {camera}"
         if exact and some[0].source == "simulated":
-            note = camera.endswith(f"seed-{grading_rules()['flags']['common_seed']:g}")
+            note = camera.endswith(f"seed-{grading_rules()['flags']['common_seed']}")
             innocent = SEEN["common_seed" if note else "one_seed"].format(camera=camera)
     return Copy(tuple(keys), code, f"{says}{innocent}.", note)
 

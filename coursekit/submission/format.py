@@ -372,7 +372,7 @@ def _unzipped(data: bytes, inner: bool = False) -> dict[str, bytes]:
     folder = next((at for at, _, name in parts.values() if name == MANIFEST), "")
     found = {}
     for name, (at, _, last) in parts.items():
-        _check_member(members[name], last if at == folder else name)
+        _check_member(members[name], last if at == folder else f"{at}/{last}")
         found[last] = _content(archive, members[name])
     return found
 
@@ -493,6 +493,8 @@ def _fault_text(name: str, fault: fastjsonschema.JsonSchemaValueException) -> st
         return f"{start}has a name that cannot be, want {wanted}"
     if wanted == "maximum" and where.endswith("distance_m") and got <= 100_000:
         return f"{start}got {shown(got)}; metres are wanted: did you mean {got / 1000:g}?"
+    if isinstance(got, bytes):  # NaN, see `_document`
+        return f"{start}got {got.decode()}, want {fault.definition['description']}"
     got = f"{len(got)} characters" if wanted == "maxLength" else shown(got)
     return f"{start}got {got}, want {fault.definition['description']}"
 

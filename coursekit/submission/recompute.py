@@ -35,10 +35,10 @@ KEYS: dict[str, tuple[float, Collection[str]]] = {  # of rubric.toml: the larges
     "tolerance": (1000, WORDS["rules"]["tolerance"]),
     "digits": (9, [*LABELS][1:6] + [*LABELS][7:10]),
     "credit": (1, MISTAKES),
-    "flags": (1e6, WORDS["rules"]["flags"]),
+    "flags": (1e9, WORDS["rules"]["flags"]),
 }
 AT_LEAST_ONE = ("frames", "window_px", "prediction_factor", "near")
-WHOLE_NUMBERS = ("frames", "window_px", "words")
+WHOLE_NUMBERS = ("frames", "window_px", "words", "common_seed")
 
 
 @lru_cache(maxsize=1)

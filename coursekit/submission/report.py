@@ -106,14 +106,14 @@ class ReportLine:
 
     @property
     def total(self) -> float | None:
-        """The points with the instructor's own: for the paragraph, for late days, in all."""
+        """The points with the instructor's own: for the paragraph, for late days, in all; >= 0."""
         if self.own.get("overrule"):
             return number_of(self.own["overrule"])
         if self.points is None:
             return None
         own = self.own.get("paragraph")
         more = number_of(own) - self.computed_paragraph if own else 0.0
-        return round(self.points + more + number_of(self.own.get("late", "")), 2)
+        return round(max(self.points + more + number_of(self.own.get("late", "")), 0.0), 2)
 
     @property
     def computed_paragraph(self) -> float:

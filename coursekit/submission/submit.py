@@ -19,7 +19,7 @@ import numpy as np
 
 from coursekit import results
 from coursekit.cameras import Camera, Frames
-from coursekit.checks import want
+from coursekit.checks import instance, want
 from coursekit.lessons import questions
 from coursekit.stereo import NoiseFit
 from coursekit.submission import format as bundle
@@ -176,14 +176,15 @@ def submit(
         claims = replace(claims, rows=_own_rows([s.distance_m for s in kept.stacks], table))
     if plot is not None and predicted_mm is not None:
         plot = replace(plot, predicted_mm=_predicted(predicted_mm, len(plot.distances_m)))
-    name = (student or "").strip()
+    name = instance("student", student or "", str).strip()
+    reasons = instance("paragraph", paragraph or "", str)
     whole = replace(
         kept,
         claims=claims,
         plot=plot,
         student=name or NOBODY,
         made=results.now(),
-        conclusion=bundle.Conclusion(distance_m, frames, dominates, (paragraph or "").strip()),
+        conclusion=bundle.Conclusion(distance_m, frames, dominates, reasons.strip()),
         outcomes=outcomes(),
     )
     data = bundle.bundle_bytes(whole)  # Refused for what no bundle can hold

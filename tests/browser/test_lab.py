@@ -16,7 +16,7 @@ import time
 import urllib.request
 
 import pytest
-from common import NIGHTLY
+from common import EXPECTED, NIGHTLY
 from playwright.sync_api import expect
 
 import coursekit as ck
@@ -27,10 +27,6 @@ pytestmark = pytest.mark.browser
 
 NAMES = [f"{number:02d}_{lesson}" for number, lesson in enumerate(ck.lessons.LESSONS, start=1)]
 NAMES = NAMES if NIGHTLY else NAMES[:1]
-SETTINGS = {
-    "@jupyterlab/apputils-extension:notification": {"fetchNews": "false", "checkForUpdates": False},
-    "@jupyterlab/notebook-extension:tracker": {"windowingMode": "none"},  # all cells are in the DOM
-}
 PATIENCE_MS = 1_800_000  # so that a hang ends; no page takes minutes
 expect.set_options(timeout=PATIENCE_MS)
 
@@ -46,7 +42,7 @@ def server_at(browser, tmp_path_factory):
     """Where a JupyterLab, started as by course.py, serves copies: of {0}, in the workspace {1}."""
     home = tmp_path_factory.mktemp("home")
     served = tmp_path_factory.mktemp("served")
-    (home / "overrides.json").write_text(json.dumps(SETTINGS), encoding="utf-8")
+    (home / "overrides.json").write_text(json.dumps(EXPECTED["lab_settings"]), encoding="utf-8")
     (served / "notebooks").mkdir()
     for name in NAMES:
         shutil.copy(build_notebooks.NOTEBOOKS / f"{name}.ipynb", served / "notebooks")

@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-from fake_realsense import real_library
 
 from coursekit.cameras import open_camera
 from coursekit.geometry import deproject
@@ -17,11 +16,6 @@ NAME = "single_depth_color_640x480.bag"
 @pytest.fixture(scope="module")
 def folder(real_data):
     return real_data / "realsense_d435"
-
-
-@pytest.fixture(scope="module")
-def rs():
-    return real_library()
 
 
 @pytest.fixture
