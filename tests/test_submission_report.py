@@ -434,6 +434,12 @@ def read(text: str) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(text)))
 
 
+@pytest.mark.parametrize(("most", "other"), [("", 0), ("100,00", 0), ("50", 1), ("1.000,00", 1)])
+def test_a_worksheet_of_other_points_is_told(lines, most, other):
+    row = {"Identifier": "Participant 17", "Maximum grade": most}
+    assert len(report.exports([replace(lines[0], row=row)])[1]) == other
+
+
 def test_the_table_has_a_row_a_bundle_and_points_that_add_up(lines):
     rows = read(report.grades_csv(lines))
     assert tuple(rows[0]) == report.HEADER

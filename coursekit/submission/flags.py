@@ -50,7 +50,9 @@ WORDS_IN_A_ROW = 3  # words in a row, by which paragraphs are compared
 MOODLE = re.compile(
     r"(?:^|/)(?P<at>(?P<name>[^/]+?)_(?P<id>\d+)_assignsubmission_(?:file|onlinetext)_?)"
 )
-CANVAS = re.compile(r"(?:^|/)(?P<name>[^/_]+)(?P<late>_LATE)?_(?P<id>\d{2,})_\d{2,}_[^/]+$")
+CANVAS = re.compile(  # but no date
+    r"(?:^|/)(?P<name>[^/_]+)(?P<late>_LATE)?_(?!20\d\d_[01]\d_)(?P<id>\d{2,})_\d{2,}_[^/]+$"
+)
 NAME_COLUMNS, FIRST_AND_LAST, IDS = (HEADINGS[k] for k in ("names", "parts_of_names", "ids"))
 UNDECOMPOSED = str.maketrans({"ł": "l", "ø": "o", "đ": "d", "ð": "d", "ħ": "h", "ŧ": "t", "ı": "i"})
 UNDECOMPOSED |= str.maketrans({"æ": "ae", "œ": "oe", "þ": "th", "ŋ": "n"})  # ß: by casefold
@@ -560,6 +562,8 @@ def place_of(file: str) -> Place:
 name='Ada Lovelace', id='17', late=False)
     >>> place_of("lovelaceada_LATE_1234_56789_studio_1.zip").feedback
     'lovelaceada_LATE_1234_56789_studio_1.html'
+    >>> place_of("lovelace_2026_03_02.zip").lms
+    ''
     """
     if found := MOODLE.search(file):
         within = "/" * file[found.end() :].startswith("/")

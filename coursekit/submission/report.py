@@ -734,7 +734,7 @@ def exports(
         identifier = f"Participant {at.id}" if at.lms == "Moodle" else row.get("identifier", "")
         if identifier:
             most = row.get("maximum grade") or "100"
-            if number_of(most) != 100:
+            if not re.fullmatch(r"100([.,]0*)?", most):
                 notes.add(SAYS["other_maximum"].format(most))
             email = row.get("email address", row.get("email", ""))
             # else Moodle skips whom it has graded before; "-" is its word for never
