@@ -121,10 +121,13 @@ def test_refuses_a_bad_count(camera, n, tmp_path):
 
 
 def test_closing_twice_is_fine_and_a_closed_camera_says_so(camera):
+    begun = camera.stream()
+    next(begun)
     camera.close()
     camera.close()
-    with pytest.raises(CameraError, match=r"closed: open it again with open_camera\(\)"):
-        camera.frame()
+    for stream in (begun, camera.stream()):
+        with pytest.raises(CameraError, match=r"closed: open it again with open_camera\(\)"):
+            list(stream)
 
 
 SAID = EXPECTED["cameras_said"]

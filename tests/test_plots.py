@@ -14,6 +14,7 @@ from test_lesson_intrinsics import X, Y, predict
 
 from coursekit import boards, budget, geometry, plots, specifications
 from coursekit.attribution import simulate_misses
+from coursekit.cameras import Frame
 from coursekit.geometry import Intrinsics
 from coursekit.hand_eye import error_study
 from coursekit.intrinsics import calibrate, compare, stored_power
@@ -178,6 +179,14 @@ def test_colours_can_be_told_apart_without_hue() -> None:
         return float(np.dot([0.2126, 0.7152, 0.0722], to_rgb(plots.COLORS[name])))
 
     assert abs(lightness("model") - lightness("measured")) > 0.05
+
+
+def test_a_frame_without_any_depth_is_no_picture() -> None:
+    lens = Intrinsics(8, 6, 5.0, 5.0, 3.5, 2.5)
+    covered = Frame(np.zeros((6, 8), np.uint16), None, 0.001, 0.0, 1, lens)
+    for drawn, of in ((pinhole.frame, covered), (pinhole.point_cloud, covered.points())):
+        with pytest.raises(ValueError, match="no pixel has a depth"):
+            drawn(of)
 
 
 def test_unknown_entry_of_K() -> None:

@@ -144,9 +144,9 @@ class RosBag(Camera):
     def stream(self) -> Generator[Frame, None, None]:
         others: dict[str, list[_Shot]] = {name: [] for name in self._names.values()}
         waiting = others.pop("depth")
-        need(not self._closed, "cameras.closed", what=self._what)
         with self._reader() as reader:
             for name, shot in self._shots(reader):
+                need(not self._closed, "cameras.closed", what=self._what)
                 (waiting if name == "depth" else others[name]).append(shot)
                 while waiting and (len(waiting) > MOST_WAITING or _passed(waiting[0], others)):
                     yield self._frame(waiting.pop(0), others)

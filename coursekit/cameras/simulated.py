@@ -173,7 +173,7 @@ class SimulatedCamera(Camera):
 
     def stream(self) -> Generator[Frame, None, None]:
         self._check_open()
-        while not self._closed:
+        while True:
             view, color = _view(self._rig, self.scene), self.color_image()
             shot = view.frame(self._rng, self._drift_from_s + self._since_placed_s)
             depth, scale_m = view.depth(shot, self.depth_scale_m), self.depth_scale_m

@@ -12,6 +12,7 @@ from matplotlib.colors import LogNorm
 from coursekit import geometry
 from coursekit.arrays import AnyArray, Floats, NDArray
 from coursekit.cameras import Frame
+from coursekit.checks import refuse
 from coursekit.geometry import Intrinsics
 from coursekit.plots.style import COLORS, LessonFigure, cross, figure, image_axes, panels, single
 from coursekit.simulation import Box
@@ -19,6 +20,7 @@ from coursekit.simulation import Box
 DISPLACEMENT_PX = 0.1, 120.0  # the colour scale of `displacement`
 SLICE_M = 0.015  # half the height of the slice in `point_cloud`
 NEAR_M = 0.60  # where its view from the side ends, m
+ALL_EMPTY = "no pixel has a depth: uncover the lenses or step back, and take another frame"
 POINT_X_M = 0.10  # how far right of the axis the point of `similar_triangles` is
 
 
@@ -170,7 +172,11 @@ def edge_and_corner(size: Floats) -> tuple[float, float]:
 
 
 def frame(shot: Frame) -> LessonFigure:
-    """The depth image, and the colour image where there is one, as the camera delivers them."""
+    """The depth image, and the colour image where there is one, as the camera delivers them.
+
+    Raises ValueError where no pixel has a depth.
+    """
+    refuse(not shot.depth.any(), f"shot: {ALL_EMPTY}")
     depth = np.where(shot.depth_m > 0, shot.depth_m, np.nan)
     height, width = depth.shape
     wide = [1.2 * width / height]  # with room for the colour bar
@@ -199,8 +205,9 @@ def point_cloud(points: NDArray[np.float32]) -> LessonFigure:
     Points are coloured by depth; NaN points and the few far beyond all others (false matches) are
     left out. The view from the side ends at NEAR_M if there is anything nearer, and leaves out
     what lies far beside all others; the slice holds the points at most SLICE_M above or below the
-    optical axis.
+    optical axis. Raises ValueError where no point is left.
     """
+    refuse(not np.isfinite(points[..., 2]).any(), f"points: {ALL_EMPTY}")
     cloud = points[points[..., 2] <= _far(points[..., 2])]
     near = cloud[cloud[:, 2] < NEAR_M]
     near = near if len(near) > 0.02 * len(cloud) else cloud
