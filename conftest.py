@@ -17,7 +17,7 @@ from tools.build_notebooks import kernel_environment
 # digits of a test should not depend on how many cores a computer has. Numba's threads change none.
 for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(threads, "1")
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # Numba's spin while they wait: a third more
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # Numba's spin while they wait
 SCRATCH = pytest.StashKey[Path]()
 
 
