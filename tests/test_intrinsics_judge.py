@@ -206,7 +206,7 @@ test_bad_input_is_named = refusals(
         lambda: intrinsics.halves(fit(CHARUCO, 1).detections[:5], CHARUCO),
     ),
     (r"factory: got \(848, 480\), want", lambda: intrinsics.compare(fit(CHARUCO, 1), OTHER)),
-    (r"factory: got IntrinsicsResult, want Intrinsics", lambda: intrinsics.compare(*[fit(CHARUCO, 1)] * 2)),
+    ("factory: got IntrinsicsR.*, want Int", lambda: intrinsics.compare(*[fit(CHARUCO, 1)] * 2)),
 )
 
 
