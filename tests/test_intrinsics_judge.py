@@ -206,6 +206,7 @@ test_bad_input_is_named = refusals(
         lambda: intrinsics.halves(fit(CHARUCO, 1).detections[:5], CHARUCO),
     ),
     (r"factory: got \(848, 480\), want", lambda: intrinsics.compare(fit(CHARUCO, 1), OTHER)),
+    ("factory: got IntrinsicsR.*, want Int", lambda: intrinsics.compare(*[fit(CHARUCO, 1)] * 2)),
 )
 
 

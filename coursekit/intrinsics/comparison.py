@@ -16,7 +16,7 @@ import numpy as np
 
 from coursekit.arrays import ArrayLike, Floats
 from coursekit.boards import Board, Detection
-from coursekit.checks import want
+from coursekit.checks import instance, want
 from coursekit.geometry import Intrinsics, deproject, moved, project
 from coursekit.intrinsics import derivatives, fit
 from coursekit.intrinsics.fit import MAP_SHAPE, IntrinsicsResult
@@ -229,7 +229,8 @@ def compare(
     [10.  0.]
     """
     ours, names = result.intrinsics, result.names
-    want(factory.size == ours.size, "factory", factory.size, f"the fit's size, {ours.size} px")
+    size = instance("factory", factory, Intrinsics).size
+    want(size == ours.size, "factory", size, f"the fit's size, {ours.size} px")
     grid = fit.image_grid(ours, shape).reshape(-1, 2)
     weights = 1.0 / result.uncertainty_map(range_m, shape).ravel()
     pixels = difference_px(ours, factory, grid, range_m, weights).reshape(*shape, 2)

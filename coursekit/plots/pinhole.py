@@ -176,7 +176,7 @@ def frame(shot: Frame) -> LessonFigure:
 
     Raises ValueError where no pixel has a depth.
     """
-    refuse(not shot.depth.any(), f"shot: {ALL_EMPTY}")
+    refuse(not np.any(shot.depth_m), f"shot: {ALL_EMPTY}")
     depth = np.where(shot.depth_m > 0, shot.depth_m, np.nan)
     height, width = depth.shape
     wide = [1.2 * width / height]  # with room for the colour bar
