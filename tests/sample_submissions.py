@@ -394,11 +394,7 @@ SLOPPY_ROWS = {
     "half": ("std", "", lambda m, row: 0.5 * row.depth_std_mm),
     "one digit": ("std", "rounded", lambda m, row: f"{row.depth_std_mm:.0e}"),
     "std for error": ("bias_se", "not_divided", lambda m, row: row.depth_std_mm),
-    "independent": (
-        "bias_se",
-        "independent",
-        lambda m, row: row.depth_std_mm / _raw(m).size ** 0.5,
-    ),
+    "N": ("bias_se", "independent", lambda m, row: row.depth_std_mm * _raw(m).size ** -0.5),
     "its own std": ("std_se", "not_divided", lambda m, row: row.depth_std_mm),
     "error of one pixel": ("std_se", "one_pixel", lambda m, row: row.depth_std_mm / 198**0.5),
     "percent": ("invalid", "percent", lambda m, row: 100 * row.invalid_fraction),

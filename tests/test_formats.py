@@ -326,7 +326,7 @@ LAST, FIRST, THREE = "x,y,z,qx,qy,qz,qw", "x,y,z,qw,qx,qy,qz", "x,y,z,rx,ry,rz"
 IN_MM, IN_DEG = "x_mm,y_mm,z_mm,rx_deg,ry_deg,rz_deg", "x,y,z,rx_deg,ry_deg,rz_deg"
 RTDE = ",".join(f"actual_TCP_pose_{i}" for i in range(6))
 VECTOR, FIXED, BODY = TURNS.as_rotvec(), TURNS.as_euler("xyz"), TURNS.as_euler("ZYX")
-AS_VECTOR = {"rotation": "rotation_vector"}
+AS_VECTOR, AS_ANGLES = {"rotation": "rotation_vector"}, {"rotation": "ZYX", "angle": "deg"}
 NOTATIONS = {  # a header, the numbers and what has to be said of them
     "quaternion": (LAST, (PLACES, QUATERNIONS), {}),
     "quaternion, w first": (FIRST, (PLACES, QUATERNIONS[:, [3, 0, 1, 2]]), {}),
@@ -334,11 +334,7 @@ NOTATIONS = {  # a header, the numbers and what has to be said of them
     "RTDE": (RTDE, (PLACES, VECTOR), {}),
     "rotation vector, deg": (IN_DEG, (PLACES, DEG(VECTOR)), AS_VECTOR),
     "xArm": ("x,y,z,roll,pitch,yaw", (1e3 * PLACES, DEG(FIXED)), {"length": "mm", "angle": "deg"}),
-    "KUKA": (
-        "X [mm],Y [mm],Z [mm],A,B,C",
-        (1e3 * PLACES, DEG(BODY)),
-        {"rotation": "ZYX", "angle": "deg"},
-    ),
+    "KUKA": ("X [mm],Y [mm],Z [mm],A,B,C", (1e3 * PLACES, DEG(BODY)), AS_ANGLES),
     "Fanuc": ("X,Y,Z,W,P,R", (PLACES, FIXED), {"rotation": "xyz", "angle": "rad"}),
     "millimetres by name": (IN_MM, (1e3 * PLACES, DEG(FIXED)), {"rotation": "xyz"}),
     "joint angles": ("q0,q1,q2,q3,q4,q5", (Q,), {}),

@@ -201,10 +201,7 @@ test_bad_input_is_named = refusals(
     ("detections: got 0, want at least one view", lambda: intrinsics.coverage([])),
     ("detections: got 0, want .* with corners", lambda: intrinsics.coverage([EMPTY])),
     ("320", lambda: intrinsics.coverage([*fit(CHARUCO, 1).detections, EMPTY])),
-    (
-        "got 5 views, halves need at least 6",
-        lambda: intrinsics.halves(fit(CHARUCO, 1).detections[:5], CHARUCO),
-    ),
+    ("5 views, halves need", lambda: intrinsics.halves(fit(CHARUCO, 1).detections[:5], CHARUCO)),
     (r"factory: got \(848, 480\), want", lambda: intrinsics.compare(fit(CHARUCO, 1), OTHER)),
     ("factory: got IntrinsicsR.*, want Int", lambda: intrinsics.compare(*[fit(CHARUCO, 1)] * 2)),
 )

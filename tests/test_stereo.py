@@ -190,20 +190,11 @@ def around(rng, n=30, more=0.0, times=1.0):
 
 ACROSS, OVER_TIME = np.arange(40), np.arange(30)[:, None, None]
 NOT_ONE_NOISE = {
-    "two surfaces": (
-        r"two surfaces, 4\d\.\d mm apart",
-        lambda r: around(r, more=0.05 * (ACROSS > 19)),
-    ),
+    "two surfaces": (r"surfaces, 4\d\.\d mm", lambda r: around(r, more=0.05 * (ACROSS > 19))),
     "a sliver of another": ("two surfaces, ", lambda r: around(r, more=0.05 * (ACROSS > 34))),
-    "two depths": (
-        "jump between two depths",
-        lambda r: around(r, more=0.004 * (r.random((30, 40, 40)) < 0.5)),
-    ),
+    "jumps": ("two depths", lambda r: around(r, more=4e-3 * (r.random((30, 40, 40)) < 0.5))),
     "an edge": ("between parts of the window", lambda r: around(r, times=1 + 6.0 * (ACROSS > 31))),
-    "a light switched off": (
-        "between times in the stack",
-        lambda r: around(r, times=1 + 1.5 * (OVER_TIME > 14)),
-    ),
+    "a light goes off": ("times in the", lambda r: around(r, times=1 + 1.5 * (OVER_TIME > 14))),
     "warming up": ("a drift that all pixels share", lambda r: around(r, more=2e-4 * OVER_TIME)),
     "tails": ("heavy tails", lambda r: tilted() + 6e-4 * r.standard_t(3, (30, 40, 40))),
 }
