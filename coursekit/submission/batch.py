@@ -680,6 +680,8 @@ def _finish(
     kept = {"tables": tables, "state": state, "chosen": chosen}
     texts[f"{ROWS}/{CLASS}"] = json.dumps(kept)
     notes = (*notes, *_set_aside(out, before))
+    if left := report.unread(lines):
+        notes = (*notes, say("submission.unread", many=counted(left, "paragraph")))
     if not (out / OWN_POINTS).exists():
         texts[OWN_POINTS] = report.own_table(lines, how.separator)
     for name, text in texts.items():
@@ -759,6 +761,9 @@ def _own_points(path: Path) -> list[dict[str, str]]:
         there = "who" in row and {*possible} & row.keys()
         want(there, path.name, [*row], "the columns who and paragraph, late or overrule")
         row["who"] = row["who"].removeprefix("'")
+        if report.CODE.fullmatch(row["who"]):  # two cells of a second marker: code and points
+            row["code"], row["who"] = row["who"], ""
+            row["paragraph"] = row.get("paragraph") or row.pop("student", "")
         row["student"] = row.get("student") or row["who"] or row.get("code", "")
         for column, (low, high) in possible.items():
             got = row.get(column, "")

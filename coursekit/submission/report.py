@@ -59,6 +59,7 @@ from coursekit.words import counted
 HEADER = (*HEADINGS["first"], *LABELS, *HEADINGS["last"])  # of grades.csv
 FAILED = ("timeout", "died", "memory", "error", "lost")  # reasons; tried anew by the next run
 NOTHING, GONE = WORDS["failed"]["missing"], WORDS["failed"]["gone"]
+CODE = re.compile("p[0-9a-f]{6}")  # see `ReportLine.code`
 MOODLE_COLUMNS, CANVAS_COLUMNS, OWN_COLUMNS = (HEADINGS[k] for k in ("moodle", "canvas", "own"))
 FORMULA = tuple("=+-@\t\r\n＝＋－＠")  # what makes a spreadsheet calculate a cell
 HERE = Path(__file__).parent
@@ -278,9 +279,11 @@ def _own_rows(
     for row in sorted(own, key=lambda row: row["who"] not in roster.people):
         one = roster.people.get(row["who"]) or codes.get(row.get("code", ""))
         one = one or roster.named(row["student"], row["who"])
-        kept = row if one is None else found.setdefault(one.key, row)
+        if one is None or found.setdefault(one.key, row) is row:
+            continue
+        kept, row["student"], row["who"] = found[one.key], one.name, "another row of theirs counts"
         for column in OWN_COLUMNS[3:]:
-            if kept is not row and not kept.get(column):
+            if not kept.get(column) or kept[column] == row.get(column):
                 kept[column] = row.pop(column, "")
     return found
 
@@ -587,9 +590,15 @@ def class_page(
         changes=changes,
         named=named,
         namesakes=_namesakes(named),
-        unread=sum(bool(n.paragraph.strip()) and not n.own.get("paragraph") for n in counts),
+        unread=unread(counts),
         ranked=sorted(named, key=lambda line: (line.total is not None, line.total or 0.0)),
     )
+
+
+def unread(lines: Sequence[ReportLine]) -> int:
+    """How many paragraphs have no points of the instructor's."""
+    some = (line for line in lines if line.counts and line.points is not None)
+    return sum(bool(n.paragraph.strip()) and not n.own.get("paragraph") for n in some)
 
 
 def _namesakes(lines: Sequence[ReportLine]) -> set[str]:
