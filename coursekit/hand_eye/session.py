@@ -142,7 +142,7 @@ class HandEyeSession:
         if self.q is not None:
             off = np.abs(self.arm.forward(self.q) - self.T_base_gripper).max(axis=(1, 2))
             return self.q if float(np.median(off)) < BELONGS else None
-        arm = replace(self.arm, limits=self.arm.limits + [-BEYOND_RAD, BEYOND_RAD])
+        arm = replace(self.arm, limits=self.arm.limits + np.array([-BEYOND_RAD, BEYOND_RAD]))
         for some in (self.T_base_gripper[:5], self.T_base_gripper):  # of another arm five will do
             q, reached = arm.inverse(some)
             if not reached.all():

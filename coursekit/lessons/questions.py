@@ -341,7 +341,8 @@ SIDE_COLORS = {
 class Verdict:
     """A headline and a few lines; `named` is the misconception that was recognised, if one was.
 
-    others: why other answers are not right, collapsed on a page. In the texts *asterisks* set emphasis and `backticks` code.
+    others: why other answers are not right, collapsed on a page. In the texts *asterisks* set
+    emphasis and `backticks` code.
     """
 
     subject: str
