@@ -84,17 +84,17 @@ def held_out(
     """The gap between prediction and sight at poses that were not used for the fit.
 
     T_base_gripper (m, 4, 4), m, and seen as in a session, of the result's board and camera.
-    What the fit has learnt of the arm's own errors is applied: of joint offsets at q (m, 6), rad,
-    of what all poses share at fk, or as usual at q or at the angles that bring the arm there.
-    Compare its rms_px with the result's own: where it is much larger, X fits the noise of its
-    poses. Raises ValueError as a session does.
+    q (m, 6), rad, or fk for these poses apply what the fit has learnt of the arm's
+    own errors; without them the arm of a session with joint angles is taken at its word. Compare
+    its rms_px with the result's own: where it is much larger, X fits the noise of its poses. Raises
+    ValueError as a session does.
     """
     given, fit = result.session, result.refined
     about = given.board, given.intrinsics, q
     other = HandEyeSession(result.mount, T_base_gripper, seen, *about, arm=given.arm)  # type: ignore[arg-type]
     poses = other.T_base_gripper
     if fit is not None:
-        if fit.problem.guessed and fk is None:
+        if fit.problem.guessed and fk is None and (other.q is not None or given.q is None):
             fk = other.shared_errors
         poses = arm_poses_with(fit, replace(fit.problem, T_base_gripper=poses, q=other.q, fk=fk))
     expected = camera_board(poses, result.X, result.Y, result.mount)
