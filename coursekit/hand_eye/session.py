@@ -137,7 +137,7 @@ class HandEyeSession:
         """The arm's joint angles (n, 6), rad, at the arm poses; None where these are another arm's.
 
         Without q they are those that bring the arm there. Of four other arms' seven sessions in
-        `tests/real` the WidowX can take no more than a third of the poses.
+        `tests/real` the WidowX can take two poses in five at most.
         """
         if self.q is not None:
             off = np.abs(self.arm.forward(self.q) - self.T_base_gripper).max(axis=(1, 2))
