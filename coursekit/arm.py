@@ -28,7 +28,6 @@ Bending under load, temperature and wear are left out.
 from __future__ import annotations
 
 import json
-import math
 import zlib
 from dataclasses import dataclass, replace
 from functools import cache
@@ -184,23 +183,26 @@ class Arm:
         shape = targets.shape[:-2]
         targets = targets.reshape(-1, 4, 4)
         q, reached = np.zeros((len(targets), 6)), np.zeros(len(targets), bool)
-        starts: list[Floats] = []
+        starts = np.zeros((0, len(targets), 6))
         if elsewhere or start is None:
             low, high = self.limits.T
             more = np.random.default_rng(0).uniform(low, high, (IK_MORE_STARTS, 6))
             more *= [0.5, 1.0, 1.0, 1.0, 1.0, 1.0]  # joint_0 roughly towards the target
-            starts += [*self.starts, *more]
+            starts = np.tile(np.concatenate([self.starts, more])[:, None], (1, len(targets), 1))
+            starts[..., 0] += np.arctan2(targets[:, 1, 3], targets[:, 0, 3])
         if start is not None:
-            starts.insert(0, np.broadcast_to(_angles(start), (*shape, 6)).reshape(-1, 6))
-        towards = np.arctan2(targets[:, 1, 3], targets[:, 0, 3])
-        for begin in starts:
+            begin = np.broadcast_to(_angles(start), (*shape, 6)).reshape(1, -1, 6)
+            starts = np.concatenate([begin, starts])
+        for begins in (starts[:1], starts[1:]):  # most need one; the others try all at once
             open_ = np.flatnonzero(~reached)
-            if not open_.size:
+            if not open_.size or not len(begins):
                 break
-            q0 = np.broadcast_to(begin, q.shape)[open_].copy()
-            if begin.ndim == 1:
-                q0[:, 0] += towards[open_]
-            q[open_], reached[open_] = self._descend(targets[open_], q0)
+            tried = np.tile(targets[open_], (len(begins), 1, 1))
+            found, arrived = self._descend(tried, begins[:, open_].reshape(-1, 6))
+            arrived = arrived.reshape(len(begins), -1)
+            first = arrived.argmax(axis=0), np.arange(open_.size)
+            q[open_] = found.reshape(*arrived.shape, 6)[first]
+            reached[open_] = arrived[first]
         return q.reshape(*shape, 6), reached.reshape(shape)
 
     def _descend(self, targets: Floats, q: Floats) -> tuple[Floats, Mask]:
@@ -363,38 +365,6 @@ def fk_covariance(
     )
     each = loose @ np.swapaxes(loose, -1, -2)
     return FkErrors(np.concatenate(columns, axis=-1), sigma, names, each)
-
-
-def upright_errors(T_base_gripper: ArrayLike, errors: ArmErrors | None = None) -> FkErrors:
-    """What poses (..., 4, 4), m, of any arm on a vertical first axis may all be wrong by.
-
-    For arms whose joint angles nobody knows. The arm may turn and shift as a whole about its base,
-    and the gripper by itself: a hand-eye session takes either for X or Y, and no residual tells.
-    Turns about the horizontal axis across the reach do show, at the shoulder, where half of what
-    the elbow does is counted, and at the wrist; they tell how large this arm's errors are. errors:
-    the sizes, the course's unless given.
-
-    >>> upright_errors([np.eye(4)]).shared.shape
-    (1, 6, 14)
-    """
-    T, errors = np.asarray(T_base_gripper, float), errors or ArmErrors()
-    R, t = T[..., :3, :3], T[..., :3, 3]
-    across = np.cross([0.0, 0.0, 1.0], t)[..., None]
-    across /= np.maximum(np.linalg.norm(across, axis=-2, keepdims=True), 1e-12)
-    base = np.broadcast_to(np.eye(3), R.shape)
-    axes = np.concatenate([base, across, across, R], axis=-1)
-    lever = np.where(np.arange(8) < 4, t[..., None], 0.0)  # about the base, or the gripper's origin
-    turns = np.concatenate([axes, np.cross(axes, lever, axis=-2)], axis=-2)
-    shifts = np.concatenate([np.zeros((*R.shape[:-1], 6)), np.concatenate([base, R], -1)], axis=-2)
-    joint, link = math.hypot(errors.offset_rad, errors.play_rad), errors.link_rad
-    sizes = {"rx of the base": link, "ry of the base": link}
-    sizes |= {"rz of the base": math.hypot(joint, link)}
-    sizes |= {"turn of the shoulder": 1.25**0.5 * joint, "turn of the wrist": 2**0.5 * joint}
-    sizes |= {f"r{axis} of the gripper": joint for axis in "xyz"}
-    sizes |= {f"{axis} of the base": errors.link_m for axis in "xyz"}
-    sizes |= {f"{axis} of the gripper": 2 * errors.link_m for axis in "xyz"}
-    shared, sigma = np.concatenate([turns, shifts], axis=-1), np.array(list(sizes.values()))
-    return FkErrors(shared, sigma, tuple(sizes), np.zeros((*R.shape[:-2], 6, 6)))
 
 
 def _by_link(frames: Floats, T: Floats) -> Floats:

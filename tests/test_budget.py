@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from common import WIDE as LENS
-from common import derivative, each, named, refusals
+from common import WIDE, derivative, each, named, refusals
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
@@ -17,7 +16,7 @@ from coursekit.stereo import depth_noise
 
 TURNED = np.eye(4)
 TURNED[:3, :3] = Rotation.from_rotvec([0.4, -1.9, 0.7]).as_matrix()
-SOMEWHERE = eb.View(LENS, 0.52, 0.05, 703.0, 88.0, TURNED)
+SOMEWHERE = eb.View(WIDE, 0.52, 0.05, 703.0, 88.0, TURNED)
 
 
 # --- the lesson's example ---
@@ -243,6 +242,14 @@ def test_what_to_fix_first() -> None:
     assert by_name["pixel"].worst_case_m == 0.0
     assert by_name["pixel"].noise_m > 0.0
     assert str(turn).startswith("halve hand-eye rotation:     +")
+
+
+def test_closing_rows_scatter_as_drawn_rigs_do() -> None:
+    mine = eb.hand_over().budget(subtract_depth_bias=True).at(distance_m=0.7)
+    rows = [r for r in mine.closing_rows().values() if r[3] == "bias"]
+    squares = [(a * a + a * b + b * b) / (9 if toward is None else 3) for a, b, toward, _ in rows]
+    drawn = 1000 * mine.draw(100_000).along_m[:, 0]
+    assert math.sqrt(sum(squares)) == pytest.approx(drawn.std(), rel=0.03)
 
 
 def test_what_to_fix_first_when_all_succeed() -> None:

@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from common import NIGHTLY, derivative
-from common import WIDE as LENS
+from common import NIGHTLY, WIDE, derivative
 from scipy.spatial.transform import Rotation
 
 import coursekit.budget as eb
@@ -65,7 +64,7 @@ def exact(where: eb.Chain, names: tuple[str, ...], e: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
-@pytest.mark.parametrize(("camera", "p"), [(LESSON_CAMERA, 4), (LENS, 9)])
+@pytest.mark.parametrize(("camera", "p"), [(LESSON_CAMERA, 4), (WIDE, 9)])
 def test_jacobian_is_the_derivative(mount: str, camera: Intrinsics, p: int) -> None:
     where, names = chain(mount, camera, 0.5, 701.0, 92.0), PARAMETERS[:p]
     numerical = derivative(lambda e: exact(where, names, e), 1e-6, 15 + p)
@@ -75,7 +74,7 @@ def test_jacobian_is_the_derivative(mount: str, camera: Intrinsics, p: int) -> N
 @pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
 def test_displacements_are_those_of_the_composed_transforms(mount: str) -> None:
     """Errors of every part at once, and large: 10 degrees of turn, 10 mm of depth, a wrong lens."""
-    where = chain(mount, LENS, 0.5, 701.0, 92.0)
+    where = chain(mount, WIDE, 0.5, 701.0, 92.0)
     given = errors(0.5, 10.0, lens=True)
     all_of_it = replace(given, depth_sigma_m=0.01, arm=100 * np.asarray(given.arm))
     drawn = scaled_root(all_of_it.joint) @ np.random.default_rng(5).standard_normal((24, 30))
@@ -97,7 +96,7 @@ def test_first_order_over_the_working_volume(mount: str, Z: float) -> None:
 def test_first_order_with_a_lens() -> None:
     """Within 1 % of a million; of fewer, within four standard errors of a variance more."""
     n = 1_000_000 if NIGHTLY else 200_000
-    where = chain("eye_in_hand", LENS, 0.45, 40.0, 30.0)
+    where = chain("eye_in_hand", WIDE, 0.45, 40.0, 30.0)
     check = eb.check_first_order(where, errors(0.45, 1.0, lens=True), n)
     assert check.n == n
     assert check.worst < 0.01
@@ -106,15 +105,15 @@ def test_first_order_with_a_lens() -> None:
 
 def test_a_lens_that_folds_has_no_ray() -> None:
     """k3 so uncertain that some drawn lenses turn back before the corner: NaN, not a number."""
-    where = chain("eye_to_hand", LENS, 0.45, 10.0, 10.0)
+    where = chain("eye_to_hand", WIDE, 0.45, 10.0, 10.0)
     wild = eb.Covariances(names=("k3",), intrinsics=[[0.05**2]])
     samples = eb.monte_carlo(where, wild, 2000)
     lost = np.isnan(samples).any(axis=1)
     assert 0 < lost.mean() < 0.3
     assert eb.check_first_order(where, wild, 2000).n == 2000 - lost.sum()
-    drawn = LENS.coeffs[4] + 0.05 * np.random.default_rng(0).standard_normal(2000)
-    seen = (np.array([10.0, 10.0]) - LENS.K[:2, 2]) / LENS.K[[0, 1], [0, 1]]
-    has_ray = [undistort(seen, (*LENS.coeffs[:4], k3))[1] for k3 in drawn[:300]]
+    drawn = WIDE.coeffs[4] + 0.05 * np.random.default_rng(0).standard_normal(2000)
+    seen = (np.array([10.0, 10.0]) - WIDE.K[:2, 2]) / WIDE.K[[0, 1], [0, 1]]
+    has_ray = [undistort(seen, (*WIDE.coeffs[:4], k3))[1] for k3 in drawn[:300]]
     assert (~lost[:300] == np.array(has_ray)).mean() > 0.99
 
 

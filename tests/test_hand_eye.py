@@ -106,7 +106,7 @@ def test_bad_input_names_the_argument_and_the_index():
         ({"method": "park", "free_scale": True}, r"method: got 'park', want 'refine' with free_sc"),
         ({"method": "park", "guess": known.X}, r"method: got 'park', want 'refine' with guess"),
         ({"free_offsets": True}, r"q: got None, want joint angles"),
-        ({"fk": "uprigth"}, r"fk: got 'uprigth', want 'usual', 'upright'"),
+        ({"fk": "usuall"}, r"fk: got 'usuall', want 'usual', None or FkErrors"),
     ):
         with pytest.raises(ValueError, match=message):
             known.solve(**options)

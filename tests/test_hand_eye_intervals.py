@@ -58,8 +58,7 @@ def solved(
     session = replace(jittery(known, seed, **options).session, q=q)
     if of_poses:
         session = replace(session, seen=session.T_camera_board)
-    how = "upright" if kind == "zeros, no joint angles" else "usual"
-    return session.solve(fk=how), session, known.X
+    return session.solve(), session, known.X
 
 
 CASES = [(kind, n) for kind in KINDS for n in (8, 15, 30)] if NIGHTLY else ORDINARY
@@ -79,8 +78,8 @@ def test_intervals_hold_whatever_the_arm_does_at_each_pose(kind, n, mount):
     least, most = (0.92, 0.98) if n == 8 else (0.93, 0.97)
     if kind.startswith("zeros"):
         least, most = 0.90, 0.98
-    if kind == "zeros, no joint angles":  # an arm before a fixed camera shows little of its zeros
-        least, most = 0.85, 0.99
+    if kind == "zeros, no joint angles" and mount == "eye_to_hand":
+        least = 0.88  # a tenth of these poses is taken with other joints than inverse() finds first
     assert least - SLACK <= np.mean(inside) <= most + SLACK
     if NIGHTLY:
         assert np.median(off) <= 1.02 * np.median(park)

@@ -1,8 +1,8 @@
 """Minutes that a notebook's core takes: `python -m tools.core_time` prints them by section.
 
-A student reads 200 words a minute, what is printed and what is collapsed as well, and takes 1.5
-minutes for a checkpoint, 5 for an exercise and 1 for a figure. What is marked deeper or comes after
-the core's end is not in.
+A student reads 200 words a minute, what is printed, what is collapsed and what a checkpoint says to
+the right answer as well, and takes 1.5 minutes for a checkpoint, 5 for an exercise and 1 for a
+figure. What is marked deeper or comes after the core's end is not in.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
+from coursekit.lessons import checkpoint
 from tools.build_notebooks import Cell, Notebook, find, joined, read
 
 WORDS_A_MINUTE, CHECKPOINT, EXERCISE, FIGURE = 200, 1.5, 5.0, 1.0
@@ -36,9 +37,11 @@ def minutes(cell: Cell) -> float:
     source = joined(cell["source"])
     if cell["cell_type"] == "markdown":
         return words(source) / WORDS_A_MINUTE
-    checkpoints, exercises = source.count("ck.checkpoint("), source.count("ck.check(")
-    if checkpoints or exercises:
-        return CHECKPOINT * checkpoints + EXERCISE * exercises
+    if asked := re.findall(r'ck\.checkpoint\("([\w.]+)"', source):
+        said = (checkpoint(name).explanation().lines for name in asked)
+        return sum(CHECKPOINT + words(" ".join(lines)) / WORDS_A_MINUTE for lines in said)
+    if exercises := source.count("ck.check("):
+        return EXERCISE * exercises
     shown = [
         output.get("data", {"text/plain": output.get("text", "")}) for output in cell["outputs"]
     ]

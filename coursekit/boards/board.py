@@ -27,6 +27,7 @@ from coursekit.words import ROOM_TEXTS, Listed, counted, say
 
 BoardKind = Literal["checkerboard", "charuco"]
 FEWEST_SQUARES = {"checkerboard": 4, "charuco": 3}  # OpenCV finds none with fewer corners than 3x3
+FEWEST_CORNERS = 6  # in an image that counts
 SMALLEST_SQUARE_M, LARGEST_SQUARE_M = 0.0005, 1.0  # who gives millimetres is told so
 MARKER_SHARE = 0.75  # of a square's side, unless the board says otherwise
 DICTIONARIES = tuple(

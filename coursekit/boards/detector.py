@@ -20,14 +20,20 @@ import cv2
 import numpy as np
 
 from coursekit.arrays import AnyArray, Grey, NDArray
-from coursekit.boards.board import Board, BoardNotFound, Detection, Detections, Skipped
+from coursekit.boards.board import (
+    FEWEST_CORNERS,
+    Board,
+    BoardNotFound,
+    Detection,
+    Detections,
+    Skipped,
+)
 from coursekit.boards.corners import blur_covariance, refine_corners, steps
 from coursekit.boards.explain import BLANK_GREY, explain
 from coursekit.boards.find import OFF_PLANE, find_corners, on_plane
 from coursekit.checks import want
 from coursekit.words import ROOM_TEXTS, counting, say
 
-FEWEST_CORNERS = 6
 SMALLEST_IMAGE_PX = 40  # shorter side of an image in which a board can be told
 NARROWEST = 40  # long sides to the short one
 MOST_PIXELS, MOST_BYTES = 250_000_000, 2_000_000_000  # more is no photograph

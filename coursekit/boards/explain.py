@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from coursekit.arrays import Floats, Grey, NDArray
-from coursekit.boards.board import DICTIONARIES, FEWEST_SQUARES, Board, OtherBoard
+from coursekit.boards.board import DICTIONARIES, FEWEST_CORNERS, FEWEST_SQUARES, Board, OtherBoard
 from coursekit.boards.find import checkerboard_seen, off_homography, real_beyond, shrunk
 from coursekit.words import ROOM_TEXTS, say
 
@@ -74,7 +74,7 @@ def explain(grey: Grey, board: Board, corners: int) -> str:
     if reason := _what_else(small, board):
         raise OtherBoard(say("boards.not_asked_for", asked=asked, reason=reason))
     if corners:
-        return say("boards.few_corners", corners=corners, asked=asked)
+        return say("boards.few_corners", corners=corners, asked=asked, least=FEWEST_CORNERS)
     if (width_px := _edges_px(small)) > BLURRED_PX:
         return say("boards.blurred", width_px=width_px)
     return say(f"boards.no_{board.kind}", board=board)

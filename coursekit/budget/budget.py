@@ -429,6 +429,18 @@ class ErrorBudget:
 
     # how often
 
+    def closing_rows(self) -> dict[str, tuple[float, float, tuple[int, int, int] | None, str]]:
+        """The rows as the exercise `add_up` takes them: low and high, mm, toward, kind, by name.
+
+        What a calibration found counts with its sigma along closing, any other row lies any way.
+        """
+        rows = {}
+        for row in self.rows:
+            sigma, ends = 500 * row.along_m[0], (1000 * row.low_m, 1000 * row.high_m)
+            known = (sigma, sigma, (1, 0, 0)) if row.term.normal else (*ends, None)
+            rows[row.term.name] = (*known, row.term.kind)
+        return rows
+
     def draw(
         self, n: int = 1_000_000, seed: int = 0, directions: Directions = "own", noise: bool = False
     ) -> Draws:

@@ -28,8 +28,8 @@ from scipy.spatial.transform import Rotation
 from coursekit import checks, results
 from coursekit.arrays import Bools, Floats, Image
 from coursekit.boards import Board, BoardNotFound, Detection, Detections, Skipped, detect
-from coursekit.boards.board import seen, slide_into_view
-from coursekit.boards.detector import FEWEST_CORNERS, SESSION
+from coursekit.boards.board import FEWEST_CORNERS, seen, slide_into_view
+from coursekit.boards.detector import SESSION
 from coursekit.boards.find import find_corners
 from coursekit.cameras.camera import Camera
 from coursekit.cameras.frames import CameraError

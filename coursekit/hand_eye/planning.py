@@ -91,12 +91,11 @@ def held_out(
     """
     given, fit = result.session, result.refined
     about = given.board, given.intrinsics, q
-    other = HandEyeSession(result.mount, T_base_gripper, seen, *about)  # type: ignore[arg-type]
+    other = HandEyeSession(result.mount, T_base_gripper, seen, *about, arm=given.arm)  # type: ignore[arg-type]
     poses = other.T_base_gripper
-    known = other.q is not None or not given.has_its_joints
     if fit is not None:
-        if fit.problem.guessed and fk is None and known:
-            fk = given.shared_errors(poses, other.q)
+        if fit.problem.guessed and fk is None and (other.q is not None or given.q is None):
+            fk = other.shared_errors
         poses = arm_poses_with(fit, replace(fit.problem, T_base_gripper=poses, q=other.q, fk=fk))
     expected = camera_board(poses, result.X, result.Y, result.mount)
     residuals = None

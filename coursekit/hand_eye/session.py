@@ -34,7 +34,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coursekit.arm import Arm, FkErrors, fk_covariance, upright_errors, widowx
+from coursekit.arm import Arm, FkErrors, fk_covariance, widowx
 from coursekit.arrays import ArrayLike, Floats, Integers
 from coursekit.boards import Board, Detection, Detections, detect_all
 from coursekit.boards.board import Skipped, why_unused
@@ -58,6 +58,7 @@ OPTIONAL = {"times": ("time",), "q": JOINTS, "dq": VELOCITIES}
 REPEATS = "repeats"  # how the reason begins for which a pair is left out by `once`
 # Arm poses no farther apart, rad and m, are one pose, if the board is not seen to move by more.
 SAME_POSE, SAME_SIGHT = (np.radians(0.1), 1e-3), (np.radians(3.0), 0.01)
+BEYOND_RAD = 0.3  # a joint's limit: where a pose that has an error may lie
 BELONGS = 0.03  # rad and m, between an arm pose and that of its joint angles: an arm may err so
 
 
@@ -131,23 +132,32 @@ class HandEyeSession:
             return np.stack([pose.T_camera_board for pose in self.board_poses])
         return self.seen
 
+    @cached_property
+    def joints(self) -> Floats | None:
+        """The arm's joint angles (n, 6), rad, at the arm poses; None where these are another arm's.
+
+        Without q they are those that bring the arm there. Of four other arms' seven sessions in
+        `tests/real` the WidowX can take two poses in five at most.
+        """
+        if self.q is not None:
+            off = np.abs(self.arm.forward(self.q) - self.T_base_gripper).max(axis=(1, 2))
+            return self.q if float(np.median(off)) < BELONGS else None
+        arm = replace(self.arm, limits=self.arm.limits + np.array([-BEYOND_RAD, BEYOND_RAD]))
+        for some in (self.T_base_gripper[:5], self.T_base_gripper):  # of another arm five will do
+            q, reached = arm.inverse(some)
+            if not reached.all():
+                return None
+        return q
+
     @property
-    def has_its_joints(self) -> bool:
-        """Whether the joint angles are those of the arm poses, roughly; not of another arm."""
-        if self.q is None:
-            return False
-        off = np.abs(self.arm.forward(self.q) - self.T_base_gripper).max(axis=(1, 2))
-        return float(np.median(off)) < BELONGS
+    def shared_errors(self) -> FkErrors | None:
+        """What the arm may be wrong by in all poses alike; None where it is not known which it is.
 
-    def shared_errors(self, T_base_gripper: Floats, q: Floats | None) -> FkErrors:
-        """What this arm may be wrong by in all poses (n, 4, 4) alike; q (n, 6): their joints.
-
-        Of the session's joints where they are its own and known, else those of any upright arm.
         What each pose has for itself is not in it: that is estimated.
         """
-        if q is None or not self.has_its_joints:
-            return upright_errors(T_base_gripper)
-        errors = fk_covariance(q, arm=self.arm)
+        if self.joints is None:
+            return None
+        errors = fk_covariance(self.joints, arm=self.arm)
         return replace(errors, each=np.zeros_like(errors.each))
 
     @property
@@ -429,7 +439,7 @@ def solve(
     *,
     free_scale: bool = False,
     free_offsets: bool = False,
-    fk: FkErrors | Literal["usual", "upright"] | None = "usual",
+    fk: FkErrors | Literal["usual"] | None = "usual",
     guess: ArrayLike | None = None,
 ) -> HandEyeResult:
     """Where the camera is, from arm poses and what the camera saw at each.
@@ -449,11 +459,9 @@ def solve(
     the board is than it says; free_offsets also estimates the offsets of the session's joint
     angles. fk: what the arm errs by in all poses alike: errors whose sizes are known
     (`arm.fk_covariance` at the session's q), None for none, or "usual": those of `ArmErrors`, as
-    large as the session shows them to be, where the arm poses are those of its joint angles.
-    "upright" is that for poses without joint angles, of an arm of the WidowX's class
-    (`arm.upright_errors`): zeros of the first and last joint move X and show in no pose, so that
-    without it the intervals hold only what the poses show. guess (4, 4): an X to start from, in
-    place of the closed form.
+    large as the session shows them to be, where its arm can take all poses (`joints`). Zeros of the
+    first and last joint move X and show in no pose, so that of another arm the intervals hold only
+    what the poses show. guess (4, 4): an X to start from, in place of the closed form.
 
     Raises ValueError that names the argument for fewer than three poses and for images without a
     pose; NotDetermined where the arm did not turn about two axes; SolverFailed where a solver's
@@ -466,8 +474,8 @@ def solve(
     """
     choice("method", method, METHODS)
     stated = fk if isinstance(fk, FkErrors) else None
-    known = fk is stated or (isinstance(fk, str) and fk in ("usual", "upright"))
-    want(known, "fk", fk, "'usual', 'upright', None or FkErrors")
+    known = fk is stated or (isinstance(fk, str) and fk == "usual")
+    want(known, "fk", fk, "'usual', None or FkErrors")
     asked = {"free_scale": free_scale, "free_offsets": free_offsets, "fk": stated, "guess": guess}
     for name, value in asked.items():
         refined = value is None or value is False or method == "refine"
@@ -480,10 +488,6 @@ def solve(
         counts = session.first_alike == np.arange(n)
         stated = replace(stated, shared=stated.shared[counts], each=stated.each[counts])
     session = session.once
-    if fk == "upright":
-        want(not session.has_its_joints, "fk", fk, "'usual': the joint angles are known")
-        free = poses.observability(session.T_base_gripper, session.mount).free
-        want(not free, "fk", fk, "None: the poses leave X free, and tell nothing of the arm")
     n = len(session)
     want(n >= FEWEST_POSES, "T_base_gripper", n, f"at least {FEWEST_POSES} poses that differ")
     first = "closed_form" if method == "refine" else method
@@ -494,9 +498,9 @@ def solve(
     seen: views.Views = views.PoseViews(measured, np.zeros((n, 6, 6)))
     if session.detections is not None:
         seen = session.corners(session.corner_sigma_px)
-    guessed = not free_offsets and (fk == "upright" or (fk == "usual" and session.has_its_joints))
+    guessed = fk == "usual" and not free_offsets and session.joints is not None
     if guessed:
-        stated = session.shared_errors(session.T_base_gripper, session.q)
+        stated = session.shared_errors
     given = session.T_base_gripper, session.mount, seen
     problem = refinement.Problem(*given, free_scale, arm, q, stated, guessed)
     best = refinement.refine(problem, X, Y, measured)
@@ -818,7 +822,7 @@ class HandEyeResult(Estimate):
     @property
     def _of_poses_alone(self) -> bool:
         """Whether nothing allows for what an arm errs by in every pose."""
-        return self._fit.problem.fk is None and not self.session.has_its_joints
+        return self._fit.problem.fk is None and self.session.joints is None
 
     @property
     def _untold(self) -> str:

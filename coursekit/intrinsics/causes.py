@@ -39,10 +39,11 @@ import numpy as np
 from coursekit import causes as engine
 from coursekit.arrays import Floats, Mask, NDArray
 from coursekit.boards import Detection, Detections
+from coursekit.boards.board import FEWEST_CORNERS
 from coursekit.checks import want
 from coursekit.geometry import Intrinsics, distort, moved
 from coursekit.intrinsics import derivatives
-from coursekit.intrinsics.fit import MIN_CORNERS, IntrinsicsResult, evaluate
+from coursekit.intrinsics.fit import IntrinsicsResult, evaluate
 from coursekit.words import p_text, say
 
 BOW, HEIGHTS, FLEX = "bowed_board", "heights", "flexing_board"
@@ -574,7 +575,7 @@ def kept(model: Calibration, detections: Sequence[Detection]) -> Detections:
     for view in model.views:
         d = detections[view]
         mine = np.isin(d.ids, model.corners.ids[model.corners.view == view])
-        if mine.sum() >= MIN_CORNERS:
+        if mine.sum() >= FEWEST_CORNERS:
             left.append(replace(d, ids=d.ids[mine], pixels=d.pixels[mine]))
     return Detections(left)
 

@@ -17,14 +17,14 @@ import numpy as np
 
 from coursekit.arrays import ArrayLike, Floats
 from coursekit.boards import Board, Detection, Detections, Skipped
-from coursekit.boards.board import by_reason
+from coursekit.boards.board import FEWEST_CORNERS, by_reason
 from coursekit.causes import Accepted, CauseSearch, DiagnosisTexts, search
 from coursekit.checks import array, want
 from coursekit.geometry import fold_radius
 from coursekit.intrinsics import causes, fit
 from coursekit.intrinsics.causes import Calibration
 from coursekit.intrinsics.comparison import halves
-from coursekit.intrinsics.fit import MIN_CORNERS, MIN_VIEWS, CalibrationFailed, IntrinsicsResult
+from coursekit.intrinsics.fit import MIN_VIEWS, CalibrationFailed, IntrinsicsResult
 from coursekit.results import read_json
 from coursekit.specifications import DATA
 from coursekit.words import Finding, Findings
@@ -142,7 +142,8 @@ def _images(detections: Sequence[Detection], board: Board) -> tuple[list[Finding
     skipped: Sequence[Skipped] = getattr(detections, "skipped", ())
     if others:
         found.append(_TEXTS.finding("mixed_sizes", common=common, others=_listed(others)))
-    used = [i for i, d in enumerate(detections) if d.size == common and len(d.ids) >= MIN_CORNERS]
+    enough = [d.size == common and len(d.ids) >= FEWEST_CORNERS for d in detections]
+    used = [int(i) for i in np.flatnonzero(enough)]
     layout = _layout([detections[i] for i in used], board)
     refused = [s for s in skipped if s.kind == "other_board"]
     if not layout and len(refused) > len(used):  # the detector saw other squares in most images
@@ -153,7 +154,7 @@ def _images(detections: Sequence[Detection], board: Board) -> tuple[list[Finding
         return [*found, layout], used
     if len(used) < FEW_VIEWS:
         given = len(detections) + len(skipped)
-        figures = {"used": len(used), "given": given, "corners": MIN_CORNERS, "few": FEW_VIEWS}
+        figures = {"used": len(used), "given": given, "corners": FEWEST_CORNERS, "few": FEW_VIEWS}
         found.append(_TEXTS.finding("few_views", **figures))
     return found, used
 
@@ -448,7 +449,7 @@ def depth_scale(result: IntrinsicsResult, depth_m: Sequence[Floats]) -> tuple[fl
     for T, detection, measured in zip(poses, result.detections, depth_m, strict=True):
         predicted = result.points[detection.ids] @ T[2, :3] + T[2, 3]
         valid = np.isfinite(measured) & (np.asarray(measured) > 0)
-        if valid.sum() >= MIN_CORNERS:
+        if valid.sum() >= FEWEST_CORNERS:
             ratios.append(np.median(np.asarray(measured)[valid] / predicted[valid]))
     if len(ratios) < MIN_VIEWS:
         return None

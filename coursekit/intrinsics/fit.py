@@ -36,7 +36,7 @@ from scipy.spatial.transform import Rotation
 
 from coursekit.arrays import ArrayLike, Floats, NDArray
 from coursekit.boards import Board, Detection, Detections
-from coursekit.boards.board import check_detections
+from coursekit.boards.board import FEWEST_CORNERS, check_detections
 from coursekit.checks import array, choice, is_number, want
 from coursekit.geometry import Intrinsics, deproject, make_transform, project
 from coursekit.intrinsics import derivatives
@@ -52,7 +52,6 @@ MODELS = {
     "brown_conrady": ("k1", "k2", "p1", "p2", "k3"),
 }
 MIN_VIEWS = 3
-MIN_CORNERS = 6
 WIDE_FOCAL = 0.5  # of the width: 90 deg across
 LEAST_FOCAL = 0.05  # of the image's width: a field of view of 170 deg, no pinhole camera
 ITERATIONS = 1000  # nearly parallel boards need hundreds; OpenCV's own limit of 30 ends far away
@@ -380,7 +379,7 @@ def calibrate(
     fx = 600.0 px
     """
     choice("model", model, tuple(MODELS))
-    check_detections(detections, board, MIN_CORNERS, MIN_VIEWS)
+    check_detections(detections, board, FEWEST_CORNERS, MIN_VIEWS)
     points = board.points if points is None else points
     corners = array("points", points, board.points.shape, finite=True)
     width, height = size = detections[0].size

@@ -23,7 +23,7 @@ from coursekit import checks, results, words
 EXAMPLES = "0.37 or 150"  # of numbers, and no checkpoint's answer
 LENGTHS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 LETTERS = "ABCDEFGH"
-OTHERWISE = "*If you answered otherwise*"
+OTHERWISE = "Why not another answer?"
 
 
 class Option(NamedTuple):
@@ -76,9 +76,7 @@ class Checkpoint:
 
     def explanation(self) -> Verdict:
         """The verdict on the right answer, which says why every other one is wrong."""
-        right = self.judge(self.solution())
-        why, *others = right.lines
-        return replace(right, lines=(why, OTHERWISE, *others))
+        return self.judge(self.solution())
 
     def solution(self) -> Any:
         """The right answer."""
@@ -146,9 +144,9 @@ class Choice(Checkpoint):
             again = "Think again, and choose another."
             headline = f"{letter}, {chosen.text}: not this one."
             return Verdict(self.name, "wrong", headline, (chosen.why, again), named=letter)
-        others = [f"{k}, {o.text}: {o.why}" for k, o in options.items() if not o.right]
+        others = tuple(f"{k}, {o.text}: {o.why}" for k, o in options.items() if not o.right)
         headline = f"{letter}, {chosen.text}: right."
-        return Verdict(self.name, "right", headline, (chosen.why, *others))
+        return Verdict(self.name, "right", headline, (chosen.why,), others=others)
 
     def solution(self) -> str:
         return next(k for k, o in self.lettered().items() if o.right)
@@ -189,8 +187,8 @@ class Number(Checkpoint):
             return Verdict(self.name, "not attempted", say)
         said = f"{number:g} {self.unit}"
         if self._close(number, self.value):
-            others = [f"{c.value:g} {self.unit}: {c.why}" for c in self.classics]
-            return Verdict(self.name, "right", f"{said}: right.", (self.why, *others))
+            others = tuple(f"{c.value:g} {self.unit}: {c.why}" for c in self.classics)
+            return Verdict(self.name, "right", f"{said}: right.", (self.why,), others=others)
         slip = next((c for c in self.classics if self._close(number, c.value)), None)
         if not slip and any(self._close(number * factor, self.value) for factor in (1e-3, 1e3)):
             say = f"The digits are right. The answer is wanted in {self.unit}."
@@ -343,7 +341,8 @@ SIDE_COLORS = {
 class Verdict:
     """A headline and a few lines; `named` is the misconception that was recognised, if one was.
 
-    In the texts *asterisks* set emphasis and `backticks` code.
+    others: why other answers are not right, collapsed on a page. In the texts *asterisks* set
+    emphasis and `backticks` code.
     """
 
     subject: str
@@ -351,12 +350,18 @@ class Verdict:
     headline: str
     lines: tuple[str, ...] = ()
     named: str | None = None
+    others: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
-        return "\n".join([self.headline, *self.lines])
+        return "\n".join([self.headline, *self.lines, *self.others])
 
     def _repr_html_(self) -> str:
-        body = "".join(f"<div>{_markup(line)}</div>" for line in self.lines)
+        body, others = (
+            "".join(f"<div>{_markup(line)}</div>" for line in lines)
+            for lines in (self.lines, self.others)
+        )
+        if others:
+            body += f"<details><summary>{OTHERWISE}</summary>{others}</details>"
         return (
             f'<div style="border-left: 4px solid {SIDE_COLORS[self.kind]}; padding: 2px 0 2px 12px;'
             f' line-height: 1.4; max-width: 52em">'

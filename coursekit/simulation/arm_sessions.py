@@ -27,8 +27,8 @@ from scipy.spatial.transform import Rotation
 from coursekit.arm import ArmErrors, SimulatedArm, widowx
 from coursekit.arrays import Floats, Grey
 from coursekit.boards import Board, Detection, Detections, detect
-from coursekit.boards.board import seen
-from coursekit.boards.detector import FEWEST_CORNERS, SESSION
+from coursekit.boards.board import FEWEST_CORNERS, seen
+from coursekit.boards.detector import SESSION
 from coursekit.checks import choice, number, positive, want, whole
 from coursekit.geometry import invert_transform, make_transform, project, transform_points, turned
 from coursekit.hand_eye.poses import MOUNTS, Mount, camera_board

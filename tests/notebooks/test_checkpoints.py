@@ -54,4 +54,4 @@ def test_what_a_page_without_a_kernel_shows_is_what_the_checkpoint_says(checkpoi
     html = checkpoint.without_kernel()
     for mime, text in (("text/plain", repr(checkpoint)), ("text/html", html)):
         assert build_notebooks.joined(STORED[checkpoint.name][mime]) == text
-    assert "<em>If you answered otherwise</em>" in html
+    assert "<summary>Why not another answer?</summary>" in html

@@ -76,6 +76,7 @@ def test_a_verdict_tells_good_sessions_from_broken_ones(results, webcams):
     for name, result in results.items():
         assert result.judgement.trusted, name
         assert repr(result).count("(95 %") == 2
+        assert replace(result.session, q=None).joints is None  # no WidowX took these poses
         assert result.verdict().split(":")[0] in ("Good", "Usable with care", "Not good enough")
     for session in webcams.values():  # with exchanged rows and foreign images
         result = session.solve()
