@@ -128,7 +128,7 @@ def test_a_bad_file_is_named_and_replaced(folders, old: str, new: str, named: st
 
 
 def test_a_file_without_the_studio_exercise(folders: tuple[Path, Path]) -> None:
-    """Noise without bias: one row is the student's, the other the reference's."""
+    """Noise without bias: one row is the student's, the other the lesson's, no other unit's."""
     write(YOURS)
     results.save("02_depth_noise", YOURS, {"sigma_d": Quantity(0.05, "px", 0.01, "noise")})
     handed = hand_over(folders[1])
@@ -136,7 +136,7 @@ def test_a_file_without_the_studio_exercise(folders: tuple[Path, Path]) -> None:
     budget = handed.budget()
     assert budget["depth noise"].source.startswith("yours")
     assert budget["depth noise"].high == 0.05
-    assert budget["depth bias"].source.startswith("reference")
+    assert budget["depth bias"].source.startswith("the lesson")
     only = {"sigma_d": Quantity(0.05, "px"), "depth_bias_at_450_mm": Quantity(2.0, "mm", 0.25)}
     results.save("02_depth_noise", YOURS, only)
     assert at_object_mm(hand_over(folders[1]))["depth bias"] == pytest.approx((1.5, 2.5))

@@ -34,9 +34,10 @@ LESSON_SIGMA_D_PX = 0.08
 WRIST_DISTANCE_M = 0.25
 REFERENCE = DATA / "reference_results"
 MOUNT_TWIST = ("rx", "ry", "rz", "tx", "ty", "tz")
+BIAS = "depth_bias_fitted_at_450_mm|depth_bias_at_450_mm"
 NEEDED: dict[str, tuple[str, ...]] = {  # by notebook; "a|b": either
     "01_pinhole": ("depth_fx", "depth_fy", "depth_cx", "depth_cy"),
-    "02_depth_noise": ("sigma_d", "depth_bias_fitted_at_450_mm|depth_bias_at_450_mm"),
+    "02_depth_noise": ("sigma_d", BIAS),
     "03_intrinsics": ("fx", "fy", "cx", "cy"),
     "04_hand_eye": MOUNT_TWIST,
 }
@@ -273,8 +274,11 @@ class HandOver:
 
     def _depth_bias(self, subtracted: bool) -> ErrorTerm:
         """By the law s Z - o Z²/(f B) that notebook 2 fitted; a file that holds the bias at 0.45 m
-        alone has it taken for a scale, between a shift and what grows with Z²."""
-        name, notebook = NEEDED["02_depth_noise"][1], self["02_depth_noise"]
+        alone has it taken for a scale, between a shift and what grows with Z². Of a camera whose
+        bias nobody measured that of another unit says nothing: it is the lesson's range."""
+        name, notebook = BIAS, self["02_depth_noise"]
+        if name in notebook.lacks:
+            return lesson_terms(stated=False)[2]
         found, whose = notebook.result(name), notebook.whose(name)
         known = found.covariances.get(LAW)
         if known is None:
@@ -356,6 +360,8 @@ def _find(lesson: str, reference: Path) -> NotebookResult:
         yours, why = None, f"{file} {what}"
     if yours is None:
         return NotebookResult(lesson, None, stand_in, f"{lesson}: {why}; {comes_in}.")
+    if lacks == (BIAS,):
+        comes_in = "the lesson's range stays"
     but = f", but it {what}: for that, {comes_in}" if lacks else ""
     whose = NotebookResult(lesson, yours, stand_in, "").whose()
     return NotebookResult(lesson, yours, stand_in, f"{lesson}: {whose}{but}.", lacks)

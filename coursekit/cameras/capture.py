@@ -607,7 +607,7 @@ class LiveImage(Screen):
 
     def close(self) -> None:
         """The last image stays."""
-        legend = "The last image. Rings: the board; dots: the views before it."
+        legend = "The last image. Rings: the board; dots: views before; outline: what was wanted."
         self._words.value = f"{html.escape(self._said)} {legend}"
 
     def __repr__(self) -> str:

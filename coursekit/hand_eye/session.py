@@ -834,6 +834,8 @@ class HandEyeResult(Estimate):
         judged = self.judgement
         reasons = [*([judged.large] if judged.large else []), *judged.broken, *judged.weak]
         told = self.refined is not None and judged.trusted and math.isfinite(judged.worst_mm)
+        if told and not reasons and judged.worst_mm > GOOD_MM:
+            reasons = [SENTENCES.words["not_yet_good"].format(good=GOOD_MM)]
         if told and self._of_poses_alone:
             reasons.append(SENTENCES.words["poses_alone"])
         return "\n".join(map(wrapped, [self._head(), *(f"- {reason}" for reason in reasons)]))
