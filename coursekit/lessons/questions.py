@@ -187,7 +187,7 @@ class Number(Checkpoint):
             return Verdict(self.name, "not attempted", say)
         said = f"{number:g} {self.unit}"
         if self._close(number, self.value):
-            others = tuple(f"{c.value:g} {self.unit}: {c.why}" for c in self.classics)
+            others = tuple(f"{_short(c.value)} {self.unit}: {c.why}" for c in self.classics)
             return Verdict(self.name, "right", f"{said}: right.", (self.why,), others=others)
         slip = next((c for c in self.classics if self._close(number, c.value)), None)
         if not slip and any(self._close(number * factor, self.value) for factor in (1e-3, 1e3)):
@@ -209,7 +209,7 @@ class Number(Checkpoint):
         return math.isclose(number, value, rel_tol=self.tolerance, abs_tol=1e-12)
 
     def solution(self) -> float:
-        return self.value
+        return float(_short(self.value))
 
     def input_widget(self) -> Any:
         import ipywidgets
@@ -218,6 +218,11 @@ class Number(Checkpoint):
         style = {"description_width": "initial"}
         whole = {"continuous_update": False, "style": style}  # no half of a number is judged
         return ipywidgets.Text(placeholder="a number", description=says, **whole)
+
+
+def _short(value: float) -> str:
+    """A number with four digits, or all of a large one."""
+    return f"{value:.4g}" if abs(value) < 1e4 else f"{value:g}"
 
 
 def _readings(given: Any, unit: str) -> list[float]:
@@ -356,11 +361,9 @@ class Verdict:
         return "\n".join([self.headline, *self.lines, *self.others])
 
     def _repr_html_(self) -> str:
-        body, others = (
-            "".join(f"<div>{_markup(line)}</div>" for line in lines)
-            for lines in (self.lines, self.others)
-        )
-        if others:
+        body = "".join(f"<div>{_markup(line)}</div>" for line in self.lines)
+        if self.others:
+            others = "".join(f"<p>{_markup(line)}</p>" for line in self.others)
             body += f"<details><summary>{OTHERWISE}</summary>{others}</details>"
         return (
             f'<div style="border-left: 4px solid {SIDE_COLORS[self.kind]}; padding: 2px 0 2px 12px;'
