@@ -69,15 +69,16 @@ def between_fingers(
     for side in (-1, 1):
         ax.bar(side * (opening / 2 + 4), 16, 8, -8, color=COLORS["block"])  # a finger
         ax.axvline(side * room, color=COLORS["ink"], ls="--", lw=1)
-    ax.plot(others[:, 0], others[:, 2], ".", ms=2, color=COLORS["ink"], alpha=0.5)
+    ax.plot(others[:, 0], others[:, 2], ".", ms=2, color=COLORS[KINDS["bias"]], alpha=0.7)
     values, vectors = np.linalg.eigh(flat)
     long, short = half = np.sqrt(CHI2_95_IN_A_PLANE * np.clip(values, 0, None))[::-1]
     turn = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
     ax.add_patch(Ellipse((bias[0], bias[2]), 2 * long, 2 * short, angle=turn, alpha=0.5,
-                         fc=COLORS["measured"], ec=COLORS["measured"], lw=2))  # fmt: skip
+                         fc=COLORS[KINDS["noise"]], ec=COLORS[KINDS["noise"]], lw=2))  # fmt: skip
+    ax.plot(bias[0], bias[2], "o", ms=5, color=COLORS[KINDS["bias"]], mec=COLORS["ink"])
     ax.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal",
            xlabel="closing (mm)", ylabel="lateral (mm)")  # fmt: skip
-    ax.set_title(f"from above: its centre must stay within ±{room:.1f} mm")
+    ax.set_title(f"from above: the centre must stay within ±{room:.1f} mm")
     lengths = {"width": width, "opening": opening, "room": room, "off": np.linalg.norm(bias)}
     return fig.saying("between_fingers", half=half, bias=bias, dots=len(others), **lengths)
 
