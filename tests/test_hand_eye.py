@@ -125,10 +125,9 @@ def around(T, twists):
     return np.stack([T @ turned(np.eye(4), twist) for twist in twists])
 
 
-def degenerate(kind):
+def degenerate(kind, noise=9):
     """A session of a wrist camera over a board, by what the arm does; X and Y."""
-    X, _ = typical("eye_in_hand")
-    T = widowx().forward([0.0, 1.2, 1.0, 0.2, 0.0, 0.0])
+    X, T = typical("eye_in_hand")[0], widowx().forward([0.0, 1.2, 1.0, 0.2, 0.0, 0.0])
     centre = make_transform(np.eye(3), -BOARD.points.mean(axis=0))
     Y = T @ X @ make_transform(np.eye(3), [0, 0, 0.35]) @ centre
     twists = np.zeros((25, 6))
@@ -139,7 +138,7 @@ def degenerate(kind):
     else:
         twists[:, :3] = np.radians(0.5) * np.random.default_rng(8).uniform(-1, 1, (25, 3))
     T = around(T, twists)
-    seen = corners_at(camera_board(T, X, Y, "eye_in_hand"), np.random.default_rng(9))
+    seen = corners_at(camera_board(T, X, Y, "eye_in_hand"), np.random.default_rng(noise))
     return he.HandEyeSession("eye_in_hand", T, seen, BOARD, LENS), X, Y
 
 
@@ -329,9 +328,10 @@ def test_a_proposal_is_within_the_limits_and_sees_the_board(mount):
 
 
 def test_after_one_axis_the_next_pose_turns_about_another():
-    session, X, Y = degenerate("one axis")
-    T, result = session.T_base_gripper, session.solve(guess=X)
-    assert "unknown in part" in repr(result)
+    for noise in (2, 3, 4, 9):  # where nothing is known, rounding has either sign
+        session, X, Y = degenerate("one axis", noise)
+        T, result = session.T_base_gripper, session.solve(guess=X)
+        assert repr(result).count("unknown in part") == 2
     middle = Y @ make_transform(np.eye(3), BOARD.points.mean(axis=0))
     orbit = middle @ turned(np.eye(4), np.array([0.35, 0, 0, 0, 0, 0])) @ invert_transform(middle)
     shifted = around(T[12], np.array([[0, 0, 0, 0.02, 0, 0], [0.1, 0, 0, 0, 0, 0]]))

@@ -21,6 +21,7 @@ from coursekit.hand_eye.poses import IN_METRES, SCATTER, by_X_and_Y, camera_boar
 from coursekit.hand_eye.refinement import arm_poses_with
 from coursekit.hand_eye.session import HandEyeResult, HandEyeSession
 from coursekit.hand_eye.views import PixelViews, board_gap, rms_length, view_residuals
+from coursekit.intrinsics.derivatives import scaled_inverse
 from coursekit.words import say, wrapped
 
 CORNER_PX = 0.1  # corner noise where no images have told
@@ -227,8 +228,5 @@ def _information(result: HandEyeResult, poses: Floats) -> Floats:
 
 def _worst_mm(information: Floats) -> Floats:
     """The standard deviation of X in its worst direction, mm, from informations (m, 12, 12)."""
-    scale = np.sqrt(np.einsum("mii->mi", information))
-    covariance = np.linalg.inv(information / (scale[:, :, None] * scale[:, None, :]))
-    covariance /= scale[:, :, None] * scale[:, None, :]
-    of_X = covariance[:, :6, :6] * IN_METRES[:, None] * IN_METRES
+    of_X = scaled_inverse(information)[:, :6, :6] * IN_METRES[:, None] * IN_METRES
     return 1e3 * np.sqrt(np.linalg.eigvalsh(of_X)[:, -1])

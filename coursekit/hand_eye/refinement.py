@@ -34,7 +34,7 @@ from coursekit.arrays import Floats
 from coursekit.geometry import cross_matrix, pose_difference, turned
 from coursekit.hand_eye.poses import Mount, by_arm_twist, by_X_and_Y, camera_board
 from coursekit.hand_eye.views import PoseViews, Views
-from coursekit.intrinsics.derivatives import scaled_inverse
+from coursekit.intrinsics.derivatives import scaled_inverse, scaled_root
 
 GAUSS_NEWTON_STEPS, STEP_HALVINGS = 50, 10
 NEGLIGIBLE_DECREASE = 1e-8  # of the sum of squares by a step: 1e-4 standard deviations
@@ -427,18 +427,23 @@ class _Scatter:
 
     @cached_property
     def covariance(self) -> Floats:
-        """Of the shared unknowns, (g, g), wider for what is not known of the sizes."""
+        """Of the shared unknowns, (g, g), wider for what is not known of the sizes.
+
+        Wider, never narrower: where the data say nothing, rounding has either sign.
+        """
         lost = np.tensordot(self._unsure, self._by_two, 2)
         moved = np.tensordot(self._unsure, self._by_size, 1)
         lost -= np.einsum("kab,kbc->ac", self._by_size, self._known @ moved)
-        return self._known + 2 * self._known @ lost @ self._known
+        added = self._known @ scaled_root(lost)
+        return self._known + 2 * added @ added.T
 
     @cached_property
     def dof(self) -> Floats:
         """Degrees of freedom (g,) that the variance of each of the shared unknowns rests on."""
         grows = np.einsum("ab,kbc,ca->ka", self._known, self._by_size, self._known, optimize=True)
         spread = np.einsum("ka,kl,la->a", grows, self._unsure, grows)
-        return np.maximum(2 * np.diag(self._known) ** 2 / np.maximum(spread, 1e-300), 1.0)
+        known = np.diag(self._known) ** 2
+        return np.maximum(2 * known / np.maximum(spread, 1e-12 * known), 1.0)
 
 
 # --- the fit ---

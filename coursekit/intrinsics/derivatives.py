@@ -255,14 +255,15 @@ class NormalEquations:
 
 
 def scaled_inverse(matrix: Floats) -> Floats:
-    """The inverse of a symmetric positive matrix whose rows have very different units.
+    """The inverse (..., p, p) of symmetric positive matrices whose rows have very different units.
 
     A direction that the data do not determine at all (to double precision) gets a variance that
     is huge, not an exception: that it is undetermined is what the reader must learn.
     """
     scale, values, vectors = _scaled_parts(matrix)
-    values = np.maximum(values, len(values) * np.finfo(float).eps * values[-1])
-    return (vectors / values) @ vectors.T / np.outer(scale, scale)
+    least = values.shape[-1] * np.finfo(float).eps * values[..., -1:]
+    inverse = (vectors / np.maximum(values, least)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    return inverse / (scale[..., :, None] * scale[..., None, :])
 
 
 def scaled_root(covariance: Floats) -> Floats:
@@ -276,8 +277,8 @@ def scaled_root(covariance: Floats) -> Floats:
 
 
 def _scaled_parts(matrix: Floats) -> tuple[Floats, Floats, Floats]:
-    """Scale (p,) that makes the diagonal 1, and eigenvalues and vectors of what is left."""
-    scale = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    """Scale (..., p) that makes diagonals 1, and eigenvalues and vectors of what is left."""
+    scale = np.sqrt(np.maximum(np.einsum("...ii->...i", matrix), 0.0))
     scale = np.where(scale > 0, scale, 1.0)
-    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
+    values, vectors = np.linalg.eigh(matrix / (scale[..., :, None] * scale[..., None, :]))
     return scale, values, vectors
