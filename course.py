@@ -136,6 +136,7 @@ COMPILE = ("tools/warm_up.py",)
 # A module's tests, and the cells of a notebook, stay together in one of the two processes.
 TWO_PROCESSES = ("-n", "2", "--dist", "loadscope", "--no-loadscope-reorder")
 PIP = ("-m", "ensurepip", "--default-pip")
+PIP_INSTALL = ("-m", "pip", "install", "--no-compile")  # as uv does: Python compiles what it uses
 STEPS = (
     Step("pip", "pip", python=PIP, without=NO_PIP),
     Step("course", "Packages", (COURSE,), (*HASHED, COURSE)),
@@ -288,7 +289,7 @@ def perform(step: Step, done: dict[str, str], live: bool | None = None) -> None:
     if code and step.pip and has_uv() and re.search(CERTIFICATE, output):
         print("uv does not trust this network; pip may have been told of it: once more with pip.")
         run_logged("pip", [str(PYTHON), *PIP])
-        code, output = run_logged(step.says, [str(PYTHON), "-m", "pip", "install", *step.pip])
+        code, output = run_logged(step.says, [str(PYTHON), *PIP_INSTALL, *step.pip])
     cause = explain(output)
     if code == 0:
         done[step.name] = fingerprint(step)
@@ -306,7 +307,7 @@ def command_of(step: Step) -> Iterator[str]:
     elif has_uv():
         yield from ("uv", "pip", "install", "--python", str(PYTHON), *step.pip)
     else:
-        yield from (str(PYTHON), "-m", "pip", "install", *step.pip)
+        yield from (str(PYTHON), *PIP_INSTALL, *step.pip)
 
 
 def require_ensurepip() -> None:
