@@ -235,7 +235,3 @@ def _doctor(options: argparse.Namespace) -> int:
 TYPES = {"int": int, "float": float, "lower": str.lower, "squares": _squares, "moment": _moment}
 RUNS = (_calibrate, _hand_eye, _record, _board, _submit, _grade, _export, _doctor)
 RUN = {run.__name__[1:].replace("_", "-"): run for run in RUNS}  # by the command's name
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -47,7 +47,7 @@ def room(name: str) -> str:
     return [*name.split("."), ""][1]
 
 
-MODULES = {module(path): path for path in FILES}
+MODULES = {module(path): path for path in FILES if path.stem != "__main__"}  # that is `cli`
 
 
 def imported(path: Path) -> Iterator[str]:

@@ -232,7 +232,7 @@ def test_ctrl_c_keeps_what_is_done_and_the_same_command_goes_on(tmp_path, capsys
     for i in range(400):  # more than is graded before it is looked at
         (folder / f"{i:03d}.zip").write_bytes((SAMPLES / "ada_good.zip").read_bytes())
     command = ["grade", str(folder), "--out", str(out)]
-    here = [sys.executable, "-m", "coursekit.cli", *command, "--workers", "2"]
+    here = [sys.executable, "-m", "coursekit", *command, "--workers", "2"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     running = subprocess.Popen(here, start_new_session=True, **pipes)
     deadline = time.monotonic() + 600  # however busy the machine is
