@@ -175,8 +175,9 @@ def uncertainty(results: Mapping[str, IntrinsicsResult], range_m: float) -> Less
         for text in lines.labelTexts:
             text.set_path_effects(edge)
         image_axes(ax, width, height)
-        ax.set_title(f"{name}: {np.nanmin(sigma):.2g} to {np.nanmax(sigma):.2g} px", fontsize=10)
-        texts.append(f"{name} from {np.nanmin(sigma):.3f} to {np.nanmax(sigma):.3f} px")
+        span = f"{np.nanmin(sigma):.2g} to {np.nanmax(sigma):.2g} px"
+        ax.set_title(f"{name}: {span}", fontsize=10)
+        texts.append(f"{name} from {span}")
     bar = fig.colorbar(shown, ax=axes, label="σ of a projected pixel (px)", shrink=0.9)
     plain_ticks(bar.ax.yaxis, LEVELS_PX)
     return fig.saying("uncertainty", range_m=range_m, each="; ".join(texts))

@@ -379,7 +379,7 @@ def _stack_print(stack: Stack) -> StackPrint:
         return named((), np.zeros((0, N_WAVES), np.int8))
     valid = counts > 0
     mean = counts.sum(axis=0) / np.maximum(valid.sum(axis=0), 1)
-    off = (counts - mean.astype(np.float32)) * valid
+    off = (counts.astype(np.float32) - mean.astype(np.float32)) * valid
     most = np.maximum(6 * np.median(np.abs(off), axis=(1, 2), keepdims=True), 3)
     off = np.clip(off, -most, most)
     off = off - off.mean(axis=(1, 2), keepdims=True)
