@@ -234,6 +234,7 @@ test_bad_input_is_named = refusals(
     fourth("the same corner twice", ids=np.zeros(len(IDS), int)),
     fourth("all its corners on one line", ids=LINE, pixels=np.ones((len(LINE), 2))),
     *each("detections: got 2 views, want at least 3", calibrated, "detections", VIEWS[:2]),
+    *each("got '8 views with the board in 1 place'", calibrated, "detections", 8 * [VIEWS[0]]),
     *each("model: got 'fisheye', want one of none, k1", calibrated, "model", "fisheye"),
     *each(r"guess: got \(1280, 720\), want the images' size", calibrated, "guess", OTHER),
     *each(r"points: got shape \(3, 3\), want \(40, 3\)", calibrated, "points", np.eye(3)),

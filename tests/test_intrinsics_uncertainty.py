@@ -94,6 +94,15 @@ def test_uncertainty_is_the_spread_over_repeated_sessions() -> None:
         np.testing.assert_allclose(np.std(spread, axis=0) / sigma, 1.0, atol=1.3 * tolerance)
 
 
+def test_copies_of_views_say_no_more_than_the_views() -> None:
+    eight = [*corner_session(CHARUCO, LENS, 4)[0]][:8]
+    once, copied = (intrinsics.calibrate(v, CHARUCO, guess=LENS) for v in (eight, 6 * eight))
+    np.testing.assert_allclose(copied.covariance, once.covariance, rtol=1e-3)
+    assert copied.dof == pytest.approx(once.dof)
+    assert "8 views that differ" in copied.verdict()
+    assert intrinsics.diagnose(6 * eight, CHARUCO).names[0] == "few_views"
+
+
 # --- the functions ---
 
 

@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from coursekit.arrays import Floats
+from coursekit.arrays import ArrayLike, Floats
 from coursekit.geometry import Intrinsics, distort, distortion_jacobian
 
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
@@ -214,9 +214,10 @@ class NormalEquations:
             gradients.append(left.T @ self.residuals[rows])
         return np.stack(information), np.stack(gradients)
 
-    def scatter(self, p: int) -> Scatter:
+    def scatter(self, p: int, first: ArrayLike | None = None) -> Scatter:
         """How the first p shared parameters scatter from view to view; all g get a covariance.
 
+        first (n,): for each view the first one that is the same again; together these count as one.
         The views' gradients say it, whatever the residuals of one view have in common: half of
         each variance is the parameter's own, by a jackknife in which each view in turn keeps an
         n-th of its weight; half is the `shared_covariance` times what all p agree on. That is right
@@ -225,6 +226,9 @@ class NormalEquations:
         samples" (2002).
         """
         V, (information, gradients) = self.shared_covariance, self.parts
+        if first is not None:
+            together = np.unique(first)[:, None] == np.asarray(first)
+            information, gradients = np.tensordot(together, information, 1), together @ gradients
         moves = gradients @ V  # what each view adds to the parameters, (n, g)
         least = np.eye(len(V)) - (1.0 - 1.0 / len(moves)) * information @ V
         without = np.linalg.solve(least, gradients[..., None])[..., 0] @ V

@@ -152,6 +152,8 @@ def _images(detections: Sequence[Detection], board: Board) -> tuple[list[Finding
         layout = _TEXTS.finding("other_squares_seen", **figures)
     if layout:
         return [*found, layout], used
+    first = fit.first_alike([detections[i] for i in used])
+    used = [used[i] for i in np.unique(first)]  # a picture that is there again says nothing new
     if len(used) < FEW_VIEWS:
         given = len(detections) + len(skipped)
         figures = {"used": len(used), "given": given, "corners": FEWEST_CORNERS, "few": FEW_VIEWS}

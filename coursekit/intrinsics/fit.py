@@ -40,7 +40,7 @@ from coursekit.boards.board import FEWEST_CORNERS, check_detections
 from coursekit.checks import array, choice, is_number, want
 from coursekit.geometry import Intrinsics, deproject, make_transform, project
 from coursekit.intrinsics import derivatives
-from coursekit.words import Estimate, say, wrapped
+from coursekit.words import Estimate, counted, say, wrapped
 
 Fixed = Literal["world", "camera"]
 
@@ -52,6 +52,7 @@ MODELS = {
     "brown_conrady": ("k1", "k2", "p1", "p2", "k3"),
 }
 MIN_VIEWS = 3
+ALIKE = 0.005  # of the image's width, by which a board moves that nobody moved
 WIDE_FOCAL = 0.5  # of the width: 90 deg across
 LEAST_FOCAL = 0.05  # of the image's width: a field of view of 170 deg, no pinhole camera
 ITERATIONS = 1000  # nearly parallel boards need hundreds; OpenCV's own limit of 30 ends far away
@@ -161,7 +162,7 @@ class IntrinsicsResult(Estimate):
 
     @cached_property
     def _scatter(self) -> derivatives.Scatter:
-        return self.equations.scatter(len(self.names))
+        return self.equations.scatter(len(self.names), first_alike(self.detections))
 
     @cached_property
     def covariance(self) -> Floats:
@@ -365,9 +366,10 @@ def calibrate(
     leads nowhere takes a focal length as long as the image is wide, then half that. points (N, 3):
     where the board's corners really are, m, in place of `board.points` (a measured or bowed board).
     One thread, so that a second run gives the same bits.
-    Raises ValueError that names the view for fewer than 3 views, fewer than 6 corners or all of
-    them on a line, corners that the board does not have, NaN, and images of different sizes; and
-    CalibrationFailed where the solver finds no finite camera.
+    Raises ValueError that names the view for fewer than 3 views that differ (pictures of a board
+    that stayed where it was are one), fewer than 6 corners or all of them on a line, corners that
+    the board does not have, NaN, and images of different sizes; and CalibrationFailed where the
+    solver finds no finite camera.
 
     >>> from coursekit.geometry import project
     >>> lens = Intrinsics(640, 480, 600, 600, 320, 240)
@@ -380,6 +382,9 @@ def calibrate(
     """
     choice("model", model, tuple(MODELS))
     check_detections(detections, board, FEWEST_CORNERS, MIN_VIEWS)
+    places = len(set(first_alike(detections)))
+    got = f"{len(detections)} views with the board in {counted(places, 'place')}"
+    want(places >= MIN_VIEWS, "detections", got, f"at least {MIN_VIEWS} places: move the board")
     points = board.points if points is None else points
     corners = array("points", points, board.points.shape, finite=True)
     width, height = size = detections[0].size
@@ -604,6 +609,23 @@ def coverage(detections: Sequence[Detection], cells: tuple[int, int] = (6, 8)) -
     return Coverage(counts.astype(np.intp), margins, float(outermost / np.linalg.norm(size / 2)))
 
 
+def first_alike(detections: Sequence[Detection]) -> NDArray[np.intp]:
+    """For each view the first one with the board in the same place, (n,): itself if it is new.
+
+    A burst, or a copy of a file, brings one error of the pose and the board many times.
+    """
+    first, last = np.arange(len(detections)), max((int(d.ids.max()) for d in detections), default=0)
+    at = np.full((len(detections), last + 1, 2), np.nan)
+    for i, view in enumerate(detections):
+        at[i, view.ids] = view.pixels
+        moved = np.linalg.norm(at[:i] - at[i], axis=2)
+        both = np.isfinite(moved).sum(axis=1)
+        far = np.nansum(moved, axis=1) / np.maximum(both, 1) > ALIKE * view.size[0]
+        if (alike := (both >= FEWEST_CORNERS) & ~far).any():
+            first[i] = first[alike.argmax()]
+    return first
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Tilts:
     """How the boards are turned out of the image plane.
@@ -642,14 +664,15 @@ def tilts(result: IntrinsicsResult) -> Tilts:
 
 def _weaknesses(result: IntrinsicsResult) -> Iterator[str]:
     """What could be better about the views of a calibration, with what to do."""
-    views, seen = len(result.residuals), coverage(result.detections)
+    views, seen = len(set(first_alike(result.detections))), coverage(result.detections)
     about_x, about_y = tilts(result).spread_deg
     if result.folded_share:
         yield f"{folded_text(result.folded_share)[0]}; {_fewer_coefficients(result)}"
     if not result.converged:
         yield "the solver did not converge: remove views that are spoiled, or give a guess."
     if views < GOOD_VIEWS:
-        yield f"{views} views are few: take 20 to 40."
+        differ = " that differ" if views < len(result.detections) else ""
+        yield f"{views} views{differ} are few: take 20 to 40."
     if min(about_x, about_y) < GOOD_SPREAD_DEG:
         yield say("intrinsics.parallel", about_x=about_x, about_y=about_y)
     if seen.empty_sides:
