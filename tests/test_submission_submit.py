@@ -69,7 +69,7 @@ def test_what_is_kept_says_exactly_what_the_notebook_says(block, own_results):
 
     law = fitted(stats, camera.depth.fx, camera.baseline_m, camera.depth_scale_m)
     table = {
-        "depth_std_at_450_mm": Quantity(face.depth_std_mm, "mm", face.depth_std_error_mm, "noise"),
+        "depth_std_at_450_mm": Quantity(face.depth_std_mm, "mm", face.depth_std_error_mm, "noise")
     }
     assert keep(camera, [one], table, law, [0.7], 0.001, 0.06) == own_results / MEASURED
     found = load_measured()

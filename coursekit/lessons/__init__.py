@@ -7,13 +7,6 @@ file with its questions and objectives, facts of its exercises, and what is said
 
 from __future__ import annotations
 
-from coursekit.lessons.overview import (
-    CHECKPOINTS,
-    EXERCISES,
-    LESSONS,
-    check,
-    checkpoint,
-    evidence,
-)
+from coursekit.lessons.overview import CHECKPOINTS, EXERCISES, LESSONS, check, checkpoint, evidence
 
 __all__ = ["CHECKPOINTS", "EXERCISES", "LESSONS", "check", "checkpoint", "evidence"]

@@ -46,14 +46,7 @@ from tqdm.auto import tqdm
 from coursekit import results
 from coursekit.checks import positive, want, whole
 from coursekit.submission import report
-from coursekit.submission.flags import (
-    Roster,
-    as_json,
-    class_table,
-    grouped,
-    place_of,
-    words_of,
-)
+from coursekit.submission.flags import Roster, as_json, class_table, grouped, place_of, words_of
 from coursekit.submission.format import DOCUMENTS, MANIFEST, NO_TEXT, TURNING_SIGNS, is_junk, slug
 from coursekit.submission.recompute import LABELS, grading_rules
 from coursekit.words import counted, say
