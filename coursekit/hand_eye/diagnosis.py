@@ -354,6 +354,8 @@ def _from_residuals(found: CauseSearch[MendedPairs], session: HandEyeSession) ->
         if step in odd[1:]:
             continue
         figures = _figures(step, found.model, session) | _change(step.before.fit, step.after.fit)
+        if step.test.cause == causes.SCALE and abs(figures["scale"]) < 2 * figures["half"]:
+            continue  # no board is of size 0: the two sides move without one another
         if odd:
             figures |= {"names": ", ".join(names), "left": odd[-1].after.fit.says()}
         left_handed = step.test.cause == causes.SCALE and found.model.scale < 0
