@@ -123,7 +123,7 @@ def difference_px(
     points = fit.points_at(pixels, range_m, first)
     weights = np.ones(len(pixels)) if weights is None else weights
     known = np.isfinite(points).all(axis=1) & (weights > 0)
-    weight = weights[known, None]
+    weight, homogeneous = weights[known, None], np.insert(points[known], 3, 1.0, axis=1).T
     free = 6 if math.isfinite(range_m) else 3
     T = np.eye(4)
     for _ in range(_GAUSS_NEWTON_STEPS):
@@ -134,7 +134,9 @@ def difference_px(
         residuals = (weight * (pixels[known] - seen)).ravel()
         twist = np.zeros(6)
         twist[:free] = derivatives.scaled_inverse(columns.T @ columns) @ (columns.T @ residuals)
-        T = moved(T[None], twist[None])[0]
+        while ((ahead := moved(T[None], twist[None])[0])[2] @ homogeneous <= 0).any():
+            twist /= 2  # no point goes behind the camera
+        T = ahead
         if np.abs(columns @ twist[:free]).max() < 1e-9 * weight.max():
             break
     moved_points = points @ T[:3, :3].T + T[:3, 3]

@@ -537,9 +537,12 @@ def projection_columns(
 
 
 def worst_direction(covariance: Floats) -> Floats:
-    """The standard deviation along the longer axis of covariances (..., 2, 2)."""
+    """The standard deviation along the longer axis of covariances (..., 2, 2).
+
+    Where one is rounding, of either sign, it is as large as what it hides.
+    """
     a, b, d = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
-    return np.sqrt((a + d) / 2 + np.hypot((a - d) / 2, b))
+    return np.sqrt(np.abs(a + d) / 2 + np.hypot((a - d) / 2, b))
 
 
 # --- what the views cover, and what a calibration lacks ---
