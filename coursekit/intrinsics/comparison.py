@@ -57,7 +57,7 @@ class HalvesDifference:
     def __repr__(self) -> str:
         length, wide = self.length_px, self.expected_px
         alone = "explains" if self.noise_p_value > 0.01 else "does not explain"
-        px, sigma = ({"median": np.nanmedian(m), "worst": np.nanmax(m)} for m in (length, wide))
+        px, sigma = map(fit.sizes_over, (length, wide))
         views = [len(half.residuals) for half in (self.first, self.second)]
         p = {"views": p_text(self.p_value), "noise": p_text(self.noise_p_value)}
         facts = {"views": views, "range_m": self.range_m, "px": px, "sigma": sigma, "p": p}
@@ -199,10 +199,10 @@ class Comparison:
     def __repr__(self) -> str:
         lines = ["fitted - factory:"]
         for name, difference, sigma in zip(self.names, self.differences, self.sigmas, strict=True):
-            off = f"{difference:+9.2f}" if name[0] in "fc" else f"{difference:+9.4f}"
-            lines.append(f"{name:>4} {off}, {difference / sigma:+6.1f} of its sigma")
+            off = f"{difference:+z9.2f}" if name[0] in "fc" else f"{difference:+z9.4f}"
+            lines.append(f"{name:>4} {off}, {difference / sigma:+z6.1f} of its sigma")
         maps = (self.difference_px, 1e3 * self.shift_m, 1e3 * self.expected_shift_m)
-        px, mm, sigma = ({"median": np.nanmedian(m), "worst": np.nanmax(m)} for m in maps)
+        px, mm, sigma = map(fit.sizes_over, maps)
         facts = {"p": p_text(self.p_value), "range_m": self.range_m, "px": px, "mm": mm}
         lines.append(say("intrinsics.apart", sigma=sigma, **facts))
         lines += fit.folded_text(float(np.isnan(self.shift_m).mean()))
