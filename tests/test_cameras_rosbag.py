@@ -181,8 +181,7 @@ def test_a_picture_of_depth_is_no_depth(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("model", "message"),
-    [("equidistant", "fisheye"), ("rational_polynomial", None)],
+    ("model", "message"), [("equidistant", "fisheye"), ("rational_polynomial", None)]
 )
 def test_a_lens_that_the_course_does_not_have_is_named(tmp_path, model, message):
     path = Driver(tmp_path / "a.bag").write(depth=raw, model=model)

@@ -10,12 +10,7 @@ import re
 import numpy as np
 import pytest
 from common import NIGHTLY, nightly
-from simulated_corners import (
-    beyond_session,
-    names_found,
-    ordinary_arm_session,
-    ordinary_session,
-)
+from simulated_corners import beyond_session, names_found, ordinary_arm_session, ordinary_session
 
 from coursekit import hand_eye, intrinsics
 from coursekit.geometry import pose_difference

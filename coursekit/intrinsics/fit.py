@@ -54,6 +54,7 @@ MODELS = {
 MIN_VIEWS = 3
 WIDE_FOCAL = 0.5  # of the width: 90 deg across
 LEAST_FOCAL = 0.05  # of the image's width: a field of view of 170 deg, no pinhole camera
+MOST_FOCAL = 1e3  # of it: 0.06 deg, beyond any telescope; boards without tilt lead there
 ITERATIONS = 1000  # nearly parallel boards need hundreds; OpenCV's own limit of 30 ends far away
 ARRIVED_SIGMAS = 0.1  # no combination of parameters would move more in the next step,
 ARRIVED_PX = 1e-4  # or no corner would (float32 corners: all that OpenCV's solver can do)
@@ -491,7 +492,8 @@ def _solve(
         raise CalibrationFailed(f"detections: OpenCV's solver gave up ({error.err})") from error
     finally:
         cv2.setNumThreads(threads)
-    if not all(np.isfinite(found).all() for found in (K, dist, *rotations, *translations)):
+    finite = all(np.isfinite(found).all() for found in (K, dist, *rotations, *translations))
+    if not finite or max(K[0, 0], K[1, 1]) > MOST_FOCAL * size[0]:
         raise CalibrationFailed("detections: the solver ran away to infinity; tilt the board more")
     places = zip(map(np.ravel, rotations), map(np.ravel, translations), strict=True)
     poses = np.stack([make_transform(Rotation.from_rotvec(r), t) for r, t in places])
