@@ -41,6 +41,15 @@ def say(sentence: str, /, **facts: Any) -> str:
     return str(ROOM_TEXTS[room][name].format(**facts))
 
 
+def up_to(size: float, most: float, digits: int = 2) -> str:
+    """A size, or "over 1000" where it is larger than `most`: what is not known has no digits.
+
+    >>> up_to(0.25, 1e3), up_to(float("inf"), 1e3)
+    ('0.25', 'over 1000')
+    """
+    return f"{size:.{digits}f}" if size < most else f"over {most:.0f}"
+
+
 def with_notes(text: str, notes: Sequence[str]) -> str:
     """Text, and below it, indented, what has to be said about it."""
     if not notes:

@@ -166,8 +166,7 @@ def test_auto_exposure_follows_the_distance_and_a_fixed_one_does_not():
 
 def test_noise_is_photons_plus_reading():
     """The photon transfer curve: variance against mean is a line of known slope and intercept."""
-    view = on_wall(D435, 1.0)
-    rng = np.random.default_rng(0)
+    view, rng = on_wall(D435, 1.0), np.random.default_rng(0)
     stack = np.stack([view.images(rng)[1] for _ in range(40)]).astype(np.float32)
     mean, variance = stack.mean(axis=0), stack.var(axis=0, ddof=1)
     bins = np.linspace(25, 180, 12)

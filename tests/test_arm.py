@@ -133,8 +133,7 @@ def test_an_arm_without_errors_is_the_drawing() -> None:
 
 def test_the_error_of_forward_kinematics_is_2_to_4_mm_and_depends_on_the_pose() -> None:
     """Over units and the workspace: the mean, and how much one unit's own error varies."""
-    arm = widowx()
-    rng = np.random.default_rng(5)
+    arm, rng = widowx(), np.random.default_rng(5)
     off: dict[str, list[np.ndarray]] = {"flange": [], "gripper": []}
     for unit in range(UNITS):
         robot = SimulatedArm(unit)

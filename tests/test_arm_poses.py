@@ -54,8 +54,7 @@ def test_careful_poses_see_the_board_and_turn_far(mount: str) -> None:
 @pytest.mark.parametrize("mount", MOUNTS)
 @pytest.mark.parametrize("design", ["grid", "single_axis", "small_rotations"])
 def test_stored_sets_are_allowed_and_as_degenerate_as_they_say(mount: str, design: str) -> None:
-    setup = default_setup(mount)
-    sets = poses.degenerate_poses(mount, design)
+    setup, sets = default_setup(mount), poses.degenerate_poses(mount, design)
     assert sets.shape == (degenerate_poses.VARIANTS, degenerate_poses.POSES, 6)
     for q in sets:
         check_allowed(setup, q)

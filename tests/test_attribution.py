@@ -171,8 +171,7 @@ def test_the_nearer_the_places_the_less_a_constant_is_blamed_on_the_calibration(
 
 def test_the_numbers_are_those_of_the_textbook():
     made = simulate_misses("calibration", 12, FIRST_SEED)
-    found = attribute(made.misses, made.T_base_gripper)
-    x = made.misses
+    found, x = attribute(made.misses, made.T_base_gripper), made.misses
     S = (x - x.mean(0)).T @ (x - x.mean(0)) / 11
     t2 = 12 * x.mean(0) @ np.linalg.inv(S) @ x.mean(0)
     assert found.evidence.mean.t2 == pytest.approx(t2, rel=1e-9)

@@ -1,5 +1,7 @@
 """The fit: against OpenCV, numerical derivatives, dense algebra, and bad input."""
 
+import re
+from contextlib import suppress
 from dataclasses import replace
 
 import cv2
@@ -84,6 +86,17 @@ def test_a_start_that_leads_nowhere_is_followed_by_a_plain_one():
     fit = intrinsics.calibrate(views, CHARUCO)
     assert fit.converged
     assert abs(fit.value("fx") - LENS.fx) < 3 * fit.sigma("fx") < 300
+
+
+def test_views_that_determine_nothing_get_no_absurd_figures():
+    """What they leave open is rounding of either sign, whose root was none."""
+    for noise in np.random.default_rng(3).normal(200, 0.1, (9, 3, 54, 2)):
+        seen = CHECKERBOARD.points[:, :2] * 1200 + noise
+        with suppress(intrinsics.CalibrationFailed):
+            views = [Detection(range(54), pixels, LENS.size) for pixels in seen]
+            fit = intrinsics.calibrate(views, CHECKERBOARD, "none", same_focal=True)
+            said = repr(fit) + fit.verdict() + repr(intrinsics.compare(fit, LENS))
+            assert not re.search(r"nan|inf\b|\d{7}", said)
 
 
 def test_a_fit_that_was_stopped_early_says_so(monkeypatch):
@@ -172,8 +185,7 @@ def test_covariances_are_from_the_inverse_of_the_whole_normal_matrix(result):
     whole = dense_jacobian(result)
     scale = np.linalg.norm(whole, axis=0)
     _, triangle = np.linalg.qr(whole / scale)
-    inverse = np.linalg.inv(triangle)
-    views = len(result.T_camera_board)
+    inverse, views = np.linalg.inv(triangle), len(result.T_camera_board)
     mean = block_diag(np.eye(9), np.tile(np.eye(6) / views, views))
     wanted = mean @ (inverse @ inverse.T / np.outer(scale, scale)) @ mean.T
     sigma = np.sqrt(np.diag(wanted))

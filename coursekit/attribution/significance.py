@@ -63,8 +63,8 @@ REPEATED_SHARE = 0.5  # of the trials in repeated places, from which a set is on
 class MeanTest:
     """p_value: of "the mean is zero", by both tests together; p_pooled by one, p_t2 by the other.
 
-    t2: Hotelling's, with p_t2 None where it cannot be had: under 4 trials and for scatter in a
-    plane. axes: how many the scatter really fills, 1 to 3.
+    t2: Hotelling's, with p_t2 None where it cannot be had: under 4 trials, and for scatter in a
+    plane or of rounding. axes: how many the scatter really fills, 1 to 3.
     """
 
     p_value: float
@@ -87,7 +87,7 @@ def mean_test(misses: Floats) -> MeanTest:
     else:
         p_pooled = 0.0 if squares > 0 else 1.0
     values = np.linalg.eigvalsh(S)
-    if n < 4 or values[0] <= SINGULAR * values[-1]:
+    if n < 4 or values[0] <= SINGULAR * values[-1] or values[-1] < ROUNDING_M**2:
         return MeanTest(min(1.0, p_pooled / POOLED_SHARE), p_pooled, axes)
     t2 = float(n * mean @ np.linalg.solve(S, mean))
     p_t2 = float(f.sf(t2 * (n - 3) / (3 * (n - 1)), 3, n - 3))

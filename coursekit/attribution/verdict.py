@@ -286,7 +286,7 @@ class Attribution:
         """The numbers behind the verdict, a line each, mm."""
         seen, pose, place = self.evidence, self.evidence.pose, self.evidence.places
         axes = ", ".join(
-            f"{axis} {1e3 * mean:+.1f} ({1e3 * low:+.1f} to {1e3 * high:+.1f})"
+            f"{axis} {1e3 * mean:+z.1f} ({1e3 * low:+z.1f} to {1e3 * high:+z.1f})"
             for axis, mean, (low, high) in zip("xyz", self.mean_m, self.interval_m, strict=True)
         )
         scatter = ", ".join(f"{1e3 * std:.1f}" for std in self.scatter_m)

@@ -21,6 +21,7 @@ First the terms, then their table and its sums.
 from __future__ import annotations
 
 import html
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -149,8 +150,8 @@ class ErrorTerm:
         """
         shown = _CONVERSIONS[self.along].shown
         if self.mean is not None:
-            pairs = zip(shown, self.mean, strict=True)
-            return ", ".join(f"{factor * value:+.2g} {unit}" for (unit, factor), value in pairs)
+            pairs = zip(itertools.cycle(shown), self.mean, strict=False)
+            return ", ".join(f"{factor * value:+z.2g} {unit}" for (unit, factor), value in pairs)
         unit, factor = ("σ", 1.0) if self.factor else shown[0]
         low, high = (f"{factor * value:.2g}" for value in (self.low, self.high))
         repeats = f", {factor * self.floor:.2g} stays" if self.floor else ""

@@ -167,7 +167,7 @@ class _Case:
         first, second, _ = known.turns_deg
         if seen > SMALL_DEG and seen > 5 * first:
             return False  # the camera saw larger turns than the arm tells of: a matter of units
-        axis = known.axis * np.sign(known.axis[np.argmax(np.abs(known.axis))]) + 0.0
+        axis = known.axis * np.sign(known.axis[np.argmax(np.abs(known.axis))])
         few = {"pure_translation": first < STILL_DEG, "small_rotations": first < SMALL_DEG}
         for key, too_few in (few | {"single_axis": second < SINGLE_DEG}).items():
             if too_few:

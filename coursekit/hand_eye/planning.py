@@ -125,10 +125,10 @@ class NextPose:
     then_mm: Floats
 
     def __repr__(self) -> str:
-        place = "({:.0f}, {:.0f}, {:.0f}) mm".format(*(1e3 * self.T_base_gripper[:3, 3] + 0.0))
+        place = f"({', '.join(f'{p:z.0f}' for p in 1e3 * self.T_base_gripper[:3, 3])}) mm"
         usable, joints = np.isfinite(self.then_mm).sum(), ""
         if self.q is not None:
-            angles = ", ".join(f"{angle:.1f}" for angle in np.degrees(self.q) + 0.0)
+            angles = ", ".join(f"{angle:z.1f}" for angle in np.degrees(self.q))
             joints = f",\n  joints ({angles}) deg"
         then = {"now": self.now_mm, "then": self.then_mm[self.index], "usable": usable}
         return say("hand_eye.next", place=place, joints=joints, **then)

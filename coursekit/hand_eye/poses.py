@@ -31,7 +31,7 @@ from scipy.spatial.transform import Rotation
 from coursekit.arrays import ArrayLike, Floats
 from coursekit.checks import array, choice, transform, transforms, want
 from coursekit.geometry import cross_matrix, invert_transform, make_transform
-from coursekit.words import say, wrapped
+from coursekit.words import say, up_to, wrapped
 
 Mount = Literal["eye_in_hand", "eye_to_hand"]
 MOUNTS: tuple[Mount, ...] = ("eye_in_hand", "eye_to_hand")
@@ -160,7 +160,7 @@ class Observability:
         known = np.minimum(self.sigma_mm, NOTHING_MM)[:, None] * self.directions
         turn, shift = known[:, :3] / 1e3, known[:, 3:]  # rad, mm: by direction, along each axis
         worst = np.degrees(np.linalg.norm(turn, axis=0).max()), np.linalg.norm(shift, axis=0).max()
-        deg, mm = (f"{s:.2f}" if s < 10 else f"{s:.0f}" if s < 1e4 else "over 10000" for s in worst)
+        deg, mm = (up_to(float(s), 1e4, 2 if s < 10 else 0) for s in worst)
         free = "; ".join(self.free)  # of what is free nothing is known, whatever the poses' noise
         sizes = {"rotation": f"{deg} deg", "translation": f"{mm} mm"}
         determined = [size for what, size in sizes.items() if what not in free]

@@ -47,7 +47,7 @@ from coursekit.geometry import Intrinsics, cross_matrix, pose_difference
 from coursekit.hand_eye import poses, refinement, views
 from coursekit.hand_eye.closed_form import CLOSED_FORMS, FEWEST_POSES, closed_form
 from coursekit.results import read_json, write_bytes, write_json
-from coursekit.words import Estimate, say, wrapped
+from coursekit.words import Estimate, say, up_to, wrapped
 
 SENTENCES = DiagnosisTexts.of("hand_eye")
 METHODS = ("refine", *CLOSED_FORMS)
@@ -784,10 +784,11 @@ class HandEyeResult(Estimate):
         for name in self.names[12:] if fit is not None else ():
             value, half = self.value(name), self.quantile() * self.sigma(name)
             if name == "scale":
-                lines.append(f"scale = {value:.5f} ± {half:.5f}{self._level}")
+                lines.append(f"scale = {value:.5f}{self._within(up_to(half, 10, 5))}")
             elif name.startswith("offset_"):
                 value, half = math.degrees(value), math.degrees(half)
-                lines.append(f"{name} = {round(value, 3) + 0.0:.3f} ± {half:.3f} deg{self._level}")
+                within = self._within(up_to(half, UNKNOWN_DEG, 3) + " deg")
+                lines.append(f"{name} = {value:z.3f}{within}")
         if self.session.repeated:
             lines.append(self.session.repeated)
         if self.free:
@@ -798,9 +799,9 @@ class HandEyeResult(Estimate):
 
     def _pose_line(self, name: str, T: Floats, first: int) -> str:
         """A pose with its intervals; first: where its twist begins in the covariance."""
-        place, turns = 1e3 * T[:3, 3] + 0.0, Rotation.from_matrix(T[:3, :3]).as_rotvec() + 0.0
-        turned = "turned ({:.2f}, {:.2f}, {:.2f})".format(*(np.degrees(turns) + 0.0))
-        one = f"({', '.join(f'{p:.2f}' for p in place)}) mm, {turned} deg"
+        place, turns = 1e3 * T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_rotvec()
+        turned = f"turned ({', '.join(f'{turn:z.2f}' for turn in np.degrees(turns))})"
+        one = f"({', '.join(f'{p:z.2f}' for p in place)}) mm, {turned} deg"
         if self.refined is None:
             return f"{name}: {one}"
         if len(self.session) < refinement.FEWEST_TOLD:
@@ -808,10 +809,15 @@ class HandEyeResult(Estimate):
         sigma = self.quantile() * np.sqrt(np.diag(self.covariance)[first : first + 6])
         wide, far = np.degrees(sigma[:3].max()), 1e3 * sigma[3:]
         if wide > UNKNOWN_DEG or far.max() > UNKNOWN_MM:
-            one = "({:.0f}, {:.0f}, {:.0f}) mm".format(*place)
+            one = f"({', '.join(f'{p:z.0f}' for p in place)}) mm"
             return f"{name}: unknown in part; one that fits: {one}"
-        where = ", ".join(f"{p:.2f} ± {s:.2f}" for p, s in zip(place, far, strict=True))
+        where = ", ".join(f"{p:z.2f} ± {s:.2f}" for p, s in zip(place, far, strict=True))
         return f"{name}: ({where}) mm,\n  {turned} ± {wide:.3f} deg{self._level}"
+
+    def _within(self, half: str) -> str:
+        """An interval in words, nothing where the poses are too few for any."""
+        few = len(self.session) < refinement.FEWEST_TOLD
+        return "" if few else f" ± {half}{self._level}"
 
     @property
     def _level(self) -> str:
@@ -850,7 +856,8 @@ class HandEyeResult(Estimate):
         if math.isinf(judged.worst_mm):
             return f"{judged.grade} how good it is: {self._untold}."
         reaches, ahead = SENTENCES.words["reaches"], 1e3 * poses.LEVER_M
-        return f"{judged.grade}: {reaches.format(ahead=ahead, worst=judged.worst_mm)}"
+        worst = up_to(judged.worst_mm, UNKNOWN_MM, 1)
+        return f"{judged.grade}: {reaches.format(ahead=ahead, worst=worst)}"
 
     def sigma_at_mm(self, point: ArrayLike) -> float:
         """Standard deviation, mm, worst direction, of where X puts a point (3,), m, of the camera.

@@ -480,7 +480,7 @@ def as_fisheye(model: Calibration) -> tuple[Calibration, float]:
     how often by chance it would leave so much less, view by view: a t-test over the views, which
     are independent where the corners of one are not, of the logarithm of what each model leaves.
     """
-    from scipy.stats import ttest_1samp
+    from scipy.special import stdtr
 
     camera, tangent = model.camera, np.linspace(0.0, model.widest, 100)
     parameters = derivatives.parameter_vector(camera)
@@ -497,8 +497,10 @@ def as_fisheye(model: Calibration) -> tuple[Calibration, float]:
     project = derivatives.fisheye_with_derivatives
     rival = replace(model, camera=camera, estimated=estimated, values=values, project=project)
     rival = refit(turned_over(refit(rival, FISHEYE_STEPS)))
-    mine, theirs = (np.log(_squares_by_view(m) + LEAST_PX**2) for m in (model, rival))
-    return rival, float(ttest_1samp(mine - theirs, 0.0, alternative="greater").pvalue)
+    left = (np.minimum(_squares_by_view(m) + LEAST_PX**2, 1e300) for m in (model, rival))
+    less, n = -np.diff(np.log([*left]), axis=0)[0], len(model.views)
+    t = math.sqrt(n) * less.mean() / max(less.std(ddof=1), 1e-300)
+    return rival, float(stdtr(n - 1, -t))
 
 
 def search_lens(start: Calibration) -> engine.Accepted[Calibration] | None:

@@ -57,7 +57,7 @@ class HalvesDifference:
     def __repr__(self) -> str:
         length, wide = self.length_px, self.expected_px
         alone = "explains" if self.noise_p_value > 0.01 else "does not explain"
-        px, sigma = ({"median": np.nanmedian(m), "worst": np.nanmax(m)} for m in (length, wide))
+        px, sigma = map(fit.sizes_over, (length, wide))
         views = [len(half.residuals) for half in (self.first, self.second)]
         p = {"views": p_text(self.p_value), "noise": p_text(self.noise_p_value)}
         facts = {"views": views, "range_m": self.range_m, "px": px, "sigma": sigma, "p": p}
@@ -123,7 +123,7 @@ def difference_px(
     points = fit.points_at(pixels, range_m, first)
     weights = np.ones(len(pixels)) if weights is None else weights
     known = np.isfinite(points).all(axis=1) & (weights > 0)
-    weight = weights[known, None]
+    weight, homogeneous = weights[known, None], np.insert(points[known], 3, 1.0, axis=1).T
     free = 6 if math.isfinite(range_m) else 3
     T = np.eye(4)
     for _ in range(_GAUSS_NEWTON_STEPS):
@@ -134,7 +134,9 @@ def difference_px(
         residuals = (weight * (pixels[known] - seen)).ravel()
         twist = np.zeros(6)
         twist[:free] = derivatives.scaled_inverse(columns.T @ columns) @ (columns.T @ residuals)
-        T = moved(T[None], twist[None])[0]
+        while ((ahead := moved(T[None], twist[None])[0])[2] @ homogeneous <= 0).any():
+            twist /= 2  # no point goes behind the camera
+        T = ahead
         if np.abs(columns @ twist[:free]).max() < 1e-9 * weight.max():
             break
     moved_points = points @ T[:3, :3].T + T[:3, 3]
@@ -197,10 +199,10 @@ class Comparison:
     def __repr__(self) -> str:
         lines = ["fitted - factory:"]
         for name, difference, sigma in zip(self.names, self.differences, self.sigmas, strict=True):
-            off = f"{difference:+9.2f}" if name[0] in "fc" else f"{difference:+9.4f}"
-            lines.append(f"{name:>4} {off}, {difference / sigma:+6.1f} of its sigma")
+            off = f"{difference:+z9.2f}" if name[0] in "fc" else f"{difference:+z9.4f}"
+            lines.append(f"{name:>4} {off}, {difference / sigma:+z6.1f} of its sigma")
         maps = (self.difference_px, 1e3 * self.shift_m, 1e3 * self.expected_shift_m)
-        px, mm, sigma = ({"median": np.nanmedian(m), "worst": np.nanmax(m)} for m in maps)
+        px, mm, sigma = map(fit.sizes_over, maps)
         facts = {"p": p_text(self.p_value), "range_m": self.range_m, "px": px, "mm": mm}
         lines.append(say("intrinsics.apart", sigma=sigma, **facts))
         lines += fit.folded_text(float(np.isnan(self.shift_m).mean()))

@@ -237,7 +237,10 @@ class NormalEquations:
         by_view = np.einsum("ag,ngh,ha->na", V, free, V)
         inverse = scaled_inverse(V[:p, :p])
         squares = np.einsum("na,ab,nb->", moves[:, :p], inverse, moves[:, :p])
-        variance = float(squares / np.einsum("nab,ab->", expected, inverse))
+        agreed = float(np.einsum("nab,ab->", expected, inverse))
+        if not 0 < agreed < p:  # rounding, where the views do not determine the parameters
+            squares, agreed = self.residuals @ self.residuals, float(max(self.dof, 1))
+        variance = float(squares) / agreed
         covariance = (without.T @ without + variance * V) / 2.0
         own = by_view[:, :p].sum(axis=0) ** 2 / (by_view[:, :p] ** 2).sum(axis=0)
         return Scatter(covariance, variance, float(4.0 * np.mean(own) / (1.0 + 3.0 / p)))
@@ -265,7 +268,7 @@ def scaled_inverse(matrix: Floats) -> Floats:
     is huge, not an exception: that it is undetermined is what the reader must learn.
     """
     scale, values, vectors = _scaled_parts(matrix)
-    least = values.shape[-1] * np.finfo(float).eps * values[..., -1:]
+    least = values.shape[-1] * np.finfo(float).eps * np.maximum(values[..., -1:], 1.0)
     inverse = (vectors / np.maximum(values, least)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
     return inverse / (scale[..., :, None] * scale[..., None, :])
 

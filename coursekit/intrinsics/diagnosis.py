@@ -427,7 +427,7 @@ def _fronto_parallel(result: IntrinsicsResult) -> Finding | None:
     tilt = float(np.quantile(longest * fit.tilts(result).total_deg, FLAT_VIEWS_SHARE))
     if tilt >= FLAT_TILT_DEG:
         return None
-    sigma = 100 * result.sigma("fx") / fx
+    sigma = f"{100 * result.sigma('fx') / fx:.2g}" if result.sigma("fx") < fx else "over 100"
     return _TEXTS.finding("fronto_parallel", share=100 * FLAT_VIEWS_SHARE, tilt=tilt, fx=sigma)
 
 

@@ -40,7 +40,7 @@ from coursekit.boards.board import FEWEST_CORNERS, check_detections
 from coursekit.checks import array, choice, is_number, want
 from coursekit.geometry import Intrinsics, deproject, make_transform, project
 from coursekit.intrinsics import derivatives
-from coursekit.words import Estimate, counted, say, wrapped
+from coursekit.words import Estimate, counted, say, up_to, wrapped
 
 Fixed = Literal["world", "camera"]
 
@@ -55,6 +55,7 @@ MIN_VIEWS = 3
 ALIKE = 0.005  # of the image's width, by which a board moves that nobody moved
 WIDE_FOCAL = 0.5  # of the width: 90 deg across
 LEAST_FOCAL = 0.05  # of the image's width: a field of view of 170 deg, no pinhole camera
+MOST_FOCAL = 1e3  # of it: 0.06 deg, beyond any telescope; boards without tilt lead there
 ITERATIONS = 1000  # nearly parallel boards need hundreds; OpenCV's own limit of 30 ends far away
 ARRIVED_SIGMAS = 0.1  # no combination of parameters would move more in the next step,
 ARRIVED_PX = 1e-4  # or no corner would (float32 corners: all that OpenCV's solver can do)
@@ -68,6 +69,7 @@ GOOD_SPREAD_DEG = 10.0
 GOOD_VIEWS = 10
 GOOD_PX, USABLE_PX = 0.5, 2.0  # 95 %, in all but the worst 5 % of the image, at the boards' range
 GOOD_FAR_PX, USABLE_FAR_PX = 2.0, 4.0  # the same for a direction (a point infinitely far away)
+UNKNOWN_PX = 1e4  # what is known no better is not known; of mm and of coefficients, too
 MOST_FOLDED = 0.05  # of the image; beyond, no figure is one of "95 % of the image"
 DETERMINED_SHARE = 0.01  # 95 % of the focal length and of the centre, as shares of the focal length
 
@@ -280,7 +282,8 @@ class IntrinsicsResult(Estimate):
         determined = max(focal, centre / self.value("fx")) < DETERMINED_SHARE
         near_mm = 1e3 * near * range_m / self.value("fx")
         where = "the pixels that have a ray" if self.folded_share else "the image"
-        says = say("intrinsics.undetermined", views=views, focal=100 * focal, centre=centre)
+        unsure = {"focal": up_to(100 * focal, 100, 1), "centre": up_to(centre, UNKNOWN_PX, 0)}
+        says = say("intrinsics.undetermined", views=views, **unsure)
         if determined:
             reaches = {"range_m": range_m, "near": near, "near_mm": near_mm, "far": far}
             says = say("intrinsics.determined", where=where, **reaches)
@@ -302,13 +305,18 @@ class IntrinsicsResult(Estimate):
         for name in self.names:
             places, unit = (2, " px") if name[0] in "fc" else (4, "")
             half = self.quantile() * self.sigma(name)
-            number = f"{self.value(name):.{places}f} ± {half:.{places}f}{unit}"
+            number = f"{self.value(name):.{places}f} ± {up_to(half, UNKNOWN_PX, places)}{unit}"
             lines.append(f"{'fx = fy' if name == 'f' else name} = {number} (95 %)")
         sigmas = self.quantile() * self.uncertainty_map(self.board_range_m)
-        within = {"median": np.nanmedian(sigmas), "worst": np.nanmax(sigmas)}
-        lines.append(say("intrinsics.residuals", fit=self, **within))
+        lines.append(say("intrinsics.residuals", fit=self, **sizes_over(sigmas)))
         lines += folded_text(self.folded_share)
         return "\n".join(lines)
+
+
+def sizes_over(image: Floats) -> dict[str, str]:
+    """The median and the worst of a map over the image, NaN left out, in words."""
+    sizes = {"median": np.nanmedian(image), "worst": np.nanmax(image)}
+    return {name: up_to(float(size), UNKNOWN_PX) for name, size in sizes.items()}
 
 
 def folded_text(share: float) -> list[str]:
@@ -489,7 +497,8 @@ def _solve(
         raise CalibrationFailed(f"detections: OpenCV's solver gave up ({error.err})") from error
     finally:
         cv2.setNumThreads(threads)
-    if not all(np.isfinite(found).all() for found in (K, dist, *rotations, *translations)):
+    finite = all(np.isfinite(found).all() for found in (K, dist, *rotations, *translations))
+    if not finite or max(K[0, 0], K[1, 1]) > MOST_FOCAL * size[0]:
         raise CalibrationFailed("detections: the solver ran away to infinity; tilt the board more")
     places = zip(map(np.ravel, rotations), map(np.ravel, translations), strict=True)
     poses = np.stack([make_transform(Rotation.from_rotvec(r), t) for r, t in places])
@@ -542,9 +551,12 @@ def projection_columns(
 
 
 def worst_direction(covariance: Floats) -> Floats:
-    """The standard deviation along the longer axis of covariances (..., 2, 2)."""
+    """The standard deviation along the longer axis of covariances (..., 2, 2).
+
+    Where one is rounding, of either sign, it is as large as what it hides.
+    """
     a, b, d = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
-    return np.sqrt((a + d) / 2 + np.hypot((a - d) / 2, b))
+    return np.sqrt(np.abs(a + d) / 2 + np.hypot((a - d) / 2, b))
 
 
 # --- what the views cover, and what a calibration lacks ---

@@ -116,7 +116,7 @@ def _fitted(
 
 
 def _positive(name: str, values: ArrayLike) -> Floats:
-    z = np.atleast_1d(array(name, values, leading=True))
+    z = np.atleast_1d(array(name, values, leading=True)).round(6)  # 0.1 + 0.2 is 0.3
     fits = z.ndim == 1 and z.size > 0 and np.isfinite(z).all() and (z > 0).all()
     want(fits, name, z, "positive distances in m")
     return z
@@ -187,7 +187,7 @@ class NoiseFit(LawFit):
             text += f", exponent held at {self.exponent:g}"
         else:
             low, high = self.exponent_interval
-            text += f", exponent {self.exponent:.2f} ({low:.2f} to {high:.2f})"
+            text += f", exponent {self.exponent:z.2f} ({low:z.2f} to {high:z.2f})"
         return with_notes(f"{text}, from {counted(self.n_distances, 'distance')}", self.notes)
 
 
@@ -290,7 +290,7 @@ def _noise_points(
     want(not ((s < 0) | np.isinf(s)).any(), "stds_m", s, "standard deviations in m")
     wanted = "one above 0, which takes two frames and a depth unit that does not hide the noise"
     want(use.any(), "stds_m", s, wanted)
-    want((nu[use] > 0).all(), "dof", nu, "a positive number for each distance")
+    want(((nu > 0) & (nu < np.inf))[use].all(), "dof", nu, "a positive number for each distance")
     notes = [
         f"{d:g} m is left out: " + ("no pixel ever changed there" if v == 0 else "it has no std")
         for d, v in zip(z[~use], s[~use], strict=True)
@@ -357,9 +357,9 @@ class BiasFit(LawFit):
 
     @property
     def scale_error_interval(self) -> Interval:
-        """The 95 % interval of `scale_error`."""
+        """The 95 % interval of `scale_error`; without an end where the baseline may be nothing."""
         low, high = self.interval("baseline_error")
-        return 1 / (1 + high) - 1, 1 / (1 + low) - 1
+        return 1 / (1 + high) - 1, 1 / (1 + low) - 1 if low > -1 else math.inf
 
     def bias_m(self, distances_m: ArrayLike) -> tuple[Floats, Floats, Floats]:
         """Z_m - Z and its 95 % band at true distances (...): (bias, low, high), each (...), m."""
@@ -384,7 +384,8 @@ class BiasFit(LawFit):
 
     def __repr__(self) -> str:
         low, high = (100 * v for v in self.scale_error_interval)
-        text = f"scale error {100 * self.scale_error:+.2f} % (95 %: {low:+.2f} to {high:+.2f})"
+        most = f"{high:+z.2f}" if high < 1e3 else "over 1000"
+        text = f"scale error {100 * self.scale_error:+z.2f} % (95 %: {low:+z.2f} to {most})"
         for name, says, unit, factor in (
             ("disparity_offset_px", "disparity offset", "px", 1),
             ("fattening_px", "edges pushed out by", "px", 1),
@@ -392,8 +393,8 @@ class BiasFit(LawFit):
         ):
             if name in self.names:
                 low, high = (factor * v for v in self.interval(name))
-                text += f",\n    {says} {factor * self.value(name):+.2f} {unit} "
-                text += f"({low:+.2f} to {high:+.2f})"
+                text += f",\n    {says} {factor * self.value(name):+z.2f} {unit} "
+                text += f"({low:+z.2f} to {high:+z.2f})"
         return with_notes(f"{text}, from {counted(self.n_distances, 'distance')}", self.notes)
 
 
@@ -426,7 +427,7 @@ def fit_bias(
 
     >>> fit_bias([0.3, 0.45, 0.6], 447.0, 0.05, [0.301, 0.4515, 0.602], depth_errors_m=0.0002)
     scale error +0.33 % (95 %: -1.79 to +2.55),
-        disparity offset -0.00 px (-0.67 to +0.67), from 3 distances.
+        disparity offset +0.00 px (-0.67 to +0.67), from 3 distances.
         Note: these distances hardly tell the two apart (correlation -0.95): use their sum,
         the bias at a distance.
     """

@@ -235,7 +235,11 @@ def _not_gaussian(
         dof = min(dof, n - 1.0)
     if n < 8 or not std > (step or 0.0) or not dof > 0:
         return dof, gap, tuple(words)
+    if drift @ drift / (n - 1) > std**2 / 2:  # which pixel_dof holds already
+        words.append("most of it is a drift that all pixels share")
     square = np.square(z - mean - drift[:, None, None])
+    if not np.nanmean(square) > 1e-12 * std**2:  # rounding: of one pixel, or where all move as one
+        return dof, gap, tuple(words)
     own, fourth = valid_mean(square, axis=0), valid_mean(square**2, axis=0)
     ratio = float(np.nanmean(fourth) / np.nanmean(own**2))
     excess = (ratio * (1 + 2 / n) - 3) / max(1 - ratio / n, 0.1)  # own holds the tails, too
@@ -258,8 +262,6 @@ def _not_gaussian(
         if apart > most * math.exp(3 / math.sqrt(2 * dof / len(v))):
             words.append(f"it differs by a factor of {apart:.1f} between {where}")
             left.append(2 * len(v) / float(v.var(ddof=1)))
-    if drift @ drift / (n - 1) > std**2 / 2:  # which pixel_dof holds already
-        words.append("most of it is a drift that all pixels share")
     return min(left), gap, tuple(words)
 
 
@@ -464,7 +466,7 @@ class AveragingCurve:
     n_frames: all there are. effective_frames: how many independent ones they are worth, and its
     interval. gain: how much quieter the mean of all frames is than one; sqrt(n_frames) at best.
     floor_m: the pattern that every frame repeats, RMS over the pixels about a plane; None for a
-    series without pixels.
+    series without pixels, and for fewer than three of them.
     """
 
     n_frames: int
@@ -500,7 +502,7 @@ def averaging_curve(series_m: ArrayLike) -> AveragingCurve:
     deviation = pixels - pixels.mean(axis=0)
     effective, interval = effective_frames(deviation)
     floor = None
-    if values.ndim == 3:
+    if values.ndim == 3 and pixels.shape[1] > 2:
         own = deviation - deviation.mean(axis=1, keepdims=True)  # without the drift all share
         each = np.square(own).sum() / own.shape[1] / (n - 1)
         noise = each / (n / _correlation_time(own @ own.T))
