@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from itertools import compress
+from collections.abc import Iterator
+from itertools import compress, product
 from typing import Any
 
 import numpy as np
@@ -483,9 +484,15 @@ STANDARD_ERRORS = Exercise.told(
 )
 
 
-def _samples_independent(z: Floats) -> Floats:
-    n = np.isfinite(z).sum()
-    return np.array([np.nanstd(z, ddof=1) / math.sqrt(n), _pooled(z) / math.sqrt(2 * (n - 1))])
+def _samples_independent(part: int) -> Iterator[Step]:
+    """The bias's ± (0) or the std's (1) as if no two samples were alike, from spread and number."""
+    numbers: tuple[Step, ...] = (np.size, _valid, lambda z: _valid(z) - 1)
+    for n, spread in product(numbers, (np.nanstd, lambda z: np.nanstd(z, ddof=1), _pooled)):
+        yield _instead(part, lambda z, n=n, s=spread: s(z) / np.sqrt((1 + part) * n(z)))
+
+
+def _valid(z: Floats) -> int:
+    return int(np.isfinite(z).sum())
 
 
 def _of_every_frame(spread: Step) -> Step:
@@ -494,7 +501,7 @@ def _of_every_frame(spread: Step) -> Step:
 
 
 STANDARD_ERRORS.add_mistakes(
-    ("", "pixels_independent", lambda _: _samples_independent),
+    *(("", "pixels_independent", slip) for part in (0, 1) for slip in _samples_independent(part)),
     ("", "patches_of_every_frame", _of_every_frame(lambda z: np.nanstd(z, ddof=1))),
     ("", "noise_over_time_only", _of_every_frame(_pooled)),
     ("numbers", "pattern_over_frames", lambda patches, frames: (patches * frames, frames)),

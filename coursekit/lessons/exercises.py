@@ -231,7 +231,8 @@ class Exercise:
                 return self._say("not attempted", "not attempted yet.")
             kind, text = "wrong", "it returns None here; is a `return` missing?"
             if run.error is not None:
-                kind, text = "raised", f"your function raised {run.said}"
+                hint = " (a power is **)" if " for ^:" in run.said else ""
+                kind, text = "raised", f"your function raised {run.said}{hint}"
             elif run.value is not None:
                 if _as_numbers(run.value) is not None:
                     continue
@@ -308,7 +309,11 @@ class Exercise:
         where = self._parts_off(values, expected)
         if relation and not mistakes:
             mistakes = (_device(relation, "your result", "", replace),)
-        mistakes = mistakes or self._turned_too(values, expected) or self._by_part(values, expected)
+        mistakes = mistakes or self._turned_too(values, expected)
+        if not mistakes and (mistakes := self._by_part(values, expected)):  # show most of them
+            off = (np.abs(v - e) > self.tolerance for v, e in zip(values, expected, strict=True))
+            first = int(np.argmax([np.count_nonzero(one) for one in off]))
+            evidence = self._evidence(first, values[first], expected[first])
         if len({m.name.partition(",")[0] for m in mistakes}) > 1:
             seen = self._seen_in(first, mistakes, expected[first])
             return self._several(_in_words(seen, known), count, evidence)
