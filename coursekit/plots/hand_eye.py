@@ -176,22 +176,22 @@ def study(points: Sequence[StudyPoint]) -> LessonFigure:
 
 
 def more_poses(
-    counts: Sequence[int], error_mm: Mapping[str, ArrayLike], half_mm: Mapping[str, ArrayLike]
+    counts: Sequence[int], error_mm: Mapping[str, ArrayLike], stated_mm: Mapping[str, ArrayLike]
 ) -> LessonFigure:
-    """Error of X's translation and the half width of its stated 95 % interval, against poses.
+    """Error of X's translation, and the root mean square that is stated of it, against poses.
 
-    error_mm, half_mm: one value for each of the counts, by the panel's name.
+    error_mm, stated_mm: one value for each of the counts, by the panel's name.
     """
     fig, axes = panels(len(error_mm), len(error_mm), 9.6, 3.8, sharey=True)
     texts = []
     for ax, name in zip(axes, error_mm, strict=True):
-        error, half = np.asarray(error_mm[name]), np.asarray(half_mm[name])
+        error, stated = np.asarray(error_mm[name]), np.asarray(stated_mm[name])
         ax.plot(counts, error, "o-", color=COLORS["measured"], label="error")
-        ax.plot(counts, half, "--", color=COLORS["model"], label="stated 95 %")
+        ax.plot(counts, stated, "--", color=COLORS["model"], label="stated (rms)")
         ax.set(xscale="log", yscale="log", xlabel="poses (number)")
         plain_ticks(ax.xaxis, counts, widen=True)
         ax.set_title(name)
-        (first, *_, last) = zip(error, half, strict=True)
+        (first, *_, last) = zip(error, stated, strict=True)
         texts.append(say("plots.error_and_half", name=name, first=first, last=last))
     plain_ticks(axes[0].yaxis, (0.1, 0.3, 1, 3, 10), widen=True)
     axes[0].set_ylabel("translation of X (mm)")

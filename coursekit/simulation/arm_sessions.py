@@ -15,6 +15,7 @@ import json
 import os
 import zlib
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
@@ -26,7 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from coursekit.arm import ArmErrors, SimulatedArm, widowx
 from coursekit.arrays import Floats, Grey
-from coursekit.boards import Board, Detection, Detections, detect
+from coursekit.boards import Board, BoardNotFound, Detection, Detections, detect
 from coursekit.boards.board import FEWEST_CORNERS, seen
 from coursekit.boards.detector import SESSION
 from coursekit.checks import choice, number, positive, want, whole
@@ -217,15 +218,20 @@ def rendered_session(
 ) -> tuple[HandEyeSession, HandEyeTruth, list[Grey]]:
     """A healthy session of rendered images (h, w), whose corners `boards.detect` found.
 
-    As `hand_eye_session`, at 0.1 to 0.3 s an image, which are counted where there are many. Raises
-    BoardNotFound where the board is not found in one, which the poses are chosen to avoid.
+    As `hand_eye_session`, at 0.1 to 0.3 s an image, which are counted where there are many. An
+    image in which the board is too small to be found is left out, which the truth does not know.
     """
     truth, q, dq = _poses(mount, seed, n, arm_errors, HandEyeMistakes())
     rng, board, lens = _stream(seed, b"images"), truth.setup.board, truth.setup.intrinsics
     pictures = (render_board(board, T, lens, rng) for T in truth.T_camera_board)
     images = list(counting(pictures, n, "image", n >= FOLDER_VIEWS))
-    found = [detect(image, board, f"view_{i:02d}") for i, image in enumerate(images)]
-    return _reported(truth, q, dq, Detections(found)), truth, images
+    found: dict[int, Detection] = {}
+    for i, image in enumerate(images):
+        with suppress(BoardNotFound):
+            found[i] = detect(image, board, f"view_{i:02d}")
+    kept = list(found)
+    session = _reported(truth, q[kept], dq[kept], Detections([*found.values()]))
+    return session, truth, [images[i] for i in kept]
 
 
 def session_folder(mount: Mount, seed: int, into: str | os.PathLike[str]) -> Path:
