@@ -158,12 +158,15 @@ class Intrinsics:
 
     @classmethod
     def from_dict(cls, fields: dict[str, Any]) -> Intrinsics:
-        """Intrinsics from the dictionary that `to_dict` makes; a missing or unknown key raises."""
+        """Intrinsics from the dictionary that `to_dict` makes; a missing or unknown key raises.
+
+        A `verdict`, which `export` writes beside them, is passed over.
+        """
         known = cls.__dataclass_fields__.keys()
-        given = instance("fields", fields, dict).keys()
+        given = instance("fields", fields, dict).keys() - {"verdict"}
         missing, unknown = sorted(known - {"model", "coeffs"} - given), sorted(given - known)
         checks.refuse(missing or unknown, f"fields: missing {missing}, unknown {unknown}")
-        return cls(**fields)
+        return cls(**{name: fields[name] for name in given})
 
     @classmethod
     def from_realsense(cls, intrinsics: Any) -> Intrinsics:
