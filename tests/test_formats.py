@@ -55,8 +55,7 @@ def test_ros_file_has_every_field_of_the_format() -> None:
     assert tuple(matrix["distortion_coefficients"]) == COEFFS
     assert np.array_equal(np.reshape(matrix["rectification_matrix"], (3, 3)), np.eye(3))
     assert np.array_equal(np.reshape(matrix["projection_matrix"], (3, 4))[:, :3], LENS.K)
-    for part in (found[key] for key in matrix):
-        assert part["rows"] * part["cols"] == len(part["data"])
+    assert all(found[key]["rows"] * found[key]["cols"] == len(matrix[key]) for key in matrix)
 
 
 @pytest.mark.parametrize("suffix", ["yml", "xml", "JSON"])
@@ -217,12 +216,9 @@ test_lenses_that_are_not_supported = refusals(
 FOREIGN = {kind: text.encode("latin-1") for kind, text in FILES["foreign"].items()}
 FOREIGN["binary, or UTF-16 without"] = "width: 640\n".encode("utf-16-le")
 NO_LENS = FOREIGN | {kind: text.encode() for kind, text in FILES["of_poses"].items()}
-NO_TABLE = FOREIGN | {
-    "camera_info of ROS": ROS.encode(),
-    "OpenCV's FileStorage": OPENCV.encode(),
-    "a camera chain of Kalibr": KALIBR.encode(),
-    "COLMAP's cameras.txt": COLMAP.encode(),
-}
+OF_LENSES = {"camera_info of ROS": ROS, "OpenCV's FileStorage": OPENCV}
+OF_LENSES |= {"a camera chain of Kalibr": KALIBR, "COLMAP's cameras.txt": COLMAP}
+NO_TABLE = FOREIGN | {kind: text.encode() for kind, text in OF_LENSES.items()}
 
 
 @pytest.mark.parametrize("kind", NO_LENS)
@@ -594,6 +590,9 @@ def test_two_folders_with_the_same_names(few) -> None:
     assert len({tuple(seen.pixels[0]) for seen in session.seen}) == 4
 
 
+NAMED = r"^in_order: got True, want it left out: poses.csv names the image of each row"
+
+
 def test_a_log_without_names_goes_in_order_only_if_told(few) -> None:
     place, (header, *rows) = few
     log = [line.split(",", 1)[1] for line in (header, *rows)]
@@ -604,8 +603,9 @@ def test_a_log_without_names_goes_in_order_only_if_told(few) -> None:
     named = usable(place, [header, *rows])
     assert np.array_equal(session.T_base_gripper, named.T_base_gripper)
     assert session.names == named.names
-    with pytest.raises(ValueError, match=r"^images: got 4, want 3, one a row"):
-        usable(place, log[:-1], in_order=True)
+    for lines, message in ((log[:-1], "^images: got 4, want 3, one a"), ([header, *rows], NAMED)):
+        with pytest.raises(ValueError, match=message):
+            usable(place, lines, in_order=True)
 
 
 # --- a place goes out ---

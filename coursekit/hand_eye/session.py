@@ -362,7 +362,8 @@ def _table(
     if in_order:
         images = [file for file in files if file.suffix.lower() in IMAGES]
         pair = say("hand_eye.one_a_row", rows=len(read))
-        want(len(images) == len(read) and "file" not in columns, "images", len(images), pair)
+        want("file" not in columns, "in_order", True, say("hand_eye.not_in_order", table=POSES))
+        want(len(images) == len(read), "images", len(images), pair)
         named = zip(read, images, strict=True)
         read = [replace(row, file=file.relative_to(folder).as_posix()) for row, file in named]
         columns |= {"file"}
