@@ -596,8 +596,8 @@ NAMED = r"^in_order: got True, want it left out: poses.csv names the image of ea
 def test_a_log_without_names_goes_in_order_only_if_told(few) -> None:
     place, (header, *rows) = few
     log = [line.split(",", 1)[1] for line in (header, *rows)]
-    with pytest.raises(ValueError, match=r"no column 'file'.*in_order=True"):
-        usable(place, log)
+    with pytest.raises(ValueError, match=r"no column 'image'; .* \['Bild', 'x', .*in_order=True"):
+        usable(place, [header.replace("file", "Bild"), *rows])
     (place / "images" / "._view_00.jpg").touch()  # of macOS
     session = usable(place, log, in_order=True)
     named = usable(place, [header, *rows])

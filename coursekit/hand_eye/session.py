@@ -40,7 +40,7 @@ from coursekit.boards import Board, Detection, Detections, detect_all
 from coursekit.boards.board import Skipped, why_unused
 from coursekit.boards.detector import SESSION, natural
 from coursekit.causes import DiagnosisTexts
-from coursekit.checks import array, choice, settle, transform, want
+from coursekit.checks import array, choice, settle, shown, transform, want
 from coursekit.formats import poses as pose_files
 from coursekit.formats.poses import JOINTS, PLACE, THREE, TURN, VELOCITIES, PoseRow
 from coursekit.geometry import Intrinsics, cross_matrix, pose_difference
@@ -367,7 +367,7 @@ def _table(
         named = zip(read, images, strict=True)
         read = [replace(row, file=file.relative_to(folder).as_posix()) for row, file in named]
         columns |= {"file"}
-    _check_columns(columns)
+    _check_columns(columns, list(table.header))
     rows: dict[str, PoseRow] = {}
     skipped = []
     for row in read:
@@ -409,9 +409,9 @@ def _plain(name: str) -> str:
     return unicodedata.normalize("NFC", name).casefold()
 
 
-def _check_columns(columns: set[str]) -> None:
+def _check_columns(columns: set[str], header: list[str]) -> None:
     if "file" not in columns:
-        raise ValueError(say("hand_eye.no_file_column", table=POSES, columns=sorted(columns)))
+        raise ValueError(say("hand_eye.no_file_column", table=POSES, columns=shown(header)))
     turn = THREE if columns.issuperset(THREE) else TURN
     missing = [name for name in (*PLACE, *turn) if name not in columns]
     if missing and not columns.issuperset(JOINTS):
