@@ -506,6 +506,7 @@ NO_OTHER = say("others.no_other_lens")
 
 
 def _intrinsic_matrix(K: ArrayLike) -> Floats:
+    want(not isinstance(K, Intrinsics), "K", "Intrinsics", "their attribute .K, and .dist as dist")
     K = array("K", K, (3, 3), finite=True)
     upright = not K[0, 1] and not K[1, 0] and tuple(K[2]) == (0.0, 0.0, 1.0)
     fits = K[0, 0] > 0 and K[1, 1] > 0 and upright
