@@ -45,7 +45,7 @@ def read_lens(
         found = _colmap(_only({words[0]: words for words in lines}, which, name), name)
     else:
         found = tree(text, name, WANTED)
-        kind = f"{kind_of(text)} without names and values"
+        kind = kind_of(text, "another text, without names and values")
         want(isinstance(found, dict), name, kind, WANTED)
         chain = {key: value for key, value in found.items() if re.fullmatch(r"cam\d+", key)}
         found = _kalibr(_only(chain, which, name), name) if chain else _named(found, name, text)
