@@ -38,7 +38,7 @@ from coursekit.arm import Arm, FkErrors, fk_covariance, widowx
 from coursekit.arrays import ArrayLike, Floats, Integers
 from coursekit.boards import Board, Detection, Detections, detect_all
 from coursekit.boards.board import Skipped, why_unused
-from coursekit.boards.detector import SESSION, natural
+from coursekit.boards.detector import IMAGES, SESSION, natural
 from coursekit.causes import DiagnosisTexts
 from coursekit.checks import array, choice, settle, shown, transform, want
 from coursekit.formats import poses as pose_files
@@ -52,7 +52,6 @@ from coursekit.words import Estimate, say, wrapped
 SENTENCES = DiagnosisTexts.of("hand_eye")
 METHODS = ("refine", *CLOSED_FORMS)
 POSES = "poses.csv"
-IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 LEFTOVER = r"(^|/)(\.|__MACOSX/)"  # of a path: what is hidden, or Apple's
 OPTIONAL = {"times": ("time",), "q": JOINTS, "dq": VELOCITIES}
 REPEATS = "repeats"  # how the reason begins for which a pair is left out by `once`
