@@ -158,12 +158,15 @@ class Intrinsics:
 
     @classmethod
     def from_dict(cls, fields: dict[str, Any]) -> Intrinsics:
-        """Intrinsics from the dictionary that `to_dict` makes; a missing or unknown key raises."""
+        """Intrinsics from the dictionary that `to_dict` makes; a missing or unknown key raises.
+
+        A `verdict`, which `export` writes beside them, is passed over.
+        """
         known = cls.__dataclass_fields__.keys()
-        given = instance("fields", fields, dict).keys()
+        given = instance("fields", fields, dict).keys() - {"verdict"}
         missing, unknown = sorted(known - {"model", "coeffs"} - given), sorted(given - known)
         checks.refuse(missing or unknown, f"fields: missing {missing}, unknown {unknown}")
-        return cls(**fields)
+        return cls(**{name: fields[name] for name in given})
 
     @classmethod
     def from_realsense(cls, intrinsics: Any) -> Intrinsics:
@@ -503,6 +506,7 @@ NO_OTHER = say("others.no_other_lens")
 
 
 def _intrinsic_matrix(K: ArrayLike) -> Floats:
+    want(not isinstance(K, Intrinsics), "K", "Intrinsics", "their attribute .K, and .dist as dist")
     K = array("K", K, (3, 3), finite=True)
     upright = not K[0, 1] and not K[1, 0] and tuple(K[2]) == (0.0, 0.0, 1.0)
     fits = K[0, 0] > 0 and K[1, 1] > 0 and upright

@@ -256,9 +256,12 @@ def read(path: Path) -> Result:
 
 # --- to other programs ---
 
-COMMENTS = {"urdf": "<!-- {} -->\n"} | dict.fromkeys(
-    ("ros", "kalibr", "colmap", "tf2", "moveit", "easy_handeye2"), "# {}\n"
-)
+# How a verdict stands in a file; JSON of our own has a field for it, Open3D's has no place
+HASHED = ("ros", "opencv", "kalibr", "colmap", "tf2", "moveit", "easy_handeye2")
+COMMENTS = dict.fromkeys(HASHED, "# {0}\n") | {"opencv_json": ' "verdict": {1},\n'}
+COMMENTS |= dict.fromkeys(("urdf", "opencv_xml"), "<!-- {0} -->\n")
+GRADES = "Good|Usable with care|Not good enough"  # with which the verdict on a lens begins
+VERDICT = re.compile(rf'(?m)^(?:# |<!-- | *"verdict": ")((?:{GRADES}): .+?)(?: -->|",?)?\r?$')
 
 
 @dataclass(frozen=True)
@@ -289,8 +292,8 @@ def export(
 
     what: "03_intrinsics", "04_hand_eye" or the path of such a result; a lens file of any format;
     or what calibrated it: `Intrinsics`, a result of `intrinsics.calibrate` or `hand_eye.solve`.
-    to: for a lens "ros", "opencv" (XML where `out` ends so), "kalibr", "colmap", "open3d", "json";
-    for a place "tf2", "urdf", "moveit", "easy_handeye2", "json". out: the file, None for none.
+    to: for a lens "ros", "opencv" (XML or JSON where `out` ends so), "kalibr", "colmap", "open3d",
+    "json"; for a place "tf2", "urdf", "moveit", "easy_handeye2", "json". out: the file, or None.
 
     A place is that of the optical frame in `parent` (the gripper, or the base where the camera does
     not move). A driver that publishes link -> optical already needs parent -> link instead, as a
@@ -298,23 +301,26 @@ def export(
     both have one origin, or "x y z qx qy qz qw" as tf2_echo says it.
 
     What the result's `verdict` begins with is said, as is a parent that nobody named, and both
-    stand in the file where it may hold a comment. Raises ValueError for what a format cannot
-    hold, FileExistsError for a file that is there.
+    stand in the file where it may hold a comment; in JSON, but Open3D's, the verdict does. That of
+    a lens file goes on into the next; `Intrinsics` and notebook 3's result have none. Raises
+    ValueError for what a format cannot hold, FileExistsError for a file that is there.
     """
-    found = _exportable(what)
-    verdict, unsaid = _verdict(what), ""
+    found, verdict = _exportable(what)
+    form, unsaid = to, ""
     if isinstance(found, Intrinsics):
         checks.choice("to (of a lens)", to, lens_files.LENS_FORMATS)
-        xml = out is not None and to == "opencv" and os.fspath(out).endswith(".xml")
-        text, notes = _lens_text(found, to, xml)
+        suffix = Path(out or "").suffix.lower().replace(".", "_")
+        form = f"opencv{suffix}" if to == "opencv" and suffix in ("_xml", "_json") else to
+        text, notes = _lens_text(found, form, verdict)
     else:
         checks.choice("to (of a camera's place)", to, (*pose_files.PLACE_FORMATS, "json"))
         placed = replace(found, parent=parent or found.parent, child=optical)
         text, notes = _place_text(placed, to, link, T_link_optical)
-        verdict = found.verdict
         unsaid = "" if parent else say("others.unsaid_parent", parent=found.parent)
-    comment, said = COMMENTS.get(to, ""), filter(None, (verdict, unsaid))
-    text = "".join(comment.format(one.replace("--", "-")) for one in said) + text
+    at = text.index("\n") + 1 if form.startswith("opencv") else 0  # its first line stays the first
+    for one in filter(None, (unsaid, verdict)):
+        line = one.replace("--", "-"), json.dumps(one, ensure_ascii=False)
+        text = text[:at] + COMMENTS.get(form, "").format(*line) + text[at:]
     notes = tuple(note for note in (verdict, *notes, unsaid) if note)
     path = None if out is None else Path(out)
     if path is not None:
@@ -338,27 +344,30 @@ def _verdict(result: Any) -> str:
     return re.split(r"(?<=\.) ", " ".join(verdict().split()))[0] if callable(verdict) else ""
 
 
-def _exportable(what: Any) -> Intrinsics | Placement:
-    """The lens or the place in a result, in a file or in what a notebook calls it."""
-    if isinstance(what, (Intrinsics, Placement)):
-        return what
+def _exportable(what: Any) -> tuple[Intrinsics | Placement, str]:
+    """The lens or the place in a result, in a file or in what a notebook calls it; its verdict."""
+    if isinstance(what, Intrinsics):
+        return what, ""
+    if isinstance(what, Placement):
+        return what, what.verdict
     if hasattr(what, "X") and hasattr(what, "mount"):
-        return placement(what)
+        return _exportable(placement(what))
     if hasattr(what, "intrinsics"):
-        return checks.instance("what", what.intrinsics, Intrinsics)
+        return checks.instance("what", what.intrinsics, Intrinsics), _verdict(what)
     want(isinstance(what, (str, os.PathLike)), "what", what, "a result, or the path of a file")
     path = Path(what) if Path(what).exists() else folder() / f"{what}.json"
     want(path.is_file(), "what", os.fspath(what), say("others.no_result", folder=folder().name))
     try:
         result = read(path)
     except ValueError:  # no result of a notebook: a lens, whose reader says what else it is
-        return Intrinsics.from_file(path)
+        said = VERDICT.search(lens_files.read_text(path, lens_files.WANTED))
+        return Intrinsics.from_file(path), said[1] if said else ""
     if not (whole := result.lens or result.placement):
         raise ValueError(say("others.nothing_kept", file=path.name))
-    return whole
+    return _exportable(whole)
 
 
-def _lens_text(given: Intrinsics, to: str, xml: bool) -> tuple[str, tuple[str, ...]]:
+def _lens_text(given: Intrinsics, to: str, verdict: str) -> tuple[str, tuple[str, ...]]:
     """The text, and what became of the lens on the way."""
     notes = []
     fitted = given if to == "json" else given.as_brown_conrady(k3=to != "kalibr")
@@ -368,8 +377,8 @@ def _lens_text(given: Intrinsics, to: str, xml: bool) -> tuple[str, tuple[str, .
         notes.append(f"fitted again without {lost}: in the image off by {off:.4f} px at most")
     if to == "colmap":
         notes.append("COLMAP counts from the first pixel's corner: cx and cy are 0.5 px larger")
-    text = lens_files.write_lens(fitted.to_dict(), "opencv_xml" if xml else to)
-    return text, tuple(notes)
+    fields = fitted.to_dict() | ({"verdict": verdict} if verdict else {})
+    return lens_files.write_lens(fields, to), tuple(notes)
 
 
 def _place_text(

@@ -343,8 +343,9 @@ def test_a_folder_names_every_file_it_does_not_use(mixed_folder, capfd):
     skipped = [[skip.name, skip.reason.split(":")[0]] for skip in seen.skipped]
     assert skipped == EXPECTED["not_used"]
     said = repr(seen)
-    with pytest.raises(ValueError, match="holds no pictures"):
-        detect_all(mixed_folder / "folder.png", CHARUCO)
+    for folder, more in ((mixed_folder / "folder.png", "$"), (mixed_folder.parent, " itself, .+/")):
+        with pytest.raises(ValueError, match=f"holds no pictures{more}"):
+            detect_all(folder, CHARUCO)
     assert said.startswith("3 views with 120 corners, 5 not used\n  turned.jpg: 40 corners in 640")
     assert "\n  not used: empty.png: the file is empty" in said
     assert "\n  not used: cut.jpg: the file is cut off, its end is missing (and 1 more)" in said

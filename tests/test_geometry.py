@@ -230,6 +230,7 @@ test_what_cannot_be_is_refused = refusals(
     *each(r"^pixels\b", deprojected, "pixels", *NO_ARRAYS),
     *each(r"^depth_m\b", deprojected, "depth_m", *NO_ARRAYS),
     *each("^K: ", deprojected, "K", *NO_K),
+    ("^K: got 'Intrinsics', want their attribute .K", lambda: geometry.project(np.ones(3), LESSON)),
     (r"^depth_m: got \(4,\)", lambda: deprojected(np.zeros((3, 2)), np.ones(4))),
     *((r"^xy\b", lambda bad=bad: geometry.distort(bad, DIST)) for bad in NO_ARRAYS),
     *((r"^xy\b", lambda bad=bad: geometry.undistort(bad, DIST)) for bad in NO_ARRAYS),

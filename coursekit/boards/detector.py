@@ -39,6 +39,7 @@ NARROWEST = 40  # long sides to the short one
 MOST_PIXELS, MOST_BYTES = 250_000_000, 2_000_000_000  # more is no photograph
 RANGE = 12, 243  # grey levels of a hundredth and of 99 hundredths of a scaled image
 SESSION = "session.json"  # written beside the images by the course itself
+IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 NO_PICTURE = r"^\.|\.(md|txt|csv|json|ya?ml|xml|html?|toml|ini|log|py|zip|db)$"  # of a file's name
 JPEG, PNG = b"\xff\xd8", b"\x89PNG"
 SIZE_SEGMENTS = b"\xc0\xc1\xc2\xc3\xc5\xc6\xc7\xc9\xca\xcb\xcd\xce\xcf"  # of a JPEG hold its size
@@ -191,7 +192,9 @@ def _sources(images: Any) -> list[tuple[str, Any]]:
         files = [p for p in folder.iterdir() if p.is_file() or not p.exists()]  # a broken link
         files = [p for p in files if not re.search(NO_PICTURE, p.name.lower())]
         if not files:
-            raise ValueError(f"images: {os.fspath(images)!r} holds no pictures")
+            below = sorted(p.parent for p in folder.glob("*/*") if p.suffix.lower() in IMAGES)
+            there = f" itself, {below[0]} does: name the folder of the photographs" if below else ""
+            raise ValueError(f"images: {os.fspath(images)!r} holds no pictures{there}")
         return [(path.name, path) for path in sorted(files, key=natural)]
     if not isinstance(images, Iterable):
         kind = type(images).__name__

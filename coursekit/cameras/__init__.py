@@ -51,7 +51,8 @@ def open_camera(
         return _recording(Path(which))
     if isinstance(which, str):
         if which == "simulated":
-            return SimulatedCamera(seed=seed)
+            wanted = argument == "which"  # and then not to be told how to get another
+            return SimulatedCamera(seed=seed, advice="" if wanted else say("cameras.plug_in"))
         if which.isdecimal():
             return _live(which, infrared)
         path = Path(which)

@@ -119,7 +119,7 @@ class SimulatedCamera(Camera):
         self.set(depth_scale_m=depth_scale_m)
 
     def __repr__(self) -> str:
-        return f"{self.name}, seed {self.seed}: no real camera in use.\n{self._advice}"
+        return f"{self.name}, seed {self.seed}: no real camera in use.\n{self._advice}".strip()
 
     # --- the scene, the light, the truth -------------------------------------------------------
 

@@ -45,7 +45,7 @@ def read_lens(
         found = _colmap(_only({words[0]: words for words in lines}, which, name), name)
     else:
         found = tree(text, name, WANTED)
-        kind = f"{kind_of(text)} without names and values"
+        kind = kind_of(text, "another text, without names and values")
         want(isinstance(found, dict), name, kind, WANTED)
         chain = {key: value for key, value in found.items() if re.fullmatch(r"cam\d+", key)}
         found = _kalibr(_only(chain, which, name), name) if chain else _named(found, name, text)
@@ -163,11 +163,11 @@ def _colmap(words: list[str], name: str) -> dict[str, Any]:
 def write_lens(fields: dict[str, Any], to: str) -> str:
     """The text of a file that holds these fields, as Brown-Conrady.
 
-    to: one of `LENS_FORMATS`, or "opencv_xml". Kalibr has no k3 and Open3D no
+    to: one of `LENS_FORMATS`, "opencv_xml" or "opencv_json". Kalibr has no k3 and Open3D no
     coefficient at all: ValueError where one would be lost.
     """
     if to == "json":
-        return json.dumps(fields, indent=1, allow_nan=False) + "\n"
+        return json.dumps(fields, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
     fx, fy, cx, cy = (float(fields[key]) for key in PINHOLE)
     coeffs = [float(value) * (fields["model"] != "none") for value in fields["coeffs"]]
     want(to != "kalibr" or not coeffs[4], "to", to, "a lens without k3: Kalibr has no place for it")

@@ -68,13 +68,15 @@ class PoseRow:
 class PoseTable:
     """A table of poses: where each of its columns, by our names, stands, and how large its unit is.
 
-    rotation: how its three numbers turn, None where it has a quaternion, or none of them.
+    rotation: how its three numbers turn, None where it has a quaternion, or none of them. header:
+    the names of its columns as they stand in it.
     """
 
     name: str
     places: dict[str, int]
     units: dict[str, float]
     rotation: str | None
+    header: tuple[str, ...]
 
     def row(self, line: int, cells: Sequence[str]) -> PoseRow:
         """A line of the table, with what is wrong in it."""
@@ -161,7 +163,7 @@ def _header(lines: list[str], name: str) -> tuple[int, str]:
                     return at, header
             break
     kind = kind_of("\n".join(lines[:50]), "no line that names such columns")
-    wanted = "file, x, y, z and qx, qy, qz, qw or rx, ry, rz; or file, q0, ..., q5"
+    wanted = "image, x, y, z and qx, qy, qz, qw or rx, ry, rz; or image, q0, ..., q5"
     raise ValueError(f"{name}: got {kind}, want {TABLE}, whose first line has {wanted}")
 
 
@@ -191,13 +193,13 @@ def _columns(
         angular |= (unit != "" or plain.startswith("actual_tcp")) and ours == "rx"
         units |= {ours: UNITS[unit]} if unit else {}
     if places.keys() >= {*TURN} or not places.keys() >= {*THREE}:
-        return PoseTable(name, places, units, None)
+        return PoseTable(name, places, units, None, tuple(cells))
     agree = None in (says, rotation) or says == rotation
     want(agree, "rotation", rotation, f"{says!r}, which the columns of {name} say")
     if not (says or rotation) or not angular:
         missing = "how they turn" if not (says or rotation) else "whether in rad or in deg"
         raise ValueError(FORMAT_TEXTS["messages"]["rotation"].format(name=name, missing=missing))
-    return PoseTable(name, places, units, rotation or says)
+    return PoseTable(name, places, units, rotation or says, tuple(cells))
 
 
 def _plausible(table: PoseTable, rows: list[dict[str, float]]) -> None:

@@ -38,9 +38,9 @@ from coursekit.arm import Arm, FkErrors, fk_covariance, widowx
 from coursekit.arrays import ArrayLike, Floats, Integers
 from coursekit.boards import Board, Detection, Detections, detect_all
 from coursekit.boards.board import Skipped, why_unused
-from coursekit.boards.detector import SESSION, natural
+from coursekit.boards.detector import IMAGES, SESSION, natural
 from coursekit.causes import DiagnosisTexts
-from coursekit.checks import array, choice, settle, transform, want
+from coursekit.checks import array, choice, settle, shown, transform, want
 from coursekit.formats import poses as pose_files
 from coursekit.formats.poses import JOINTS, PLACE, THREE, TURN, VELOCITIES, PoseRow
 from coursekit.geometry import Intrinsics, cross_matrix, pose_difference
@@ -52,7 +52,6 @@ from coursekit.words import Estimate, say, up_to, wrapped
 SENTENCES = DiagnosisTexts.of("hand_eye")
 METHODS = ("refine", *CLOSED_FORMS)
 POSES = "poses.csv"
-IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 LEFTOVER = r"(^|/)(\.|__MACOSX/)"  # of a path: what is hidden, or Apple's
 OPTIONAL = {"times": ("time",), "q": JOINTS, "dq": VELOCITIES}
 REPEATS = "repeats"  # how the reason begins for which a pair is left out by `once`
@@ -362,11 +361,12 @@ def _table(
     if in_order:
         images = [file for file in files if file.suffix.lower() in IMAGES]
         pair = say("hand_eye.one_a_row", rows=len(read))
-        want(len(images) == len(read) and "file" not in columns, "images", len(images), pair)
+        want("file" not in columns, "in_order", True, say("hand_eye.not_in_order", table=POSES))
+        want(len(images) == len(read), "images", len(images), pair)
         named = zip(read, images, strict=True)
         read = [replace(row, file=file.relative_to(folder).as_posix()) for row, file in named]
         columns |= {"file"}
-    _check_columns(columns)
+    _check_columns(columns, list(table.header))
     rows: dict[str, PoseRow] = {}
     skipped = []
     for row in read:
@@ -408,9 +408,9 @@ def _plain(name: str) -> str:
     return unicodedata.normalize("NFC", name).casefold()
 
 
-def _check_columns(columns: set[str]) -> None:
+def _check_columns(columns: set[str], header: list[str]) -> None:
     if "file" not in columns:
-        raise ValueError(say("hand_eye.no_file_column", table=POSES, columns=sorted(columns)))
+        raise ValueError(say("hand_eye.no_file_column", table=POSES, columns=shown(header)))
     turn = THREE if columns.issuperset(THREE) else TURN
     missing = [name for name in (*PLACE, *turn) if name not in columns]
     if missing and not columns.issuperset(JOINTS):
