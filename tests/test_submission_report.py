@@ -192,9 +192,8 @@ def test_the_class_page_has_everything(lines):
     assert "sign of the bias turned (1)" in page.text
     assert "nearly identical" in page.text
     links = {attributes["href"] for tag, attributes in page.tags if tag == "a"}
-    assert links == {f"students/{i}%20a.html" for i in range(6)} | {
-        *("paragraphs.html", "second_marker.html")
-    }
+    pages = {f"students/{i}%20a.html" for i in range(6)}
+    assert links == pages | {"paragraphs.html", "second_marker.html"}
     for line in lines:
         for flag in line.flags:
             assert flag.says in page.text

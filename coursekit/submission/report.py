@@ -136,6 +136,17 @@ class ReportLine:
         return "p" + hashlib.sha256(f"{self.who}\0{self.file}".encode()).hexdigest()[:6]
 
     @property
+    def depths(self) -> tuple[str, ...]:
+        """What is the same for the same raw depths; () for none."""
+        prints = self.fingerprint
+        return tuple(sorted(stack.digest for stack in prints.stacks)) if prints else ()
+
+    @property
+    def measured(self) -> bool:
+        """Whether it is what `submit.keep` wrote, and no bundle to hand in."""
+        return self.points is not None and not self.student
+
+    @property
     def percent(self) -> float | None:
         """Points of what could be had."""
         if self.points is None:
@@ -218,6 +229,8 @@ def across(
         if (at := place_of(line.file)).lms:
             roster.of_place(at)
     who = {line.file: roster.of_file(line.file, line.student) for line in lines}
+    owner = {n.depths: who[n.file] for n in reversed(lines) if n.student and n.depths}
+    who |= {n.file: owner[n.depths] for n in lines if n.depths in owner and not who[n.file].name}
     there = {one.key: one for one in who.values()}
     enrolled = Counter(person(one.name) for one in roster.people.values() if one.row)
     handed = Counter(person(one.name) for one in there.values())
@@ -225,11 +238,13 @@ def across(
         roster.add(one)
     codes = {replace(line, who=who[line.file].key).code: who[line.file] for line in lines}
     rows = _own_rows(own, roster, codes)
+    theirs = grouped((who[line.file].key, line) for line in lines)
+    chosen = {key: _that_counts(some) for key, some in theirs.items()}
     done = [line for line in lines if line.points is not None]
     prints = {
         line.file: replace(line.fingerprint, student=who[line.file].key)
         for line in done
-        if line.fingerprint is not None
+        if line.fingerprint and not (line.measured and chosen[who[line.file].key][0] is not line)
     }
     said = {line.file: (who[line.file].key, line.paragraph) for line in done}
     shared = [*copies(prints), *same_words(said), *_one_file(done, who)]
@@ -238,18 +253,16 @@ def across(
         for copy in shared
         for key in copy.keys
     )
-    theirs = grouped((who[line.file].key, line) for line in lines)
-    chosen = {
-        key: _that_counts([line for line in some if line.points is not None] or some)
-        for key, some in theirs.items()
-    }
     found = []
     for line in lines:
         one = who[line.file]
         last, more = chosen[one.key]
         flags = [*line.flags, *about.get(line.file, ()), *more, *_clock(line)]
         flags += roster.other_name(one, line.student)
-        if last is not line and line.points is not None:
+        if line.measured:
+            code = "only_a_measurement" if last is line else "unpacked_measurement"
+            flags.append(flag_of(code, last is not line, file=last.file))
+        elif last is not line and line.points is not None:
             facts = {"student": last.student, "file": last.file}
             facts |= {"points": _points(line.points), "better": _points(last.points)}
             flags.append(flag_of("earlier_bundle", note=True, **facts))
@@ -292,8 +305,11 @@ def _that_counts(some: Sequence[ReportLine]) -> tuple[ReportLine, tuple[Flag, ..
     """Which of a student's bundles counts, and what to say about it.
 
     The newest, or the first of those; but if no LMS says that they are of one student, never one
-    that takes points away from another.
+    that takes points away from another. What is graded before what is not, and bundles before a
+    measurement.
     """
+    some = [line for line in some if line.points is not None] or some
+    some = [line for line in some if not line.measured] or some
     newest = max(some, key=_moment)
     if len(some) == 1 or place_of(newest.file).lms:
         return newest, ()
@@ -352,12 +368,7 @@ def _date(moment: str) -> str:
 def _one_file(done: Sequence[ReportLine], who: Mapping[str, Person]) -> Iterator[Copy]:
     """Files that several people handed in: one name, one second of packing, the same depths."""
     packed = grouped(
-        (
-            (line.student, line.made, tuple(stack.digest for stack in line.fingerprint.stacks)),
-            line.file,
-        )
-        for line in done
-        if line.fingerprint is not None
+        ((line.student, line.made, line.depths), line.file) for line in done if line.fingerprint
     )
     for (typed, made, _), files in packed.items():
         n = len({who[file].key for file in files})
@@ -393,9 +404,10 @@ def _decided(line: ReportLine) -> str:
 
 
 def _told(line: ReportLine) -> str:
-    """What somebody without points is told; nothing where it is the grader that failed."""
+    """What somebody without points is told; nothing where it is the grader that failed. With points
+    it is what is to be handed in, where that was no bundle."""
     if line.total is not None or line.reason in FAILED:
-        return ""
+        return next((flag.says for flag in line.flags if flag.code == "only_a_measurement"), "")
     again = SAYS["again"].format(file=line.file.rpartition("/")[2], says=line.says)
     return line.says if line.reason == "missing" else again
 
