@@ -665,7 +665,7 @@ def _finish(
     _same_class(before, lines, out)
     changes = list(_changes(before, state))
     table = report.grades_csv(lines, how.separator)
-    imports, notes = report.exports(lines, how.separator, how.assignment)
+    imports, notes = report.exports(lines, how.separator, how.assignment, roster.possible)
     warning = _unused(own, lines)
     chosen = {"--roster": bool(how.roster), "--late-after": bool(how.late_after)}
     notes = (*notes, *filter(None, [warning, *_not_said(before, chosen), _late(lines, how)]))

@@ -608,16 +608,22 @@ class Person:
 
 
 class Roster:
-    """A class: the rows of a table, and whoever an LMS names besides."""
+    """A class: the rows of a table, and whoever an LMS names besides.
+
+    possible: what Canvas' gradebook says that each of its columns is worth.
+    """
 
     def __init__(self, rows: Sequence[Mapping[str, str]] = ()) -> None:
         self.people: dict[str, Person] = {}
+        self.possible: dict[str, str] = {}
         self._known: dict[str, set[str]] = {}
         for row in rows:
             cells = {column.strip().casefold(): value for column, value in row.items()}
             name = next((cells[c] for c in NAME_COLUMNS if cells.get(c)), "")
             name = name or " ".join(filter(None, (cells.get(c) for c in FIRST_AND_LAST)))
             ids = {column: cells[column] for column in IDS if cells.get(column)}
+            if person(name) == "pointspossible":
+                self.possible = {column.strip(): value for column, value in row.items()}
             if (person(name) in ("", "pointspossible") and not ids) or name == "Student, Test":
                 continue  # an empty line, or the second one of Canvas, or its test student
             key = next(iter(ids.values()), person(name))

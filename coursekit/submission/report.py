@@ -736,14 +736,15 @@ def canvas_column(lines: Sequence[ReportLine], assignment: str = "") -> tuple[st
 
 
 def exports(
-    lines: Sequence[ReportLine], separator: str = ",", assignment: str = ""
+    lines: Sequence[ReportLine], sign: str = ",", assignment: str = "", most: Mapping[str, str] = {}
 ) -> tuple[dict[str, str], tuple[str, ...]]:
-    """Tables that Moodle and Canvas import, by the file's name, and a note if the roster does not
-    have the column of the points; lines: after `across`.
+    """Tables that Moodle and Canvas import, by the file's name, and notes: if the roster does not
+    have the column of the points, or it is not worth 100; lines: after `across`.
 
     Moodle's is its offline grading worksheet, found by `Identifier`; Canvas' its gradebook, found
     by `ID`, with the row of the points possible. Both have whoever has points or a word for them;
-    a table without either is not made. assignment: see `canvas_column`.
+    a table without either is not made. sign: between cells. assignment: see `canvas_column`. most:
+    see `Roster.possible`.
     """
     tables: dict[str, str] = {}
     moodle, canvas, notes = [], [], set[str]()
@@ -754,9 +755,7 @@ def exports(
             continue
         identifier = f"Participant {at.id}" if at.lms == "Moodle" else row.get("identifier", "")
         if identifier:
-            most = row.get("maximum grade") or "100"
-            if not re.fullmatch(r"100([.,]0*)?", most):
-                notes.add(SAYS["other_maximum"].format(most))
+            notes |= _other_maximum("moodle.csv", "worksheet", row.get("maximum grade"))
             email = row.get("email address", row.get("email", ""))
             # else Moodle skips whom it has graded before; "-" is its word for never
             when = row.get("last modified (grade)", "").strip("- ")
@@ -767,15 +766,22 @@ def exports(
             ids = (row.get(column.casefold(), "") for column in CANVAS_COLUMNS[2:5])
             canvas.append((name, number, *ids, grade_of))
     if any(row[3] or row[6] != NOTHING for row in moodle):
-        tables["moodle.csv"] = _csv([MOODLE_COLUMNS, *moodle], separator)
+        tables["moodle.csv"] = _csv([MOODLE_COLUMNS, *moodle], sign)
     if not any(row[-1] for row in canvas):
         return tables, tuple(notes)
     column, known = canvas_column(lines, assignment)
-    possible = ("    Points Possible", "", "", "", "", "100")
-    tables["canvas.csv"] = _csv([(*CANVAS_COLUMNS[:-1], column), possible, *canvas], separator)
+    possible = ("    Points Possible", "", "", "", "", most.get(column) or "100")
+    notes |= _other_maximum("canvas.csv", "gradebook", possible[-1])
+    tables["canvas.csv"] = _csv([(*CANVAS_COLUMNS[:-1], column), possible, *canvas], sign)
     if not known:
         notes.add(SAYS["no_column"].format(column))
     return tables, tuple(sorted(notes))
+
+
+def _other_maximum(file: str, of: str, most: str | None) -> set[str]:
+    """What to say where what an LMS gives at most is not 100."""
+    other = most and not re.fullmatch(r"100([.,]0*)?", most)
+    return {SAYS["other_maximum"].format(file, of, most)} if other else set()
 
 
 def own_table(lines: Sequence[ReportLine], separator: str = ",") -> str:
