@@ -796,9 +796,7 @@ def _state(line: report.ReportLine) -> list[Any]:
 def _changes(before: dict[str, Any], state: dict[str, Any]) -> Iterator[tuple[str, ...]]:
     """Whose points changed since the last report: name, from, to, why."""
     old = before.get("state", {})
-    files = {
-        was[3]: was for was in old.values() if was[3]
-    }  # with another roster who has another key
+    files = {was[3]: was for was in old.values() if was[3]}  # another roster has other keys
     for who, (name, total, topics, *bundle) in state.items():
         was = old.get(who) or files.get(bundle[0])
         if was is None or was[1] == total:

@@ -35,9 +35,8 @@ from coursekit.submission.recompute import HEADINGS, SEEN, Recomputed, grading_r
 _Key = TypeVar("_Key")
 _Thing = TypeVar("_Thing")
 LARGEST_WAVE = 6  # so many of them across a window; finer ones hold what was added
-N_WAVES = (
-    27  # numbers in a spectrum: pairs of 0 to 6 waves down and across, in any order, but (0, 0)
-)
+# Numbers in a spectrum: pairs of 0 to 6 waves down and across, in any order, but (0, 0).
+N_WAVES = 27
 FRAME_LIKENESS = 0.8  # of two frames' spectra; strangers' 8th best of 12: 0.74 in a small window
 COMPARED, MOST_FRAMES = 150_000, 40_000  # pairs of stacks in all, and frames for each, at most
 FRAMES_ASKED = 12  # frames of a stack that are looked for in others
