@@ -528,9 +528,7 @@ def _noise_figure(submission: Submission, found: Recomputed) -> dict[str, Any] |
         "claimed": claims,
         "predicted": guesses,
         "said": [(*row, claimed.get(row[0]), predicted.get(row[0])) for row in measured],
-        "has_table": bool(claimed),
-        "has_guesses": bool(predicted),
-        "off": ", ".join(off_claims + off_guesses),
+        "off": (("your table", off_claims), ("your prediction", off_guesses)),
     }
 
 
@@ -642,9 +640,8 @@ def _topics(lines: Sequence[ReportLine]) -> list[tuple[str, str, int, Any]]:
         groups = grouped((way, line) for line, ways in said for way in ways)
         ranked = sorted(groups.items(), key=lambda pair: -len(pair[1]))
         if ranked:
-            found.append(
-                (label, REPEAT.get(topic, ""), sum(bool(ways) for _, ways in said), ranked)
-            )
+            wrong = sum(bool(ways) for _, ways in said)
+            found.append((label, REPEAT.get(topic, ""), wrong, ranked))
     return sorted(found, key=lambda row: -row[2])
 
 
