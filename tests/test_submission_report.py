@@ -221,8 +221,7 @@ def test_an_empty_class_has_a_page():
 
 
 def test_points_are_those_that_the_instructor_gave():
-    line = line_of(GOOD)
-    text = report.class_page([line, replace(line, file="b.zip", own={"overrule": "12,5"})])
+    text = report.class_page([line_of(GOOD), replace(line_of(GOOD, "b"), own={"overrule": "12,5"})])
     assert "Median 56.25 % of the points, from 12.5 to 100 %." in text
     assert "Students by points: 1 from 10 to 20 %, 1 from 90 to 100 %." in text
 
