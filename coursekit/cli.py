@@ -15,6 +15,7 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from coursekit import doctor
 from coursekit.boards import Board
 from coursekit.boards.board import Skipped, by_reason
 from coursekit.checks import want
+from coursekit.formats import numbers, poses
 from coursekit.results import Exported
 from coursekit.words import Estimate, Findings, say, wrapped
 
@@ -30,7 +32,7 @@ SHOWN = 1  # reason, the commonest, for which images were not used
 NOT_TRUSTED = 3  # the exit code; what was found is written nevertheless
 
 COMMANDS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
-INSTEAD, OPTIONS = COMMANDS.pop("instead"), COMMANDS.pop("arguments")
+INSTEAD, OPTIONS, WANTED = (COMMANDS.pop(name) for name in ("instead", "arguments", "wanted"))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -78,7 +80,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="store_true", help="say which course this is, and end")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     table = copy.deepcopy(COMMANDS)
-    table["export"]["options"]["--to"]["help"] = "/".join(ck.results.EXPORTS)
+    table["export"]["options"]["--to"]["help"] = ", ".join(ck.results.EXPORTS)
     shared = table.pop("shared")
     for name, about in table.items():
         options, either = about.pop("options"), about.pop("either", [])
@@ -90,27 +92,37 @@ def _parser() -> argparse.ArgumentParser:
         command.set_defaults(run=RUN[name])
         group = command.add_mutually_exclusive_group() if either else command
         for option, how in options.items():
-            types = {"type": TYPES[how["type"]]} if "type" in how else {}
+            types = {"type": partial(_read, how["type"])} if "type" in how else {}
             (group if option in either else command).add_argument(option, **how | types)
     return parser
 
 
+def _read(kind: str, text: str) -> Any:
+    """What was typed, as one of TYPES; argparse ends with the message where it is none."""
+    try:
+        return TYPES[kind](text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"got {text!r}, want {WANTED[kind]}") from None
+
+
 def _squares(text: str) -> tuple[int, int]:
     columns, _, rows = text.lower().partition("x")
-    try:
-        return int(columns), int(rows)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"got {text!r}, want for example 9x6") from None
+    return int(columns), int(rows)
+
+
+def _number(text: str) -> float:
+    return float(text.replace(",", "."))
 
 
 def _moment(text: str) -> datetime:
     """A moment as ISO 8601 has it; a day alone is its last second."""
-    try:
-        when = datetime.fromisoformat(text)
-    except ValueError:
-        wanted = "a day or a moment, such as 2026-03-02 or 2026-03-02T23:59"
-        raise argparse.ArgumentTypeError(f"got {text!r}, want {wanted}") from None
+    when = datetime.fromisoformat(text)
     return when.replace(hour=23, minute=59, second=59) if len(text) <= len("2026-03-02") else when
+
+
+def _pose(text: str) -> Any:
+    """What `export` takes as T_link_optical, looked at before any work."""
+    return text if text == "turn" else poses.posed(numbers(text.split(), "pose"), "pose")
 
 
 def _record(options: argparse.Namespace) -> None:
@@ -223,8 +235,7 @@ def _export(options: argparse.Namespace) -> None:
 def _exported_place(what: Any, options: argparse.Namespace) -> Exported:
     """A place, with the frames that were named; or a lens, which has none."""
     names = ("parent", "optical", "link", "T_link_optical", "overwrite")
-    frames = {name: getattr(options, name) for name in names}
-    given = {name: value for name, value in frames.items() if value is not None}
+    given = {name: value for name in names if (value := getattr(options, name)) is not None}
     return ck.export(what, options.to, options.out, **given)
 
 
@@ -232,6 +243,7 @@ def _doctor(options: argparse.Namespace) -> int:
     return doctor.run(options.camera, options.json)
 
 
-TYPES = {"int": int, "float": float, "lower": str.lower, "squares": _squares, "moment": _moment}
+TYPES: dict[str, Any] = {"int": int, "float": _number, "lower": str.lower, "squares": _squares}
+TYPES |= {"moment": _moment, "pose": _pose}
 RUNS = (_calibrate, _hand_eye, _record, _board, _submit, _grade, _export, _doctor)
 RUN = {run.__name__[1:].replace("_", "-"): run for run in RUNS}  # by the command's name

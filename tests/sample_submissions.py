@@ -600,22 +600,22 @@ def moodle(name: str, i: int, file: str) -> str:
 def canvas(name: str, i: int, file: str) -> str:
     *first, last = name.replace("'", "").split()
     late = "_LATE" * (i == 2)
-    return (
-        f"{(last + ''.join(first)).lower()}{late}_{1000 + i}_{70000 + i}_{file.replace('/', '_')}"
-    )
+    who, file = (last + "".join(first)).lower(), file.replace("/", "_")
+    return f"{who}{late}_{1000 + i}_{70000 + i}_{file}"
 
 
 def class_zip(whole: Submission, n: int, of: Callable[[str, int, str], str]) -> bytes:
     """What an LMS makes of what n students handed in; `of` names the files as it does.
 
-    0 and 1 hand in nothing, 2 is late, 3 hands in twice, 4 half of a download, 5 a bundle without
-    an ending, 6 an unpacked one, 7 one zipped again, 8 an essay, 9 a bundle with the name of 10,
-    packed in 2099; 11, 12 and 13 type their names in other ways; 14's is no bundle.
+    0 and 1 hand in nothing, 2 is late, 3 hands in twice, and then the measurement without a name, 4
+    half of a download, 5 a bundle without an ending, 6 an unpacked one, 7 one zipped again, 8 an
+    essay, 9 a bundle with the name of 10, packed in 2099; 11, 12 and 13 type their names in other
+    ways; 14's is no bundle.
     """
-    names = class_names(n)
+    names, measured = class_names(n), with_part(whole, "conclusion", paragraph="")
 
-    def data(name: str, made: str = MADE) -> bytes:
-        return bundle.bundle_bytes(replace(whole, student=name, made=made))
+    def data(name: str, made: str = MADE, one: Submission = whole) -> bytes:
+        return bundle.bundle_bytes(replace(one, student=name, made=made))
 
     def parts(name: str) -> dict[str, bytes]:
         with zipfile.ZipFile(io.BytesIO(data(name))) as packed:
@@ -624,23 +624,19 @@ def class_zip(whole: Submission, n: int, of: Callable[[str, int, str], str]) -> 
     again = {f"studio_1/{part}": content for part, content in parts(names[7]).items()}
     inside = {f"studio_1/{part}": content for part, content in parts(names[6]).items()}
     odd: dict[int, dict[str, bytes]] = {
-        **{
-            0: {},
-            1: {},
-            3: {"a.zip": data(names[3]), "b.zip": data(names[3], "2026-03-02T11:00:00+00:00")},
-        },
+        **{0: {}, 1: {}, 3: {"a.zip": data(names[3]), "b.zip": data(names[3])}},
         **{4: {"studio.zip.crdownload": data(names[4])[:500]}, 5: {"studio": data(names[5])}},
         **{6: inside, 7: {"s.zip": bundle.zip_bytes(again | {"__MACOSX/studio_1/._x": b"q"})}},
         **{8: {"essay.pdf": b"%PDF"}, 9: {"s.zip": data(names[10], "2099-01-01T00:00:00+00:00")}},
         **{11: {"s.zip": data(names[11].upper() + "\u200b")}, 13: {"s.zip": data("Bunny")}},
         **{12: {"s.zip": data(", ".join(reversed(names[12].split(" ", 1))))}, 14: {"s.zip": b"no"}},
     }
-    buffer = io.BytesIO()
+    odd[3]["studio_1.measured"], buffer = data(bundle.NOBODY, one=measured), io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as packed:
         for i, name in enumerate(names):
-            for file, content in (odd[i] if i in odd else {"studio_1.zip": data(name)}).items():
-                day = 5 if i == 2 else 2
-                member = zipfile.ZipInfo(of(name, i, file), (2026, 3, day, 13, file == "b.zip", 0))
+            day, files = 5 if i == 2 else 2, odd.get(i, {"studio_1.zip": data(name)})
+            for minute, (file, content) in enumerate(files.items()):
+                member = zipfile.ZipInfo(of(name, i, file), (2026, 3, day, 13, minute, 0))
                 packed.writestr(member, content)
     return buffer.getvalue()
 

@@ -21,13 +21,13 @@ import pytest
 from common import EXPECTED, NIGHTLY
 from hostile_bundles import ZOE
 from misbehaving import fail, misbehave
-from sample_submissions import canvas, class_names, class_zip, moodle
+from sample_submissions import canvas, class_names, class_zip, moodle, with_part
 
 from coursekit import cli
 from coursekit.specifications import DATA
 from coursekit.submission import batch
 from coursekit.submission.batch import Bundle, Limits
-from coursekit.submission.format import Claims, bundle_bytes, zip_bytes
+from coursekit.submission.format import NOBODY, Claims, bundle_bytes, zip_bytes
 from coursekit.submission.recompute import grading_rules
 from coursekit.submission.report import ReportLine
 
@@ -388,17 +388,15 @@ def test_everybody_of_a_class_has_a_row_and_nobodys_grade_is_anothers(
     status: dict[str, list[str]] = {}
     for row in rows:
         status.setdefault(row["student"], []).append(row["status"].removeprefix("not graded: "))
-    odd = {0: ["missing"], 1: ["missing"], 3: ["graded"] * 2, 14: ["not_a_zip"], 8: ["no_bundle"]}
+    odd = {0: ["missing"], 1: ["missing"], 3: ["graded"] * 3, 14: ["not_a_zip"], 8: ["no_bundle"]}
     odd |= {4: ["not_a_zip"]} | ({} if lms == "Moodle" else {6: ["no_bundle"]})
     assert status == {name: odd.get(i, ["graded"]) for i, name in enumerate(names)}
     assert {row["student"] for row in rows if row["late"] == "yes"} == {names[2]}
-    assert [row["counts"] for row in rows if row["student"] == names[3]] == ["no", "yes"]
+    assert [row["counts"] for row in rows if row["student"] == names[3]] == ["no", "yes", "no"]
     assert all(row["Section"] == "AB"[names.index(row["student"]) % 2] for row in rows)
     flags = {row["student"]: {*row["flags"].split()} - USUAL for row in rows}
-    assert {name: codes for name, codes in flags.items() if codes} == {
-        names[9]: {"another_student", "wrong_clock"},
-        names[13]: {"other_name"},
-    }
+    seen = {names[9]: {"another_student", "wrong_clock"}, names[13]: {"other_name"}}
+    assert {name: codes for name, codes in flags.items() if codes} == seen
     graded = {row["student"]: row["total"] for row in rows if row["counts"] == "yes"}
     imported = {row[column]: row for row in table(out, f"{lms.lower()}.csv")}
     points = "Grade" if lms == "Moodle" else "Studio exercise 1"
@@ -438,7 +436,7 @@ def test_what_the_instructor_decides_reaches_everybody(lms, in_process, tmp_path
 
     said, rows, pages = run()
     assert "Missing: 1 student: Absent, Ann\n" in said
-    assert "--assignment" not in said
+    assert ("gradebook's of 20: set" in said, "--assignment" in said) == (True, False)
     assert "could not be graded, so hand in another. The file is no zip" in pages["Bo Lee"]
     assert "<h1>Studio exercise 1: Eve Martin</h1>" in pages["Eve Martin"]
     assert "The name in the file is Hana Sato." in pages["Eve Martin"]
@@ -455,9 +453,8 @@ def test_what_the_instructor_decides_reaches_everybody(lms, in_process, tmp_path
     said, rows, pages = run()
     assert said.startswith("3 bundles: 2 graded, 1 refused")
     column = "Homework depth noise (4711)"
-    assert [rows[name][column] for name in ("Martin, Eve", "Lee, Bo", "Absent, Ann")] == [
-        *("50", "0", "")
-    ]
+    who = ("Martin, Eve", "Lee, Bo", "Absent, Ann", "    Points Possible")
+    assert [rows[name][column] for name in who] == ["50", "0", "", "20"]
     assert [*rows["Lee, Bo"].values()][:5] == ["Lee, Bo", "1002", "s2", "bo", "B"]
     assert "<strong>50 of 100 points." in pages["Eve Martin"]
     assert "Your instructor set the total. Computed were " in pages["Eve Martin"]
@@ -480,18 +477,16 @@ def test_own_points_survive_a_regrade_which_says_what_changed(in_process, tmp_pa
     own.write_text(text, encoding="utf-8-sig")
     kept = own.read_bytes()
     (out / "grades.csv").write_text("edited", encoding="utf-8")
-    for name in (".DS_Store", "Thumbs.db", "desktop.ini", "~$grades.xlsx", ".~lock.grades.csv#"):
-        (out / name).write_bytes(b"")
-    for name in ("grades.xlsx", "notes.txt", "students/.DS_Store", "students/a.png", ".rows/x"):
+    junk = (".DS_Store", "Thumbs.db", "desktop.ini", "~$grades.xlsx", ".~lock.grades.csv#")
+    for name in (*junk, "grades.xlsx", "a.txt", "students/.DS_Store", "students/a.png", ".rows/x"):
         (out / name).write_bytes(b"mine")
     foreign = {path for path in out.rglob("*") if path.is_file()}
     summary = graded(folder, out, overwrite=True)
     first = next(row for row in table(out) if row["student"] == "a")
     machine = float(first["points"]) - float(first["paragraph"])
     assert float(first["total"]) == pytest.approx(machine + 1.5 - 1)
-    assert summary.changes[0] == (
-        *("a", f"{float(first['points']):g}", first["total"], "your own points changed"),
-    )
+    why = "your own points changed"
+    assert summary.changes[0] == ("a", f"{float(first['points']):g}", first["total"], why)
     other = next(row for row in table(out) if row["student"] == "b")
     assert float(other["total"]) == float(other["points"]) - float(other["paragraph"]) + 0.5
     assert other["comment"] == "terse"
@@ -564,12 +559,26 @@ def test_without_an_lms_a_name_typed_twice_takes_nobodys_points(in_process, tmp_
     folder, out = tmp_path / "in", tmp_path / "out"
     good, weak = ZOE, replace(ZOE, made="2026-03-05T12:00:00+00:00", claims=Claims())
     for place, one in (("zoe", good), ("mallory", weak)):
-        (folder / place).mkdir(parents=True)
-        (folder / place / "s.zip").write_bytes(bundle_bytes(one))
+        (quick(folder / place, ()) / "s.zip").write_bytes(bundle_bytes(one))
     graded(folder, out)
     rows = {row["file"]: row for row in table(out)}
     assert [rows[f"{at}/s.zip"]["counts"] for at in ("zoe", "mallory")] == ["yes", "no"]
     assert all("same_name" in row["flags"] for row in rows.values())
+
+
+@pytest.mark.parametrize(("n", "who"), [(2, "a"), (1, "file studio_1.measured")])
+def test_a_measurement_without_a_name_never_counts_beside_its_bundle(n, who, in_process, tmp_path):
+    """n: of its two distances."""
+    later, out = {"made": "2026-03-05T12:00:00+00:00", "stacks": ZOE.stacks[:n]}, tmp_path / "out"
+    kept = replace(with_part(ZOE, "conclusion", paragraph=""), student=NOBODY, **later)
+    folder = quick(tmp_path / "in", "a")
+    (folder / "studio_1.measured").write_bytes(bundle_bytes(kept))
+    graded(folder, out)
+    rows, counts = table(out), ["yes", "yes" if n == 1 else "no"]
+    assert [(row["who"], row["counts"]) for row in rows] == [*zip(["a", who], counts, strict=True)]
+    assert [bool({*row["flags"].split()} - USUAL) for row in rows] == [False, n == 1]
+    told = [b"hand in the zip" in page.read_bytes() for page in (out / "students").iterdir()]
+    assert sorted(told) == [False, n == 1]
 
 
 def test_a_bundle_by_itself_is_graded_and_graded_again(in_process, tmp_path):

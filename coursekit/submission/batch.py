@@ -658,7 +658,7 @@ def _finish(
     _same_class(before, lines, out)
     changes = list(_changes(before, state))
     table = report.grades_csv(lines, how.separator)
-    imports, notes = report.exports(lines, how.separator, how.assignment)
+    imports, notes = report.exports(lines, how.separator, how.assignment, roster.possible)
     warning = _unused(own, lines)
     chosen = {"--roster": bool(how.roster), "--late-after": bool(how.late_after)}
     notes = (*notes, *filter(None, [warning, *_not_said(before, chosen), _late(lines, how)]))
@@ -789,9 +789,7 @@ def _state(line: report.ReportLine) -> list[Any]:
 def _changes(before: dict[str, Any], state: dict[str, Any]) -> Iterator[tuple[str, ...]]:
     """Whose points changed since the last report: name, from, to, why."""
     old = before.get("state", {})
-    files = {
-        was[3]: was for was in old.values() if was[3]
-    }  # with another roster who has another key
+    files = {was[3]: was for was in old.values() if was[3]}  # another roster has other keys
     for who, (name, total, topics, *bundle) in state.items():
         was = old.get(who) or files.get(bundle[0])
         if was is None or was[1] == total:

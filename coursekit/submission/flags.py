@@ -35,9 +35,8 @@ from coursekit.submission.recompute import HEADINGS, SEEN, Recomputed, grading_r
 _Key = TypeVar("_Key")
 _Thing = TypeVar("_Thing")
 LARGEST_WAVE = 6  # so many of them across a window; finer ones hold what was added
-N_WAVES = (
-    27  # numbers in a spectrum: pairs of 0 to 6 waves down and across, in any order, but (0, 0)
-)
+# Numbers in a spectrum: pairs of 0 to 6 waves down and across, in any order, but (0, 0).
+N_WAVES = 27
 FRAME_LIKENESS = 0.8  # of two frames' spectra; strangers' 8th best of 12: 0.74 in a small window
 COMPARED, MOST_FRAMES = 150_000, 40_000  # pairs of stacks in all, and frames for each, at most
 FRAMES_ASKED = 12  # frames of a stack that are looked for in others
@@ -608,16 +607,22 @@ class Person:
 
 
 class Roster:
-    """A class: the rows of a table, and whoever an LMS names besides."""
+    """A class: the rows of a table, and whoever an LMS names besides.
+
+    possible: what Canvas' gradebook says that each of its columns is worth.
+    """
 
     def __init__(self, rows: Sequence[Mapping[str, str]] = ()) -> None:
         self.people: dict[str, Person] = {}
+        self.possible: dict[str, str] = {}
         self._known: dict[str, set[str]] = {}
         for row in rows:
             cells = {column.strip().casefold(): value for column, value in row.items()}
             name = next((cells[c] for c in NAME_COLUMNS if cells.get(c)), "")
             name = name or " ".join(filter(None, (cells.get(c) for c in FIRST_AND_LAST)))
             ids = {column: cells[column] for column in IDS if cells.get(column)}
+            if person(name) == "pointspossible":
+                self.possible = {column.strip(): value for column, value in row.items()}
             if (person(name) in ("", "pointspossible") and not ids) or name == "Student, Test":
                 continue  # an empty line, or the second one of Canvas, or its test student
             key = next(iter(ids.values()), person(name))

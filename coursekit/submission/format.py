@@ -48,6 +48,7 @@ LONGEST_SLUG = 40  # characters of a name that go into the name of a file
 LATEST_S = 1e12  # of a time stamp, either side of 0
 
 MANIFEST = "manifest.json"
+NOBODY = "nobody"  # stands in for a name while there is none
 DOCUMENTS = ("facts.json", "claims.json", "conclusion.json", "outcomes.json")
 ALLOWED_BYTES = {
     re.compile(r"(manifest|facts|claims|conclusion|outcomes)\.json"): MAX_JSON,

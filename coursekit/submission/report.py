@@ -136,6 +136,17 @@ class ReportLine:
         return "p" + hashlib.sha256(f"{self.who}\0{self.file}".encode()).hexdigest()[:6]
 
     @property
+    def depths(self) -> tuple[str, ...]:
+        """What is the same for the same raw depths; () for none."""
+        prints = self.fingerprint
+        return tuple(sorted(stack.digest for stack in prints.stacks)) if prints else ()
+
+    @property
+    def measured(self) -> bool:
+        """Whether it is what `submit.keep` wrote, and no bundle to hand in."""
+        return self.points is not None and not self.student
+
+    @property
     def percent(self) -> float | None:
         """Points of what could be had."""
         if self.points is None:
@@ -218,6 +229,8 @@ def across(
         if (at := place_of(line.file)).lms:
             roster.of_place(at)
     who = {line.file: roster.of_file(line.file, line.student) for line in lines}
+    owner = {n.depths: who[n.file] for n in reversed(lines) if n.student and n.depths}
+    who |= {n.file: owner[n.depths] for n in lines if n.depths in owner and not who[n.file].name}
     there = {one.key: one for one in who.values()}
     enrolled = Counter(person(one.name) for one in roster.people.values() if one.row)
     handed = Counter(person(one.name) for one in there.values())
@@ -225,11 +238,13 @@ def across(
         roster.add(one)
     codes = {replace(line, who=who[line.file].key).code: who[line.file] for line in lines}
     rows = _own_rows(own, roster, codes)
+    theirs = grouped((who[line.file].key, line) for line in lines)
+    chosen = {key: _that_counts(some) for key, some in theirs.items()}
     done = [line for line in lines if line.points is not None]
     prints = {
         line.file: replace(line.fingerprint, student=who[line.file].key)
         for line in done
-        if line.fingerprint is not None
+        if line.fingerprint and not (line.measured and chosen[who[line.file].key][0] is not line)
     }
     said = {line.file: (who[line.file].key, line.paragraph) for line in done}
     shared = [*copies(prints), *same_words(said), *_one_file(done, who)]
@@ -238,18 +253,16 @@ def across(
         for copy in shared
         for key in copy.keys
     )
-    theirs = grouped((who[line.file].key, line) for line in lines)
-    chosen = {
-        key: _that_counts([line for line in some if line.points is not None] or some)
-        for key, some in theirs.items()
-    }
     found = []
     for line in lines:
         one = who[line.file]
         last, more = chosen[one.key]
         flags = [*line.flags, *about.get(line.file, ()), *more, *_clock(line)]
         flags += roster.other_name(one, line.student)
-        if last is not line and line.points is not None:
+        if line.measured:
+            code = "only_a_measurement" if last is line else "unpacked_measurement"
+            flags.append(flag_of(code, last is not line, file=last.file))
+        elif last is not line and line.points is not None:
             facts = {"student": last.student, "file": last.file}
             facts |= {"points": _points(line.points), "better": _points(last.points)}
             flags.append(flag_of("earlier_bundle", note=True, **facts))
@@ -292,8 +305,11 @@ def _that_counts(some: Sequence[ReportLine]) -> tuple[ReportLine, tuple[Flag, ..
     """Which of a student's bundles counts, and what to say about it.
 
     The newest, or the first of those; but if no LMS says that they are of one student, never one
-    that takes points away from another.
+    that takes points away from another. What is graded before what is not, and bundles before a
+    measurement.
     """
+    some = [line for line in some if line.points is not None] or some
+    some = [line for line in some if not line.measured] or some
     newest = max(some, key=_moment)
     if len(some) == 1 or place_of(newest.file).lms:
         return newest, ()
@@ -352,12 +368,7 @@ def _date(moment: str) -> str:
 def _one_file(done: Sequence[ReportLine], who: Mapping[str, Person]) -> Iterator[Copy]:
     """Files that several people handed in: one name, one second of packing, the same depths."""
     packed = grouped(
-        (
-            (line.student, line.made, tuple(stack.digest for stack in line.fingerprint.stacks)),
-            line.file,
-        )
-        for line in done
-        if line.fingerprint is not None
+        ((line.student, line.made, line.depths), line.file) for line in done if line.fingerprint
     )
     for (typed, made, _), files in packed.items():
         n = len({who[file].key for file in files})
@@ -393,9 +404,10 @@ def _decided(line: ReportLine) -> str:
 
 
 def _told(line: ReportLine) -> str:
-    """What somebody without points is told; nothing where it is the grader that failed."""
+    """What somebody without points is told; nothing where it is the grader that failed. With points
+    it is what is to be handed in, where that was no bundle."""
     if line.total is not None or line.reason in FAILED:
-        return ""
+        return next((flag.says for flag in line.flags if flag.code == "only_a_measurement"), "")
     again = SAYS["again"].format(file=line.file.rpartition("/")[2], says=line.says)
     return line.says if line.reason == "missing" else again
 
@@ -516,9 +528,7 @@ def _noise_figure(submission: Submission, found: Recomputed) -> dict[str, Any] |
         "claimed": claims,
         "predicted": guesses,
         "said": [(*row, claimed.get(row[0]), predicted.get(row[0])) for row in measured],
-        "has_table": bool(claimed),
-        "has_guesses": bool(predicted),
-        "off": ", ".join(off_claims + off_guesses),
+        "off": (("your table", off_claims), ("your prediction", off_guesses)),
     }
 
 
@@ -630,9 +640,8 @@ def _topics(lines: Sequence[ReportLine]) -> list[tuple[str, str, int, Any]]:
         groups = grouped((way, line) for line, ways in said for way in ways)
         ranked = sorted(groups.items(), key=lambda pair: -len(pair[1]))
         if ranked:
-            found.append(
-                (label, REPEAT.get(topic, ""), sum(bool(ways) for _, ways in said), ranked)
-            )
+            wrong = sum(bool(ways) for _, ways in said)
+            found.append((label, REPEAT.get(topic, ""), wrong, ranked))
     return sorted(found, key=lambda row: -row[2])
 
 
@@ -724,14 +733,15 @@ def canvas_column(lines: Sequence[ReportLine], assignment: str = "") -> tuple[st
 
 
 def exports(
-    lines: Sequence[ReportLine], separator: str = ",", assignment: str = ""
+    lines: Sequence[ReportLine], sign: str = ",", assignment: str = "", most: Mapping[str, str] = {}
 ) -> tuple[dict[str, str], tuple[str, ...]]:
-    """Tables that Moodle and Canvas import, by the file's name, and a note if the roster does not
-    have the column of the points; lines: after `across`.
+    """Tables that Moodle and Canvas import, by the file's name, and notes: if the roster does not
+    have the column of the points, or it is not worth 100; lines: after `across`.
 
     Moodle's is its offline grading worksheet, found by `Identifier`; Canvas' its gradebook, found
     by `ID`, with the row of the points possible. Both have whoever has points or a word for them;
-    a table without either is not made. assignment: see `canvas_column`.
+    a table without either is not made. sign: between cells. assignment: see `canvas_column`. most:
+    see `Roster.possible`.
     """
     tables: dict[str, str] = {}
     moodle, canvas, notes = [], [], set[str]()
@@ -742,9 +752,7 @@ def exports(
             continue
         identifier = f"Participant {at.id}" if at.lms == "Moodle" else row.get("identifier", "")
         if identifier:
-            most = row.get("maximum grade") or "100"
-            if not re.fullmatch(r"100([.,]0*)?", most):
-                notes.add(SAYS["other_maximum"].format(most))
+            notes |= _other_maximum("moodle.csv", "worksheet", row.get("maximum grade"))
             email = row.get("email address", row.get("email", ""))
             # else Moodle skips whom it has graded before; "-" is its word for never
             when = row.get("last modified (grade)", "").strip("- ")
@@ -755,15 +763,22 @@ def exports(
             ids = (row.get(column.casefold(), "") for column in CANVAS_COLUMNS[2:5])
             canvas.append((name, number, *ids, grade_of))
     if any(row[3] or row[6] != NOTHING for row in moodle):
-        tables["moodle.csv"] = _csv([MOODLE_COLUMNS, *moodle], separator)
+        tables["moodle.csv"] = _csv([MOODLE_COLUMNS, *moodle], sign)
     if not any(row[-1] for row in canvas):
         return tables, tuple(notes)
     column, known = canvas_column(lines, assignment)
-    possible = ("    Points Possible", "", "", "", "", "100")
-    tables["canvas.csv"] = _csv([(*CANVAS_COLUMNS[:-1], column), possible, *canvas], separator)
+    possible = ("    Points Possible", "", "", "", "", most.get(column) or "100")
+    notes |= _other_maximum("canvas.csv", "gradebook", possible[-1])
+    tables["canvas.csv"] = _csv([(*CANVAS_COLUMNS[:-1], column), possible, *canvas], sign)
     if not known:
         notes.add(SAYS["no_column"].format(column))
     return tables, tuple(sorted(notes))
+
+
+def _other_maximum(file: str, of: str, most: str | None) -> set[str]:
+    """What to say where what an LMS gives at most is not 100."""
+    other = most and not re.fullmatch(r"100([.,]0*)?", most)
+    return {SAYS["other_maximum"].format(file, of, most)} if other else set()
 
 
 def own_table(lines: Sequence[ReportLine], separator: str = ",") -> str:

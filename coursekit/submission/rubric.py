@@ -20,7 +20,7 @@ import numpy as np
 from coursekit.arrays import Interval
 from coursekit.stereo import NoiseFit
 from coursekit.submission.flags import Fingerprint, Flag, data_flags, fingerprint
-from coursekit.submission.format import Plot, Submission, TableRow
+from coursekit.submission.format import NOBODY, Plot, Submission, TableRow
 from coursekit.submission.recompute import (
     LABELS,
     SAYS,
@@ -64,7 +64,10 @@ class Item:
 
 @dataclass(frozen=True, eq=False)
 class Grade:
-    """Points with their reasons; flags, which take none; and what the raw depths say."""
+    """Points with their reasons; flags, which take none; and what the raw depths say.
+
+    student: "" for what is measured and not packed, see `submit.keep`.
+    """
 
     student: str
     items: tuple[Item, ...]
@@ -155,7 +158,9 @@ def grade(submission: Submission) -> Grade:
     """
     found, prints = recompute(submission), fingerprint(submission)
     flags = data_flags(submission, found, prints)
-    return Grade(submission.student, judged(submission, found), flags, found, prints)
+    named = submission.student != NOBODY or submission.conclusion.paragraph
+    student = submission.student if named else ""
+    return Grade(student, judged(submission, found), flags, found, prints)
 
 
 def shortcomings(submission: Submission) -> tuple[str, ...]:

@@ -31,7 +31,6 @@ LESSON_PREFIX = "depth_noise."  # of its checkpoints and exercises
 COLUMNS = [field.name for field in fields(bundle.TableRow)][1:]  # of one's own table
 CAMERA_FACTS = ("name", "serial", "source", "baseline_m", "depth_scale_m")
 IN_MM = {"mm": 1.0, "m": 1e3}  # units of a std, and what one of them is in mm
-NOBODY = "nobody"  # stands in for a name while there is none
 Table = Mapping[float, Sequence[float | None]]
 
 
@@ -114,7 +113,7 @@ def measured(
     facts = {name: getattr(camera, name) for name in CAMERA_FACTS} | asdict(camera.depth)
     figure = bundle.Plot(at, stds, predicted) if len(stds) == len(stacks) else None
     return bundle.Submission(
-        student=NOBODY,
+        student=bundle.NOBODY,
         made=results.now(),
         versions=results.versions(),
         camera=bundle.CameraFacts(**facts),
@@ -182,7 +181,7 @@ def submit(
         kept,
         claims=claims,
         plot=plot,
-        student=name or NOBODY,
+        student=name or bundle.NOBODY,
         made=results.now(),
         conclusion=bundle.Conclusion(distance_m, frames, dominates, reasons.strip()),
         outcomes=outcomes(),
