@@ -216,14 +216,9 @@ class HandOver:
         board. What was measured with a standard deviation is a normal bias, shown up to two of
         them.
         """
-        return (
-            lesson_terms(stated=False)[0],
-            self._depth_noise(),
-            self._depth_bias(subtract_depth_bias),
-            self._intrinsics(),
-            *self._hand_eye(mount),
-            self._arm(),
-        )
+        pixel, arm = lesson_terms(stated=False)[0], self._arm()
+        depth = self._depth_noise(), self._depth_bias(subtract_depth_bias)
+        return (pixel, *depth, self._intrinsics(), *self._hand_eye(mount), arm)
 
     def budget(self, subtract_depth_bias: bool = False) -> ErrorBudget:
         """The student's own table, the reference's numbers where there are no others.

@@ -114,15 +114,9 @@ def jacobian(chain: Chain, names: tuple[str, ...] = PINHOLE_PARAMETERS) -> Float
     chosen = [PARAMETERS.index(name) for name in names]
     turned = -cross_matrix(view.lever_base) @ frame
     arm = np.concatenate([-cross_matrix(chain.arm_lever), np.eye(3)], axis=1)
-    parts = (
-        R @ view.by_pixel,
-        (R @ view.ray)[:, None],
-        R @ view.by_parameter[:, chosen],
-        turned,
-        frame,
-        arm if chain.mount == "eye_in_hand" else -arm,
-    )
-    return np.concatenate(parts, axis=1)
+    seen = R @ view.by_pixel, (R @ view.ray)[:, None], R @ view.by_parameter[:, chosen]
+    carried = arm if chain.mount == "eye_in_hand" else -arm
+    return np.concatenate([*seen, turned, frame, carried], axis=1)
 
 
 def propagate(chain: Chain, covariances: Covariances) -> Floats:

@@ -144,16 +144,12 @@ class Overview:
 
     def rows(self) -> list[tuple[str, str, str, str]]:
         """Notebook, checkpoints, exercises and results of each, as text."""
-        return [
-            (
-                s.notebook,
-                f"{s.first_try + s.later} of {s.checkpoints}"
-                + (f" ({s.first_try} at first try)" if s.later else ""),
-                f"{s.exercises[0]} of {s.exercises[1]}",
-                s.result or "-",
-            )
-            for s in self.standings
-        ]
+        rows = []
+        for s in self.standings:
+            first = f" ({s.first_try} at first try)" if s.later else ""
+            answered = f"{s.first_try + s.later} of {s.checkpoints}{first}"
+            rows.append((s.notebook, answered, "{} of {}".format(*s.exercises), s.result or "-"))
+        return rows
 
     def __repr__(self) -> str:
         head = ("notebook", "checkpoints", "exercises", "results")

@@ -171,6 +171,7 @@ def stats_without_mismatches(measured: Floats, z: Floats, step: float | None) ->
     moves = n > 1 and deviation.size
     frozen = (np.nanmax(np.abs(deviation), axis=0) < 1e-12).mean() if moves else math.nan
     residual, level = about_plane(mean)
+    moved = 0.0 if n == 1 else mean_std / math.sqrt(effective_frames(drift[:, None])[0])
     return WindowStats(
         n_frames=n,
         n_pixels=height * width,
@@ -178,11 +179,7 @@ def stats_without_mismatches(measured: Floats, z: Floats, step: float | None) ->
         n_mismatches=int(valid.sum() - np.isfinite(z).sum()),
         frozen_fraction=float(frozen),
         depth_m=float(level),
-        depth_error_m=math.hypot(
-            0.0 if n == 1 else mean_std / math.sqrt(effective_frames(drift[:, None])[0]),
-            _patch_error(residual),
-            gap / 2,
-        ),
+        depth_error_m=math.hypot(moved, _patch_error(residual), gap / 2),
         pixel_std_m=pixel_std,
         pixel_dof=pixel_dof,
         pixel_std_unrounded_m=unrounded_std(pixel_std, step),
