@@ -45,13 +45,8 @@ def pinhole_figures() -> dict[str, plots.LessonFigure]:
 @pytest.fixture(scope="module")
 def figures() -> dict[str, plots.LessonFigure]:
     """Every figure of the notebooks, by its function's name."""
-    return {
-        **pinhole_figures(),
-        **depth_noise_figures(),
-        **intrinsics_figures(),
-        **hand_eye_figures(),
-        **error_budget_figures(),
-    }
+    first = pinhole_figures() | depth_noise_figures() | intrinsics_figures()
+    return first | hand_eye_figures() | error_budget_figures()
 
 
 def test_every_axis_has_a_label_and_every_figure_words(figures) -> None:
