@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import json
 import tomllib
+import unicodedata
+import zlib
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -21,6 +23,18 @@ from coursekit.geometry import Intrinsics, make_transform
 
 PACKAGE = Path(__file__).resolve().parent
 DATA = next(p for p in (PACKAGE / "data", PACKAGE.parent / "data") if p.is_dir())  # wheel, checkout
+
+
+def seed_of(name: str) -> int:
+    """The seed of a person's own simulated camera, arm and sessions; see `cameras.my_unit`.
+
+    Raises ValueError for a name without letters or digits.
+    """
+    plain = unicodedata.normalize("NFKD", name.casefold())
+    letters = "".join(letter for letter in plain if letter.isalnum())
+    checks.want(letters, "name", name, "one with letters or digits")
+    # Of two names that are alike once in 90 million; far from what notebooks count up from 7
+    return 10_000_000 + zlib.crc32(letters.encode()) % 90_000_000
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import unicodedata
 import zlib
 from collections.abc import Generator
 from dataclasses import replace
@@ -51,12 +50,7 @@ def my_unit(name: str = "") -> int:
     """
     path = results.folder() / UNIT
     if checks.instance("name", name, str):
-        plain = unicodedata.normalize("NFKD", name.casefold())
-        letters = "".join(letter for letter in plain if letter.isalnum())
-        checks.want(letters, "name", name, "one with letters or digits")
-        # Of two names that are alike once in 90 million; far from what notebooks count up from 7
-        seed = 10_000_000 + zlib.crc32(letters.encode()) % 90_000_000
-        results.write_json(path, {"name": name, "seed": seed})
+        results.write_json(path, {"name": name, "seed": specifications.seed_of(name)})
     if not path.exists():
         return REFERENCE_UNIT
     try:

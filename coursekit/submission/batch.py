@@ -613,9 +613,8 @@ def _alone(out: Path) -> Iterator[None]:
 def _load(out: Path, bundle: Bundle) -> report.ReportLine | None:
     """The line of a bundle that is kept."""
     try:
-        return report.ReportLine.from_dict(
-            json.loads((out / ROWS / f"{bundle.key}.json").read_bytes())
-        )
+        kept = (out / ROWS / f"{bundle.key}.json").read_bytes()
+        return report.ReportLine.from_dict(json.loads(kept))
     except (OSError, AttributeError, KeyError, TypeError, ValueError):
         return None
 
@@ -670,8 +669,7 @@ def _finish(
         **imports,
     }
     tables = {name: _digest(text) for name, text in texts.items() if name.endswith(".csv")}
-    kept = {"tables": tables, "state": state, "chosen": chosen}
-    texts[f"{ROWS}/{CLASS}"] = json.dumps(kept)
+    texts[f"{ROWS}/{CLASS}"] = json.dumps({"tables": tables, "state": state, "chosen": chosen})
     notes = (*notes, *_set_aside(out, before))
     if left := report.unread(lines):
         notes = (*notes, say("submission.unread", many=counted(left, "paragraph")))
@@ -771,10 +769,8 @@ def _own_points(path: Path) -> list[dict[str, str]]:
 def _unused(own: list[dict[str, str]], lines: Sequence[report.ReportLine]) -> str:
     """Which of the instructor's rows with something in them reach nobody; "" for none."""
     used = {id(line.own) for line in lines}
-    unused = (
-        row for row in own if id(row) not in used and any(map(row.get, report.OWN_COLUMNS[3:]))
-    )
-    names = "; ".join(row["student"] + f" ({row['who']})" * bool(row["who"]) for row in unused)
+    left = [n for n in own if id(n) not in used and any(map(n.get, report.OWN_COLUMNS[3:]))]
+    names = "; ".join(row["student"] + f" ({row['who']})" * bool(row["who"]) for row in left)
     return say("submission.own_unused", file=OWN_POINTS, names=names) if names else ""
 
 

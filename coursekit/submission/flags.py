@@ -20,7 +20,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from functools import cache, partial
-from itertools import combinations
+from itertools import combinations, permutations
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -438,8 +438,9 @@ def _shared(one: StackPrint, others: Sequence[StackPrint]) -> list[tuple[bool, b
     return found
 
 
-def copies(prints: Mapping[str, Fingerprint]) -> list[Copy]:
+def copies(prints: Mapping[str, Fingerprint], owners: Mapping[str, str] = {}) -> list[Copy]:
     """Bundles whose raw data are identical or nearly so, by their keys: one `Copy` a group.
+    owners: see `Roster.owners`.
 
     Found whatever the order and number of the frames, mirrored, turned, transposed, rolled, with
     noise of a count or a constant added, rescaled, some values changed. In a large class a stack is
@@ -470,7 +471,7 @@ def copies(prints: Mapping[str, Fingerprint]) -> list[Copy]:
             if alike:
                 part = pairs.setdefault((min(key, other), max(key, other)), {})
                 part[stack.distance_m] = exact or part.get(stack.distance_m, False)
-    return [_copy(keys, pairs, prints) for keys in _groups(list(prints), list(pairs))]
+    return [_copy(keys, pairs, prints, owners) for keys in _groups(list(prints), list(pairs))]
 
 
 def _same_values(prints: Mapping[str, Fingerprint]) -> Counter[tuple[str, str, float]]:
@@ -511,6 +512,7 @@ def _copy(
     keys: Sequence[str],
     pairs: Mapping[tuple[str, str], Mapping[float, bool]],
     prints: Mapping[str, Fingerprint],
+    owners: Mapping[str, str],
 ) -> Copy:
     """What is said of a group: how much the same they are, and why that may be by right."""
     some = [prints[key] for key in keys]
@@ -532,7 +534,8 @@ def _copy(
         innocent = f": all are {camera}"
         if exact and some[0].source == "simulated":
             note = camera.endswith(f"seed-{grading_rules()['flags']['common_seed']}")
-            innocent = SEEN["common_seed" if note else "one_seed"].format(camera=camera)
+            of = owners.get(camera.rpartition(", ")[2], SEEN["nobody"])
+            innocent = SEEN["common_seed" if note else "one_seed"].format(camera=camera, of=of)
     return Copy(tuple(keys), code, f"{says}{innocent}.", note)
 
 
@@ -687,6 +690,30 @@ class Roster:
         else:
             alike = bool({*words_of(typed)} & {*words_of(one.name)})
             yield flag_of("other_name", alike, typed=typed, name=one.name)
+
+    def owners(self) -> dict[str, str]:
+        """Whose a simulated camera is, by its serial."""
+        has = grouped((unit, n.name) for n in self.people.values() for unit in units(n.name))
+        return {unit: " or ".join(names[:3]) for unit, names in has.items()}
+
+
+def units(name: str) -> set[str]:
+    """The serials of the simulated cameras that a name gives, or some of its words in any order."""
+    words = re.findall(r"[^\W_]+", name)[:5]
+    some = ("".join(order) for n in range(len(words)) for order in permutations(words, n + 1))
+    return {f"seed-{specifications.seed_of(one)}" for one in some}
+
+
+def another_unit(camera: str, names: Sequence[str], owners: Mapping[str, str]) -> Iterator[Flag]:
+    """What to say of a simulated camera that none of these names gives, nor no name.
+
+    camera: as in a `Fingerprint`. owners: see `Roster.owners`.
+    """
+    unit = camera.rpartition(", ")[2]
+    known = {f"seed-{grading_rules()['flags']['common_seed']}"}.union(*map(units, names))
+    if names[0] and unit.startswith("seed-") and unit not in known:
+        whose = owners.get(unit, SEEN["nobody"])
+        yield flag_of("another_unit", unit=unit, name=names[0], whose=whose)
 
 
 def class_table(path: Path) -> list[dict[str, str]]:

@@ -35,6 +35,7 @@ from coursekit.submission.flags import (
     Flag,
     Person,
     Roster,
+    another_unit,
     copies,
     flag_of,
     grouped,
@@ -236,6 +237,7 @@ def across(
     handed = Counter(person(one.name) for one in there.values())
     for one in there.values():
         roster.add(one)
+    owners = roster.owners()
     codes = {replace(line, who=who[line.file].key).code: who[line.file] for line in lines}
     rows = _own_rows(own, roster, codes)
     theirs = grouped((who[line.file].key, line) for line in lines)
@@ -247,7 +249,7 @@ def across(
         if line.fingerprint and not (line.measured and chosen[who[line.file].key][0] is not line)
     }
     said = {line.file: (who[line.file].key, line.paragraph) for line in done}
-    shared = [*copies(prints), *same_words(said), *_one_file(done, who)]
+    shared = [*copies(prints, owners), *same_words(said), *_one_file(done, who)]
     about = grouped(
         (key, Flag(copy.code, copy.says, copy.note, "; ".join(copy.keys)))
         for copy in shared
@@ -259,6 +261,8 @@ def across(
         last, more = chosen[one.key]
         flags = [*line.flags, *about.get(line.file, ()), *more, *_clock(line)]
         flags += roster.other_name(one, line.student)
+        if line.fingerprint is not None:
+            flags += another_unit(line.fingerprint.camera, (one.name, line.student), owners)
         if line.measured:
             code = "only_a_measurement" if last is line else "unpacked_measurement"
             flags.append(flag_of(code, last is not line, file=last.file))
@@ -269,11 +273,8 @@ def across(
         own_line = replace(_of(line, one, rows), flags=tuple(flags), fingerprint=None)
         found.append(replace(own_line, counts=last is line, late=_late(line, late_after)))
     nothing = not_graded("", "missing")
-    missing = [
-        one
-        for one in roster.people.values()
-        if one.key not in there and handed[person(one.name)] < enrolled[person(one.name)]
-    ]
+    absent = (one for one in roster.people.values() if one.key not in there)
+    missing = [n for n in absent if handed[person(n.name)] < enrolled[person(n.name)]]
     return [*found, *(_of(nothing, one, rows) for one in missing)]
 
 
