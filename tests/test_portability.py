@@ -352,9 +352,9 @@ class TestStart:
 
     @staticmethod
     def start(home: Path, *command: str, **environment: str) -> str:
-        told = {"capture_output": True, "encoding": "utf-8"}
+        command, told = [BINDER / "start", *command], {"capture_output": True, "encoding": "utf-8"}
         env = {"HOME": str(home), "PATH": os.environ["PATH"], **environment}
-        result = subprocess.run(["bash", str(BINDER / "start"), *command], check=True, env=env, **told)
+        result = subprocess.run(["bash", *command], check=True, env=env, **told)
         assert result.stderr == ""
         return result.stdout
 
