@@ -134,17 +134,12 @@ class Placement:
         """As JSON has it, with the quaternion (x, y, z, w) beside the matrix."""
         q = pose_files.described(self.T)
         known = None if self.covariance is None else self.covariance.tolist()
-        return {
-            "parent": self.parent,
-            "child": self.child,
-            "mount": self.mount,
-            "T": self.T.tolist(),
-            "translation_m": [q[name] for name in pose_files.PLACE],
-            "quaternion_xyzw": [q[name] for name in pose_files.TURN],
-            "rpy_rad": [q[name] for name in ("roll", "pitch", "yaw")],
-            "covariance_rad_m": known,
-            "verdict": self.verdict,
-        }
+        frames = {"parent": self.parent, "child": self.child, "mount": self.mount}
+        named = {"translation_m": pose_files.PLACE, "quaternion_xyzw": pose_files.TURN}
+        named |= {"rpy_rad": ("roll", "pitch", "yaw")}
+        place = {key: [q[name] for name in names] for key, names in named.items()}
+        matrices = {"T": self.T.tolist(), **place, "covariance_rad_m": known}
+        return frames | matrices | {"verdict": self.verdict}
 
     @classmethod
     def from_dict(cls, content: dict[str, Any]) -> Placement:

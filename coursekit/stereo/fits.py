@@ -103,16 +103,10 @@ def _fitted(
 
     ends = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-12)
     found = least_squares(residuals, list(start.values()), x_scale="jac", **ends)
-    return {
-        "names": tuple(start),
-        "theta": found.x,
-        "covariance": np.linalg.inv(found.jac.T @ found.jac),
-        "chi2": float(2 * found.cost),
-        "n_residuals": len(found.fun),
-        "n_distances": len(np.unique(z)),
-        "fx": fx,
-        "baseline_m": baseline_m,
-    }
+    covariance, chi2 = np.linalg.inv(found.jac.T @ found.jac), float(2 * found.cost)
+    told = {"names": tuple(start), "theta": found.x, "covariance": covariance, "chi2": chi2}
+    counts = {"n_residuals": len(found.fun), "n_distances": len(np.unique(z))}
+    return told | counts | {"fx": fx, "baseline_m": baseline_m}
 
 
 def _positive(name: str, values: ArrayLike) -> Floats:
