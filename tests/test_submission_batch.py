@@ -364,7 +364,8 @@ def test_what_cannot_be_is_said_before_anything_is_made(change, message, tmp_pat
 
 # --- a class ---
 
-LMS = {"Moodle": (moodle, "Identifier", "Participant {}"), "Canvas": (canvas, "ID", "{}")}
+LMS = {"Moodle": (moodle, "Identifier", "Participant {}", "Vollständiger Name")}
+LMS |= {"Canvas": (canvas, "ID", "{}", "Student")}
 
 
 @pytest.mark.parametrize("lms", LMS)
@@ -373,17 +374,16 @@ def test_everybody_of_a_class_has_a_row_and_nobodys_grade_is_anothers(
 ):
     """And the table for the LMS, read as it is documented, says the same."""
     monkeypatch.chdir(tmp_path)
-    n, (of, column, number) = 120 if NIGHTLY else 16, LMS[lms]
+    n, (of, column, number, title) = 120 if NIGHTLY else 16, LMS[lms]
     names = class_names(n)
     Path("all.zip").write_bytes(class_zip(ZOE, n, of))
     lines = [f"{number.format(1000 + i)};{name};{'AB'[i % 2]}" for i, name in enumerate(names)]
-    Path("class.csv").write_text("\n".join([f"{column};Student;Section", *lines]), "utf-8-sig")
+    Path("class.csv").write_text("\n".join([f"{column};{title};Section", *lines]), "utf-8-sig")
     choices = batch.Choices("class.csv", datetime(2026, 3, 4))
     summary = batch.grade_folder("all.zip", progress=False, choices=choices)
     assert summary.missing == tuple(names[:2])
     assert sum("“Studio exercise 1”" in note for note in summary.notes) == (lms == "Canvas")
-    out = Path("all_report")
-    rows = table(out)
+    rows = table(out := Path("all_report"))
     status: dict[str, list[str]] = {}
     for row in rows:
         status.setdefault(row["student"], []).append(row["status"].removeprefix("not graded: "))
@@ -582,7 +582,7 @@ def test_a_measurement_without_a_name_never_counts_beside_its_bundle(n, who, in_
 def test_a_bundle_by_itself_is_graded_and_graded_again(in_process, tmp_path):
     bundle, out = quick(tmp_path / "in", ["a"]) / "a.zip", tmp_path / "out"
     assert [graded(bundle, out, overwrite=True).kept for _ in "12"] == [0, 1]
-    assert [row["file"] for row in table(out)] == ["a.zip"]
+    assert [(row["file"], row["handed in"]) for row in table(out)] == [("a.zip", "")]
 
 
 def test_two_graders_do_not_write_one_report(in_process, tmp_path):

@@ -815,9 +815,10 @@ def _digest(text: str) -> str:
 
 
 def _dated(path: Path) -> str:
-    """When a file was handed in, by its date."""
+    """When a file was handed in, by its date; "" for that of all that is in a bundle."""
     path = path / MANIFEST if path.is_dir() else path
-    return datetime.fromtimestamp(path.stat().st_mtime).isoformat(timespec="seconds")
+    then = datetime.fromtimestamp(path.stat().st_mtime)
+    return then.isoformat(timespec="seconds") if then.year > 1980 else ""  # as in `zip_bytes`
 
 
 def _kind(line: report.ReportLine) -> str:
