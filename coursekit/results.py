@@ -29,7 +29,7 @@ from coursekit.formats import lens as lens_files
 from coursekit.formats import numbers
 from coursekit.formats import poses as pose_files
 from coursekit.geometry import Intrinsics, cross_matrix, invert_transform
-from coursekit.words import say
+from coursekit.words import say, wrapped
 
 ROOT = Path(__file__).resolve().parent.parent
 EXPORTS = tuple(dict.fromkeys((*lens_files.LENS_FORMATS, *pose_files.PLACE_FORMATS)))
@@ -225,6 +225,9 @@ def load(lesson: str) -> Result:
     """Read `results/<lesson>.json`; FileNotFoundError if there is none, ValueError if damaged."""
     try:
         return read(_path(lesson))
+    except FileNotFoundError as error:
+        kept = f"notebook {lesson} has kept nothing yet: run it to its last cell"
+        raise FileNotFoundError(kept) from error
     except ValueError as error:
         raise ValueError(f"{error}. Run notebook {lesson} again.") from error
 
@@ -269,7 +272,7 @@ class Exported:
 
     def __repr__(self) -> str:
         where = [f"Wrote {self.path.name}." if self.path else self.text.rstrip()]
-        return "\n".join([*where, *(f"- {note}" for note in self.notes)])
+        return "\n".join([*where, *(wrapped(note, first="- ") for note in self.notes)])
 
 
 def export(

@@ -22,7 +22,7 @@ def test_round_trip(own_results: Path) -> None:
     }
     path = results.save("01_pinhole", CAMERA, quantities)
     assert path == own_results / "01_pinhole.json"
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(FileNotFoundError, match="notebook 02_depth_noise has kept nothing"):
         results.load("02_depth_noise")
     loaded = results.load("01_pinhole")
     assert loaded.quantities == quantities

@@ -72,9 +72,9 @@ def older_ones(copies: list[Path]) -> str:
     """What to say of them, empty if there are none."""
     if not copies:
         return ""
-    names = ", ".join(path.name for path in copies)
+    names, where = ", ".join(path.name for path in copies), "/".join(copies[0].parts[-3:-1])
     return (
-        f"Of an older version of the course, in {copies[0].parent.name}/: {names}. They stay as "
+        f"Of an older version of the course, in {where}: {names}. They stay as "
         "they are. For the new version rename yours and start again; your answers and results "
         "are kept in results/.\n"
     )
