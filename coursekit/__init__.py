@@ -28,7 +28,7 @@ and `words` serve them all.
 | `plots` | one module of figures a notebook | `LessonFigure` | `geometry`, `boards`, `intrinsics`, `hand_eye`, `budget`, `attribution`, `simulation`, `cameras` |
 | `submission` | handing in and grading the studio exercise | `Submission`, bundles (.zip), HTML pages | `specifications`, `results`, `stereo`, `cameras`, `lessons` |
 | `doctor` | what works on this computer, and what to do about the rest | lines of text | `results`, `stereo`, `cameras` |
-| `cli` | the command `coursekit` | arguments, exit codes | `geometry`, `results`, `boards`, `intrinsics`, `hand_eye`, `cameras`, `submission`, `doctor` |
+| `cli` | the command `coursekit` | arguments, exit codes | `formats`, `geometry`, `results`, `boards`, `intrinsics`, `hand_eye`, `cameras`, `submission`, `doctor` |
 
 Where a thing is: open the room's `__init__.py`; it begins with the room's question or equation and
 lists what the room offers. A module is named for what is in it.
