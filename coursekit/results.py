@@ -226,8 +226,7 @@ def load(lesson: str) -> Result:
     try:
         return read(_path(lesson))
     except FileNotFoundError as error:
-        kept = f"notebook {lesson} has kept nothing yet: run it to its last cell"
-        raise FileNotFoundError(kept) from error
+        raise FileNotFoundError(f"notebook {lesson} has kept nothing: run it to its end") from error
     except ValueError as error:
         raise ValueError(f"{error}. Run notebook {lesson} again.") from error
 

@@ -145,8 +145,7 @@ def block_face(
     if width_m is not None:
         width_m = positive("width_m", width_m)
     patch = _find_face(stack, step, camera, width_m, near)
-    planes = _frame_planes(patch)
-    edges = _edges(patch)
+    planes, edges = _frame_planes(patch), _edges(patch)
     line, edge_error = _edge_lines(edges)
     window = _face_window(patch)
     stats = windows.window_stats(stack, window, step)

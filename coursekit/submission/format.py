@@ -320,10 +320,9 @@ def read_bundle(source: bytes | Path) -> Submission:
     plot = claims.pop("plot")
     facts["camera"] = CameraFacts(**facts["camera"])
     claims["rows"] = tuple(TableRow(**row) for row in claims["rows"])
+    given = {name: manifest[name] for name in ("student", "exercise", "made")}
     submission = Submission(
-        student=manifest["student"],
-        exercise=manifest["exercise"],
-        made=manifest["made"],
+        **given,
         **facts,
         claims=Claims(**claims),
         plot=None if plot is None else Plot(**plot),

@@ -175,6 +175,8 @@ def number_of(text: str) -> float:
 
 def graded(file: str, grade: Grade, submission: Submission) -> ReportLine:
     """The line of a graded bundle; of its items what the class page and the table say."""
+    told = ("verdict", "paragraph")
+    items = tuple(replace(i, says=i.says * (i.topic in told), tolerance=None) for i in grade.items)
     return ReportLine(
         file=file,
         student=grade.student,
@@ -182,10 +184,7 @@ def graded(file: str, grade: Grade, submission: Submission) -> ReportLine:
         paragraph=submission.conclusion.paragraph,
         points=grade.points,
         of=grade.of,
-        items=tuple(
-            replace(item, says=item.says * (item.topic in ("verdict", "paragraph")), tolerance=None)
-            for item in grade.items
-        ),
+        items=items,
         flags=grade.flags,
         fingerprint=grade.fingerprint,
     )
