@@ -32,7 +32,7 @@ SHOWN = 1  # reason, the commonest, for which images were not used
 NOT_TRUSTED = 3  # the exit code; what was found is written nevertheless
 
 COMMANDS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
-INSTEAD, OPTIONS, WANTED = (COMMANDS.pop(name) for name in ("instead", "arguments", "wanted"))
+INSTEAD, OPTIONS, TYPED_AS = (COMMANDS.pop(name) for name in ("instead", "arguments", "wanted"))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -102,7 +102,7 @@ def _read(kind: str, text: str) -> Any:
     try:
         return TYPES[kind](text)
     except ValueError:
-        raise argparse.ArgumentTypeError(f"got {text!r}, want {WANTED[kind]}") from None
+        raise argparse.ArgumentTypeError(f"got {text!r}, want {TYPED_AS[kind]}") from None
 
 
 def _squares(text: str) -> tuple[int, int]:
